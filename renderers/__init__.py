@@ -1,0 +1,21 @@
+"""Differentiable renderers of implicit surfaces. They turn a field and rays into a rendering, and know no task."""
+
+from renderers.camera import Camera, Rays
+from renderers.dist import DIST
+from renderers.field import Field, Kind, Meter
+from renderers.naive import Naive
+from renderers.rendering import Capabilities, Renderer, Rendering, Status
+
+__all__ = [
+    "DIST",
+    "Camera",
+    "Capabilities",
+    "Field",
+    "Kind",
+    "Meter",
+    "Naive",
+    "Rays",
+    "Renderer",
+    "Rendering",
+    "Status",
+]

@@ -1,0 +1,147 @@
+"""Cameras and rays. Axes: x right, y down, z forward (OpenCV); the centre of pixel (column, row) is at +0.5."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Half lines from `origins` [*rays, 3] along unit `directions` [*rays, 3].
+
+    `image` says that the last two leading dimensions are the rows and columns of an image, so that neighbours in the
+    tensor are neighbours in view.
+    """
+
+    origins: Float[Tensor, "*rays 3"]
+    directions: Float[Tensor, "*rays 3"]
+    image: bool = False
+
+    def __post_init__(self) -> None:
+        if self.origins.shape != self.directions.shape or self.origins.shape[-1:] != (3,):
+            raise ValueError(
+                f"origins and directions must both have shape [*rays, 3], not {tuple(self.origins.shape)} and "
+                f"{tuple(self.directions.shape)}: expand one to the other"
+            )
+        length = torch.linalg.vector_norm(self.directions.detach(), dim=-1)
+        if length.numel() and not bool(((length - 1).abs() < 1e-3).all()):
+            raise ValueError("directions must have unit length: pass them through torch.nn.functional.normalize")
+
+    @property
+    def shape(self) -> torch.Size:
+        """The leading shape."""
+        return self.origins.shape[:-1]
+
+    def flat(self) -> "Rays":
+        """The same rays in one row [n, 3]."""
+        return Rays(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
+
+    def at(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays 3"]:
+        """The points at `distance` along the rays."""
+        return self.origins + distance[..., None] * self.directions
+
+    def __getitem__(self, index: Bool[Tensor, "*rays"]) -> "Rays":
+        return Rays(self.origins[index], self.directions[index])
+
+    def coarser(self, factor: int) -> "Rays":
+        """One ray for each block of factor x factor pixels, through its middle; image rays only.
+
+        The last row and column of blocks are filled up by repeating the image's edge.
+        """
+        return Rays(
+            _block_mean(self.origins, factor),
+            torch.nn.functional.normalize(_block_mean(self.directions, factor), dim=-1),
+            image=True,
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Args:
+        intrinsics: [3, 3] in pixels: focal lengths on the diagonal, principal point in the last column.
+        world_to_camera: [4, 4] rigid motion.
+        height, width: of the image, in pixels.
+    """
+
+    intrinsics: Float[Tensor, "3 3"]
+    world_to_camera: Float[Tensor, "4 4"]
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        focal = self.intrinsics.detach().diagonal()[:2]
+        if not bool((focal > 0).all()) or not bool(torch.isfinite(self.intrinsics).all()):
+            raise ValueError(f"focal lengths must be positive and finite, not {focal.tolist()}: check intrinsics")
+        if self.height < 1 or self.width < 1:
+            raise ValueError(f"height and width must be at least 1 pixel, not {self.height} x {self.width}")
+        rotation = self.world_to_camera.detach()[:3, :3]
+        identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        if not torch.allclose(rotation @ rotation.T, identity, atol=1e-4) or torch.linalg.det(rotation) < 0:
+            raise ValueError("world_to_camera must hold a rotation (orthogonal, determinant +1) in its top left 3 x 3")
+
+    @property
+    def camera_to_world(self) -> Float[Tensor, "4 4"]:
+        """The inverse rigid motion; its last column is the camera's centre."""
+        return torch.linalg.inv(self.world_to_camera)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """Where the camera is, in world coordinates."""
+        return self.camera_to_world[:3, 3]
+
+    def rays(self) -> Rays:
+        """The rays [height, width] through the pixel centres; gradients flow to both matrices."""
+        bearings = self._bearings()
+        directions = torch.nn.functional.normalize(bearings @ self.camera_to_world[:3, :3].T, dim=-1)
+        return Rays(self.center.expand_as(directions), directions, image=True)
+
+    def depth(self, distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+        """Camera z of the points at `distance` along each pixel's ray (DIST, Eq. 2)."""
+        return distance / torch.linalg.vector_norm(self._bearings(), dim=-1)
+
+    def _bearings(self) -> Float[Tensor, "height width 3"]:
+        """Camera coordinates of the pixel centres on the plane z = 1."""
+        like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
+        rows, columns = torch.meshgrid(
+            torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij"
+        )
+        pixels = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+        return pixels @ torch.linalg.inv(self.intrinsics).T
+
+
+def sphere_span(
+    rays: Rays, radius: float = 1.0
+) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"], Bool[Tensor, "*rays"]]:
+    """Where rays enter and leave the sphere of `radius` about the origin.
+
+    Returns:
+        entry, exit: distances along the ray, entry 0 where the ray starts inside; both are the distance of the closest
+            approach where it misses. Gradients flow to the rays.
+        meets: false where the ray misses the sphere, or has it behind.
+    """
+    approach = -(rays.origins * rays.directions).sum(-1)
+    beyond = rays.origins + approach[..., None] * rays.directions
+    half_chord_squared = radius**2 - beyond.square().sum(-1)
+    crosses = half_chord_squared > 0
+    half_chord = torch.where(crosses, half_chord_squared, 1.0).sqrt() * crosses
+    entry, leave = (approach - half_chord).clamp_min(0), approach + half_chord
+    return entry, leave, crosses & (leave > 0)
+
+
+def distance_to_origin(rays: Rays) -> Float[Tensor, "*rays"]:
+    """Least distance from the origin to each half line."""
+    approach = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
+    return torch.linalg.vector_norm(rays.at(approach), dim=-1)
+
+
+def _block_mean(image: Float[Tensor, "*rays 3"], factor: int) -> Float[Tensor, "*coarse 3"]:
+    rows, columns = image.shape[-3:-1]
+    down, across = -rows % factor, -columns % factor
+    stacked = image.reshape(-1, rows, columns, 3).permute(0, 3, 1, 2)
+    padded = torch.nn.functional.pad(stacked, (0, across, 0, down), mode="replicate")
+    mean = torch.nn.functional.avg_pool2d(padded, factor).permute(0, 2, 3, 1)
+    return mean.reshape(*image.shape[:-3], *mean.shape[1:])

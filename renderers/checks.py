@@ -1,0 +1,21 @@
+"""Checks of arguments at the edges; each names the argument, the rule, the value found and the remedy."""
+
+from math import isfinite
+
+
+def check_positive(name: str, value: float, remedy: str) -> None:
+    """Raises ValueError unless `value` is finite and above zero."""
+    if not isfinite(value) or value <= 0:
+        raise ValueError(f"{name} must be positive, not {value}: {remedy}")
+
+
+def check_at_least(name: str, value: float, least: float, remedy: str) -> None:
+    """Raises ValueError unless `value` is finite and at least `least`."""
+    if not isfinite(value) or value < least:
+        raise ValueError(f"{name} must be at least {least}, not {value}: {remedy}")
+
+
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raises ValueError unless `value` is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {value!r}")

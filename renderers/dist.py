@@ -1,0 +1,121 @@
+"""DIST: sphere tracing of a network, made cheap (Liu et al., CVPR 2020)."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Rays, distance_to_origin
+from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.field import Field, Kind
+from renderers.gradients import approximate
+from renderers.march import Front, Stepping, march, march_coarse_to_fine
+from renderers.rendering import Capabilities, Rendering
+from renderers.silhouette import hinge_silhouette_loss
+
+
+@dataclass(frozen=True)
+class DIST:
+    """Differentiable sphere tracing with every strategy of the paper as a switch.
+
+    Source: DIST, Secs. 3.1 to 3.4, A.1 to A.3, B.2.
+    Differentiable in: field parameters and rays, by the approximate rule of Eq. 4. The gradient of `distance` has the
+        right direction at each pixel and a wrong scale, alpha * samples * cos(angle of incidence); see
+        `gradients.approximate`. That of `closest` is exact at a fixed sample.
+    Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
+    Deviates from the paper: `extra_step_cap`, `silhouette_signed` and `silhouette_average` are ours, `step_clamp` is
+        the official code's; each is named, and off in the paper's setting. A ray that begins at negative values stops
+        at once and says so. Coarse to fine applies to rays that say that they are an image; others march at full
+        resolution.
+
+    Args:
+        steps: most marching steps a ray.
+        epsilon, alpha, extra_step_cap, step_clamp, active_only: see `march.Stepping`.
+        coarse_to_fine: begin with a ray for each 4 x 4 pixels.
+        samples: K, how many samples of least magnitude carry the gradient of a hit.
+        sphere_radius: of the sphere about the origin that holds the shape.
+        silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
+    """
+
+    steps: int
+    epsilon: float
+    alpha: float
+    extra_step_cap: float | None
+    step_clamp: float | None
+    active_only: bool
+    coarse_to_fine: bool
+    samples: int
+    sphere_radius: float
+    silhouette_signed: bool
+    silhouette_average: Literal["all", "violating"]
+
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
+    )
+
+    def __post_init__(self) -> None:
+        check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
+        check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
+        check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, the paper uses 1.5")
+        check_at_least("samples", self.samples, 1, "the paper uses 1 to 3")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+        check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        for name in ("extra_step_cap", "step_clamp"):
+            if getattr(self, name) is not None:
+                check_positive(name, getattr(self, name), f"{name}=null switches it off")
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """Marches without a graph, then asks again for the samples that carry the gradient."""
+        flat = rays.flat()
+        with torch.no_grad():
+            front = self._trace(field, rays)
+        hit = front.status == 0
+        met = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
+        wanted = front.sample_value[met].clone()
+        wanted[~hit[met], 1:] = torch.inf  # a ray that hit nothing needs its closest sample only
+        carried, least = approximate(
+            field,
+            flat[met],
+            front.distance[met],
+            alpha=self.alpha,
+            sample_distance=front.sample_distance[met],
+            sample_value=wanted,
+        )
+        # Rays that miss the sphere have a soft silhouette too: how far they pass it by (DIST, A.3).
+        closest = distance_to_origin(flat) - self.sphere_radius
+        closest = torch.where(front.meets, torch.ones_like(closest), closest).index_put((met,), least)
+        distance = torch.where(hit, front.distance.index_put((met,), carried), front.distance)
+        return Rendering(
+            distance=distance.view(rays.shape),
+            status=front.status.view(rays.shape),
+            points=rays.at(distance.view(rays.shape)),
+            residual=front.value.view(rays.shape),
+            closest=closest.view(rays.shape),
+        )
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """DIST, Eq. 11."""
+        return hinge_silhouette_loss(
+            rendering.closest,
+            mask,
+            epsilon=self.epsilon,
+            signed=self.silhouette_signed,
+            average=self.silhouette_average,
+        )
+
+    def _trace(self, field: Field, rays: Rays) -> Front:
+        stepping = Stepping(
+            self.epsilon, self.alpha, self.extra_step_cap, self.step_clamp, active_only=self.active_only
+        )
+        if self.coarse_to_fine and rays.image:
+            return march_coarse_to_fine(
+                field, rays, stepping, steps=self.steps, radius=self.sphere_radius, samples=self.samples
+            )
+        flat = rays.flat()
+        front = Front.on_sphere(flat, radius=self.sphere_radius, samples=self.samples)
+        march(field, flat, front, stepping, self.steps)
+        return front

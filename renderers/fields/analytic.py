@@ -1,0 +1,159 @@
+"""Analytic shapes and their combinations; each states its kind. A shape is a few lines: `sphere(0.5) | box((1, 1, 1))`.
+
+Formulas for the exact distances are standard (Hart 1996; Quilez, "distance functions"). Parameters may be tensors, so
+that gradients flow to them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from renderers.field import Kind
+
+Numbers = float | Sequence[float] | Tensor
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A Field made of a formula. `|` is union, `&` intersection, `-` difference."""
+
+    function: Callable[[Tensor], Tensor]
+    kind: Kind = Kind.DISTANCE
+    lipschitz: float | None = 1.0
+    flops: int | None = None
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.function(points)
+
+    def __or__(self, other: "Shape") -> "Shape":
+        return _combine(torch.minimum, self, other)
+
+    def __and__(self, other: "Shape") -> "Shape":
+        return _combine(torch.maximum, self, other)
+
+    def __sub__(self, other: "Shape") -> "Shape":
+        return _combine(lambda a, b: torch.maximum(a, -b), self, other)
+
+    def translate(self, offset: Numbers) -> "Shape":
+        """The shape moved by `offset` [3]."""
+        return self._replace(lambda p: self(p - _like(offset, p)))
+
+    def rotate(self, rotation: Float[Tensor, "3 3"]) -> "Shape":
+        """The shape turned by a rotation matrix: a surface point x goes to `rotation @ x`."""
+        return self._replace(lambda p: self(p @ _like(rotation, p)))
+
+    def scale(self, factor: Numbers) -> "Shape":
+        """The shape made `factor` times as large; its kind is kept. `factor` is one positive number."""
+        return self._replace(lambda p: self(p / _like(factor, p)) * _like(factor, p))
+
+    def stretch(self, factors: Numbers) -> "Shape":
+        """The shape stretched along the axes by `factors` [3].
+
+        Multiplied by the least factor it stays a bound, but no longer a distance.
+        """
+
+        def stretched(points: Tensor) -> Tensor:
+            axes = _like(factors, points)
+            return self(points / axes) * axes.min()
+
+        kind = Kind.LEVEL if self.kind is Kind.LEVEL else Kind.BOUND
+        return Shape(stretched, kind, self.lipschitz)
+
+    def _replace(self, function: Callable[[Tensor], Tensor]) -> "Shape":
+        return Shape(function, self.kind, self.lipschitz)
+
+
+def smooth_union(first: Shape, second: Shape, *, radius: Numbers) -> Shape:
+    """Union with a fillet of about `radius` (quadratic smooth minimum).
+
+    Its gradient is a convex mix of the two gradients, so that of two bounds it is a bound.
+    """
+
+    def blend(a: Tensor, b: Tensor) -> Tensor:
+        width = _like(radius, a)
+        overlap = (width - (a - b).abs()).clamp_min(0) / width
+        return torch.minimum(a, b) - 0.25 * width * overlap**2
+
+    return _combine(blend, first, second)
+
+
+def sphere(radius: Numbers = 1.0, center: Numbers = (0.0, 0.0, 0.0)) -> Shape:
+    """A sphere; exact distance."""
+    return Shape(lambda p: torch.linalg.vector_norm(p - _like(center, p), dim=-1) - _like(radius, p))
+
+
+def plane(normal: Numbers = (0.0, 1.0, 0.0), offset: Numbers = 0.0) -> Shape:
+    """The half space below `normal . x = offset`; exact distance. `normal` [3] need not have unit length."""
+    return Shape(lambda p: (p * torch.nn.functional.normalize(_like(normal, p), dim=-1)).sum(-1) - _like(offset, p))
+
+
+def box(half_sizes: Numbers) -> Shape:
+    """An axis-aligned box of half the side lengths `half_sizes` [3] about the origin; exact distance."""
+
+    def distance(points: Tensor) -> Tensor:
+        beyond = points.abs() - _like(half_sizes, points)
+        return _norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
+
+    return Shape(distance)
+
+
+def rounded_box(half_sizes: Numbers, radius: Numbers) -> Shape:
+    """A box of half sizes `half_sizes` [3], over all, whose edges are rounded by `radius`; exact distance."""
+    return Shape(lambda p: box(_like(half_sizes, p) - _like(radius, p))(p) - _like(radius, p))
+
+
+def torus(major: Numbers, minor: Numbers) -> Shape:
+    """A torus about the y axis: tube of radius `minor` around a circle of radius `major`; exact distance."""
+
+    def distance(points: Tensor) -> Tensor:
+        ring = _norm(points[..., [0, 2]]) - _like(major, points)
+        return _norm(torch.stack([ring, points[..., 1]], -1)) - _like(minor, points)
+
+    return Shape(distance)
+
+
+def capsule(start: Numbers, end: Numbers, radius: Numbers) -> Shape:
+    """All points within `radius` of the segment from `start` [3] to `end` [3]; exact distance."""
+
+    def distance(points: Tensor) -> Tensor:
+        a, b = _like(start, points), _like(end, points)
+        along = ((points - a) @ (b - a) / (b - a).dot(b - a)).clamp(0, 1)
+        return _norm(points - a - along[..., None] * (b - a)) - _like(radius, points)
+
+    return Shape(distance)
+
+
+def cylinder(radius: Numbers, half_height: Numbers) -> Shape:
+    """A cylinder about the y axis; exact distance."""
+
+    def distance(points: Tensor) -> Tensor:
+        beyond = torch.stack(
+            [
+                _norm(points[..., [0, 2]]) - _like(radius, points),
+                points[..., 1].abs() - _like(half_height, points),
+            ],
+            -1,
+        )
+        return _norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
+
+    return Shape(distance)
+
+
+def _combine(function: Callable[[Tensor, Tensor], Tensor], first: Shape, second: Shape) -> Shape:
+    """A function of two fields that is 1-Lipschitz in their values; of bounds it gives a bound."""
+    kind = Kind.LEVEL if Kind.LEVEL in (first.kind, second.kind) else Kind.BOUND
+    known = first.lipschitz is not None and second.lipschitz is not None
+    lipschitz = max(first.lipschitz, second.lipschitz) if known else None  # pyright: ignore[reportArgumentType]
+    return Shape(lambda p: function(first(p), second(p)), kind, lipschitz)
+
+
+def _like(value: Numbers, points: Tensor) -> Tensor:
+    return torch.as_tensor(value, dtype=points.dtype, device=points.device)
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    """Euclidean length with a zero gradient, not NaN, at zero."""
+    return torch.linalg.vector_norm(vectors, dim=-1)

@@ -1,0 +1,173 @@
+"""Stepping loops that renderers share: all rays or the active ones, plain or aggressive, coarse to fine.
+
+Everything here runs without a graph; `gradients.py` says how a gradient is attached afterwards, and `naive.py` keeps
+the graph instead.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, Int8
+from torch import Tensor
+
+from renderers.camera import Rays, sphere_span
+from renderers.field import Field
+from renderers.rendering import Status
+
+PYRAMID = (4, 2)  # pixels a side of a coarse ray's block, at the first levels (DIST, Sec. 3.2)
+PYRAMID_STEPS = 3  # steps at each of these levels
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How far a ray moves on a value of the field.
+
+    Args:
+        epsilon: a ray has converged where the field's magnitude is below this, in scene units (DIST, Sec. 3.2).
+        alpha: the step is alpha times the value; 1 is sphere tracing, more is aggressive marching.
+        extra_step_cap: bound on (alpha - 1) times the value, the part of a step that may pass a surface; None for none.
+        step_clamp: bound on the magnitude of a whole step; None for none.
+        active_only: ask the field only for rays that have not finished; else for every ray that meets the sphere.
+    """
+
+    epsilon: float
+    alpha: float
+    extra_step_cap: float | None
+    step_clamp: float | None
+    active_only: bool
+
+    def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+        """The signed step along the ray after the field gave `value`."""
+        extra = (self.alpha - 1) * value
+        if self.extra_step_cap is not None:
+            extra = extra.clamp(-self.extra_step_cap, self.extra_step_cap)
+        step = value + extra
+        return step if self.step_clamp is None else step.clamp(-self.step_clamp, self.step_clamp)
+
+
+@dataclass
+class Front:
+    """Where the front ends of n rays are, and the `samples` least field values that each has met."""
+
+    distance: Float[Tensor, "n"]
+    leave: Float[Tensor, "n"]
+    meets: Bool[Tensor, "n"]  # the ray meets the bounding sphere
+    active: Bool[Tensor, "n"]
+    fresh: Bool[Tensor, "n"]  # the field was not asked yet, on this ray or on the coarse one that it comes from
+    status: Int8[Tensor, "n"]
+    value: Float[Tensor, "n"]
+    sample_distance: Float[Tensor, "n samples"]
+    sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
+
+    @staticmethod
+    def on_sphere(rays: Rays, *, radius: float, samples: int) -> "Front":
+        """Every ray where it enters the sphere of `radius` about the origin, or at its origin if that lies inside."""
+        entry, leave, meets = sphere_span(rays, radius)
+        status = torch.where(meets, Status.OUT_OF_STEPS, Status.MISS).to(torch.int8)
+        return Front(
+            distance=entry,
+            leave=leave,
+            meets=meets,
+            active=meets.clone(),
+            fresh=torch.ones_like(meets),
+            status=status,
+            value=torch.zeros_like(entry),
+            sample_distance=entry[:, None].repeat(1, samples),
+            sample_value=torch.full_like(entry, torch.inf)[:, None].repeat(1, samples),
+        )
+
+    def split(self, parent: Int[Tensor, "children"], rays: Rays, radius: float) -> "Front":
+        """The front of finer rays, each going on from where its coarse `parent` is.
+
+        A ray whose coarse ray met no sphere, or started inside the shape, begins anew. One whose coarse ray has left
+        the sphere has left it too, and keeps the coarse ray's samples, the only ones that it has.
+        """
+        child = Front.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
+        inherits = self.meets[parent] & (self.status[parent] != Status.STARTED_INSIDE)
+        child.distance = torch.where(inherits, torch.maximum(self.distance[parent], child.distance), child.distance)
+        child.fresh = ~inherits
+        gone = child.meets & inherits & (child.distance > child.leave)
+        child.active &= ~gone
+        child.status[gone] = Status.MISS
+        child.sample_distance[gone] = self.sample_distance[parent[gone]]
+        child.sample_value[gone] = self.sample_value[parent[gone]]
+        return child
+
+
+def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int) -> None:
+    """Moves the front of flat rays [n, 3] by at most `steps` steps, in place."""
+    for _ in range(steps):
+        asked = (front.active if stepping.active_only else front.meets).nonzero().squeeze(-1)
+        if asked.numel() == 0:
+            return
+        value = field(rays.origins[asked] + front.distance[asked, None] * rays.directions[asked])
+        if not stepping.active_only:
+            moving = front.active[asked]
+            asked, value = asked[moving], value[moving]
+        _advance(front, asked, value, stepping)
+
+
+def march_coarse_to_fine(
+    field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
+) -> Front:
+    """Three steps with a ray for 4 x 4 pixels, three with one for 2 x 2, the rest with one a pixel (DIST, Sec. 3.2).
+
+    Args:
+        rays: an image of rays [*batch, height, width, 3].
+        steps: most steps of a pixel, those of its coarse rays included.
+        radius, samples: see `Front.on_sphere`.
+
+    Returns:
+        the front of the rays at full resolution, in one row.
+    """
+    level = rays.coarser(PYRAMID[0])
+    front = Front.on_sphere(level.flat(), radius=radius, samples=samples)
+    for factor in (*PYRAMID[1:], 1):
+        march(field, level.flat(), front, stepping, min(PYRAMID_STEPS, steps))
+        steps = max(steps - PYRAMID_STEPS, 0)
+        finer = rays.coarser(factor) if factor > 1 else rays
+        front = front.split(_parents(level.shape, finer.shape, front.status.device), finer.flat(), radius)
+        level = finer
+    march(field, level.flat(), front, stepping, steps)
+    return front
+
+
+def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, "children"]:
+    """For each ray of the finer image, the index of the coarse ray that covers it."""
+    index = torch.arange(coarse.numel(), device=device).view(coarse)
+    doubled = index.repeat_interleave(2, -2).repeat_interleave(2, -1)
+    return doubled[..., : fine[-2], : fine[-1]].reshape(-1)
+
+
+def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], stepping: Stepping) -> None:
+    """Takes in the values of the active rays `asked` and moves them, in place."""
+    finite = value.isfinite()
+    value = torch.where(finite, value, 0.0)
+    converged = finite & (value.abs() < stepping.epsilon)
+    inside = finite & front.fresh[asked] & (value < 0) & ~converged
+    distance = front.distance[asked]
+    _keep_least(front, asked, torch.where(finite, value, torch.inf), distance)
+
+    # The last query moves the ray by the value itself, without alpha (DIST, Eq. 1).
+    step = torch.where(converged, value, torch.where(inside, 0.0, stepping.length(value)))
+    moved = distance + step
+    left = ~converged & (moved > front.leave[asked])
+
+    status = torch.full_like(front.status[asked], Status.OUT_OF_STEPS)
+    status[left] = Status.MISS
+    status[converged] = Status.HIT
+    status[inside] = Status.STARTED_INSIDE
+    front.status[asked] = status
+    front.value[asked] = value
+    front.distance[asked] = torch.where(left, front.leave[asked], moved)
+    front.fresh[asked] = False
+    front.active[asked] = finite & ~converged & ~inside & ~left
+
+
+def _keep_least(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], distance: Float[Tensor, "m"]) -> None:
+    """Keeps of each ray the samples of least magnitude, in rising order."""
+    values = torch.cat([front.sample_value[asked], value[:, None]], dim=1)
+    distances = torch.cat([front.sample_distance[asked], distance[:, None]], dim=1)
+    order = values.abs().argsort(dim=1, stable=True)[:, :-1]
+    front.sample_value[asked] = values.gather(1, order)
+    front.sample_distance[asked] = distances.gather(1, order)

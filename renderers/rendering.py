@@ -1,0 +1,76 @@
+"""What a renderer gives, and what it states of itself."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from renderers.camera import Rays
+from renderers.field import Field, Kind
+
+
+class Status(IntEnum):
+    """How a ray ended. A ray that fails is data."""
+
+    HIT = 0
+    MISS = 1
+    STARTED_INSIDE = 2
+    OUT_OF_STEPS = 3
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One answer a ray, all of the rays' leading shape, all finite.
+
+    Args:
+        distance: along the ray to where it ended; a surface only where `hit`. Differentiable as the renderer states.
+        status: of each ray, a Status as int8.
+        points: the points at `distance`.
+        residual: the field's value where it was last asked, for the error that is left. Not differentiable.
+        closest: the field's value, with its sign, at the sample of least magnitude on the ray. Its magnitude less a
+            threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable.
+    """
+
+    distance: Float[Tensor, "*rays"]
+    status: Int8[Tensor, "*rays"]
+    points: Float[Tensor, "*rays 3"]
+    residual: Float[Tensor, "*rays"]
+    closest: Float[Tensor, "*rays"]
+
+    @property
+    def hit(self) -> Bool[Tensor, "*rays"]:
+        """True where the ray ended on a surface."""
+        return self.status == Status.HIT
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a renderer can do.
+
+    Args:
+        needs: the kinds of field that it is meant for.
+        field_gradient, ray_gradient: whether `distance` has a gradient towards the field's parameters and the rays.
+    """
+
+    needs: tuple[Kind, ...]
+    field_gradient: bool
+    ray_gradient: bool
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Finds surfaces along rays. It never times, logs, draws or synchronises, and knows no task."""
+
+    capabilities: Capabilities
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """The rendering of the field along the rays."""
+        ...
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The method's own loss between its rendering and a binary mask, true on the foreground."""
+        ...
