@@ -45,6 +45,10 @@ class Rays:
     def __getitem__(self, index: Bool[Tensor, "*rays"]) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
 
+    def to(self, device: torch.device) -> "Rays":
+        """The same rays on a device."""
+        return Rays(self.origins.to(device), self.directions.to(device), self.image)
+
     def coarser(self, factor: int) -> "Rays":
         """One ray for each block of factor x factor pixels, through its middle; image rays only.
 

@@ -1,7 +1,7 @@
 """DIST: sphere tracing of a network, made cheap (Liu et al., CVPR 2020)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -49,7 +49,7 @@ class DIST:
     samples: int
     sphere_radius: float
     silhouette_signed: bool
-    silhouette_average: Literal["all", "violating"]
+    silhouette_average: str
 
     capabilities: ClassVar[Capabilities] = Capabilities(
         needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True

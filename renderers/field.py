@@ -43,6 +43,10 @@ class Counts:
     value: int = 0
     gradient: int = 0
 
+    def flops(self, field: Field) -> int | None:
+        """What the field spent on them, in floating-point operations; a backward pass costs about two values."""
+        return None if field.flops is None else field.flops * (self.value + 2 * self.gradient)
+
     def __sub__(self, other: "Counts") -> "Counts":
         return Counts(self.value - other.value, self.gradient - other.gradient)
 
@@ -79,10 +83,6 @@ class Meter:
 
     def _count_backward(self, gradient: Tensor) -> None:
         self.counts.gradient += gradient.numel()
-
-    def spent_flops(self, counts: Counts) -> int | None:
-        """Floating-point operations of `counts` evaluations; a backward pass costs about twice a forward pass."""
-        return None if self.flops is None else self.flops * (counts.value + 2 * counts.gradient)
 
 
 def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

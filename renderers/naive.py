@@ -1,7 +1,7 @@
 """Sphere tracing as first written, with every step in the graph: the baseline that the others are measured against."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,7 +38,7 @@ class Naive:
     epsilon: float
     sphere_radius: float
     silhouette_signed: bool
-    silhouette_average: Literal["all", "violating"]
+    silhouette_average: str
 
     capabilities: ClassVar[Capabilities] = Capabilities(
         needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True

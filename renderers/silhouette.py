@@ -1,12 +1,8 @@
 """The silhouette loss of methods whose soft silhouette is the least field value on a ray (DIST, Eq. 11)."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-
-Average = Literal["all", "violating"]
 
 
 def hinge_silhouette_loss(
@@ -15,7 +11,7 @@ def hinge_silhouette_loss(
     *,
     epsilon: float,
     signed: bool,
-    average: Average,
+    average: str,
 ) -> Float[Tensor, ""]:
     """DIST, Eq. 11: the soft silhouette should be at most 0 on the foreground and at least 0 on the background.
 

@@ -1,0 +1,37 @@
+"""What a set of shapes is to the rest: numbered closed meshes in three parts that share none."""
+
+from enum import StrEnum
+from typing import Any, Protocol
+
+from datasets.mesh import Mesh
+
+SPLIT_STRIDE = 1_000_000  # seeds of the three parts are this far apart, more than any has shapes
+
+
+class Split(StrEnum):
+    """Training makes the prior, validation tunes settings, test is for results alone."""
+
+    TRAIN = "train"
+    VALIDATION = "validation"
+    TEST = "test"
+
+
+class Dataset(Protocol):
+    """Numbered shapes, each a closed mesh in the unit sphere."""
+
+    name: str
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """Shape number `index` of a part; always the same one."""
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """Plain data that decides the shapes: datasets of equal identity hold the same ones."""
+        ...
+
+
+def seed_of(split: Split, index: int) -> int:
+    """The seed of a shape; no two parts share one."""
+    if not 0 <= index < SPLIT_STRIDE:
+        raise ValueError(f"index must lie between 0 and {SPLIT_STRIDE - 1}, not {index}")
+    return list(Split).index(split) * SPLIT_STRIDE + index

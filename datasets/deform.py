@@ -1,0 +1,98 @@
+"""Seeded smooth deformations: many shapes of one family out of one mesh."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from datasets.mesh import Mesh
+
+STRETCH = 0.25  # log of the largest scale of an axis: about -22 % to +28 %
+TAPER = 0.25  # largest change of cross-section at |position| = 1 along the axis
+TWIST = np.radians(25)  # largest turn at |position| = 1
+BEND = 0.25  # largest curvature, 1 / scene unit
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """Stretch, then taper, twist and bend, each along an axis of the frame; the identity where all are zero.
+
+    Axes are 0, 1, 2 for x, y, z. Every part preserves orientation within the unit ball.
+    """
+
+    stretch: tuple[float, float, float] = (0.0, 0.0, 0.0)  # logs of the scales
+    taper: float = 0.0  # relative growth of the cross-section per unit along its axis
+    taper_axis: int = 0
+    twist: float = 0.0  # radians per unit along its axis
+    twist_axis: int = 0
+    bend: float = 0.0  # curvature that the axis takes on, towards the axis after it
+    bend_axis: int = 0
+
+    @classmethod
+    def draw(cls, seed: int, strength: float = 1.0) -> "Deformation":
+        """Draws one, evenly within the limits above times `strength`.
+
+        Args:
+            seed: the same seed gives the same deformation; at another strength, the same kind, weaker or stronger.
+            strength: from 0, the identity, to 1.
+        """
+        if not 0 <= strength <= 1:
+            raise ValueError(f"strength: must be from 0 to 1, found {strength}; 1 is the strongest that cannot fold")
+        generator = np.random.default_rng(seed)
+        amounts = strength * generator.uniform(-1, 1, 6)
+        axes = generator.integers(0, 3, 3)
+        return cls(
+            stretch=tuple(float(amount) for amount in STRETCH * amounts[:3]),
+            taper=float(TAPER * amounts[3]),
+            taper_axis=int(axes[0]),
+            twist=float(TWIST * amounts[4]),
+            twist_axis=int(axes[1]),
+            bend=float(BEND * amounts[5]),
+            bend_axis=int(axes[2]),
+        )
+
+    def apply(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Moves points of the unit ball; the result is not normalised again."""
+        points = np.asarray(points, dtype=np.float64) * np.exp(self.stretch)
+        points = _taper(points, self.taper, self.taper_axis)
+        points = _twist(points, self.twist, self.twist_axis)
+        return _bend(points, self.bend, self.bend_axis)
+
+
+def deform(mesh: Mesh, seed: int, strength: float = 1.0) -> Mesh:
+    """Deforms a mesh that lies in the unit ball; its faces and repairs stay. Normalise it again afterwards.
+
+    Raises:
+        ValueError: the mesh leaves the unit ball, or the strength is not from 0 to 1.
+    """
+    farthest = np.linalg.norm(mesh.vertices, axis=1).max()
+    if farthest > 1 + 1e-6:
+        raise ValueError(f"mesh: must lie in the unit ball, found a vertex at {farthest:.4g}; normalise it first")
+    return replace(mesh, vertices=Deformation.draw(seed, strength).apply(mesh.vertices))
+
+
+def _taper(points: np.ndarray, rate: float, axis: int) -> np.ndarray:
+    scales = np.repeat(1 + rate * points[..., [axis]], 3, axis=-1)
+    scales[..., axis] = 1
+    return points * scales
+
+
+def _twist(points: np.ndarray, rate: float, axis: int) -> np.ndarray:
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    cosine, sine = np.cos(rate * points[..., axis]), np.sin(rate * points[..., axis])
+    twisted = points.copy()
+    twisted[..., first] = cosine * points[..., first] - sine * points[..., second]
+    twisted[..., second] = sine * points[..., first] + cosine * points[..., second]
+    return twisted
+
+
+def _bend(points: np.ndarray, curvature: float, axis: int) -> np.ndarray:
+    """Bends the axis into an arc of a circle; planes across it turn without changing shape."""
+    if curvature == 0:
+        return points
+    towards = (axis + 1) % 3
+    angle, radius = curvature * points[..., axis], 1 / curvature - points[..., towards]
+    bent = points.copy()
+    bent[..., axis] = radius * np.sin(angle)
+    bent[..., towards] = 1 / curvature - radius * np.cos(angle)
+    return bent

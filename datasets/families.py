@@ -1,0 +1,154 @@
+"""Procedural families: seeded samplers of a few parameters over unions of primitives. World axes: y up."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from datasets.dataset import Split, seed_of
+from datasets.extract import extract
+from datasets.mesh import Mesh, normalise
+from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union
+
+VERSION = 1  # to be raised when a builder changes, so that no prior of the old shapes is taken for the new ones
+HALF_GRID = 1.5  # the sampled cube reaches from -1.5 to 1.5, wider than any shape before it is normalised
+SHEAR_BOUND = 0.8  # values of sheared parts are multiplied by this, so that they stay a bound at these slopes
+
+
+@dataclass(frozen=True)
+class Family:
+    """A seeded sampler of shapes, in three parts that share none.
+
+    Args:
+        name: which builder, one of `BUILDERS`.
+        resolution: of the marching cubes that turn a shape into a mesh, samples an axis.
+        radius: of the sphere about the origin that holds a shape.
+        ranges: least and largest value of each of the builder's parameters, drawn uniformly.
+    """
+
+    name: str
+    resolution: int
+    radius: float
+    ranges: dict[str, list[float]]
+
+    def __post_init__(self) -> None:
+        check_choice("name", self.name, tuple(BUILDERS))
+        check_at_least("resolution", self.resolution, 16, "128 keeps legs and wings")
+        check_positive("radius", self.radius, "below 1, so that rays can start outside the shape")
+
+    def draw(self, split: Split, index: int) -> dict[str, float]:
+        """The parameters of a shape."""
+        generator = np.random.default_rng(seed_of(split, index))
+        return {name: float(generator.uniform(*bounds)) for name, bounds in self.ranges.items()}
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """A shape as a closed mesh, by marching cubes."""
+        shape = BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
+        mesh = extract(shape, grid=self.resolution, reach=HALF_GRID)
+        if mesh is None:
+            raise ValueError(f"{self.name} {split} {index} has no surface: check dataset.ranges")
+        return normalise(mesh, self.radius)
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the shapes: two families of equal identity hold the same ones."""
+        return {"version": VERSION, **asdict(self)}
+
+
+def _union(parts: list[Shape]) -> Shape:
+    whole = parts[0]
+    for part in parts[1:]:
+        whole = whole | part
+    return whole
+
+
+def _mirror(part: Shape, axis: int) -> Shape:
+    """The part and its mirror image, for a part on the positive side of `axis`."""
+    flip = torch.ones(3)
+    flip[axis] = -1.0
+    return part | Shape(lambda p: part(p * flip), part.kind, part.lipschitz)
+
+
+def _shear(part: Shape, *, along: int, by: int, slope: float) -> Shape:
+    """The part moved along one axis by `slope` times the coordinate on another."""
+
+    def sheared(points: torch.Tensor) -> torch.Tensor:
+        moved = points.clone()
+        moved[..., along] = points[..., along] - slope * points[..., by]
+        return part(moved) * SHEAR_BOUND
+
+    return Shape(sheared, part.kind, None)
+
+
+def _sofa(p: SimpleNamespace) -> Shape:
+    def block(width: float, height: float, depth: float, at: tuple[float, float, float]) -> Shape:
+        return rounded_box((width / 2, height / 2, depth / 2), p.rounding).translate(at)
+
+    floor = p.leg_height
+    seat = block(p.width, p.seat_height, p.depth, (0, floor + p.seat_height / 2, 0))
+    back = block(p.width, p.back_height, p.back_depth, (0, floor + p.back_height / 2, -p.depth / 2 + p.back_depth / 2))
+    back = _shear(back.translate((0, -floor, 0)), along=2, by=1, slope=-p.back_tilt).translate((0, floor, 0))
+    arm = block(p.arm_width, p.arm_height, p.depth, (p.width / 2, floor + p.arm_height / 2, 0))
+    leg = cylinder(0.045, floor / 2 + 0.05).translate((p.width / 2 - 0.08, floor / 2 + 0.05, p.depth / 2 - 0.1))
+    legs = _mirror(leg, 0) | _mirror(leg.translate((0, 0, -p.depth + 0.2)), 0)
+    return _union([seat, back, _mirror(arm, 0), legs]).translate((0, -0.4, 0))
+
+
+def _plane(p: SimpleNamespace) -> Shape:
+    body = capsule((0, 0, -p.length / 2), (0, 0, p.length / 2), p.body_radius)
+    half = (p.span / 2, p.thickness / 2, p.chord / 2)
+    wing = rounded_box((half[0], half[1], half[2]), p.thickness * 0.45).translate((half[0], 0, 0))
+    wing = _shear(_shear(wing, along=2, by=0, slope=-p.sweep), along=1, by=0, slope=p.dihedral)
+    wings = _mirror(wing.translate((0, -p.body_radius * 0.4, p.wing_position)), 0)
+    end = -p.length / 2
+    tail = rounded_box((p.tail_span / 4, p.thickness / 2, p.chord * 0.3), p.thickness * 0.45)
+    tail = _shear(tail.translate((p.tail_span / 4, 0, 0)), along=2, by=0, slope=-p.sweep)
+    fin = rounded_box((p.thickness / 2, p.fin_height / 2, p.chord * 0.35), p.thickness * 0.45)
+    fin = _shear(fin.translate((0, p.fin_height / 2, 0)), along=2, by=1, slope=-p.sweep)
+    engine = capsule((0, 0, -0.09), (0, 0, 0.09), p.engine_radius)
+    at = (p.engine_offset, -p.body_radius * 0.4 - p.engine_radius, p.wing_position + 0.1 - p.sweep * p.engine_offset)
+    fuselage = smooth_union(body, wings, radius=0.06)
+    parts = [fuselage, _mirror(tail.translate((0, 0.03, end)), 0), fin.translate((0, 0, end))]
+    return _union([*parts, _mirror(engine.translate(at), 0)])
+
+
+def _table(p: SimpleNamespace) -> Shape:
+    height, half = p.height, (p.width / 2, p.depth / 2)
+    top = rounded_box((half[0], p.top_thickness / 2, half[1]), p.top_thickness * 0.4).translate((0, height, 0))
+    x, z = half[0] - p.inset - p.leg / 2, half[1] - p.inset - p.leg / 2
+    leg = rounded_box((p.leg / 2, height / 2, p.leg / 2), p.leg * p.leg_roundness).translate((0, height / 2, 0))
+    leg = _shear(_shear(leg.translate((0, -height, 0)), along=0, by=1, slope=-p.splay), along=2, by=1, slope=-p.splay)
+    legs = _mirror(_mirror(leg.translate((x, height, z)), 0), 2)
+    apron = box((x, p.apron / 2, z)) - box((x - 0.03, p.apron, z - 0.03))
+    shelf = rounded_box((x, p.shelf_thickness / 2, z), 0.01).translate((0, p.shelf_height * height, 0))
+    apron = apron.translate((0, height - p.apron / 2, 0))
+    return _union([top, legs, apron, shelf]).translate((0, -height / 2, 0))
+
+
+def _car(p: SimpleNamespace) -> Shape:
+    def slab(size: tuple[float, float, float], at: tuple[float, float, float], radius: float) -> Shape:
+        return rounded_box((size[0] / 2, size[1] / 2, size[2] / 2), radius).translate(at)
+
+    floor = p.clearance
+    lower = slab((p.width, p.body_height, p.length), (0, floor + p.body_height / 2, 0), p.rounding)
+    roof = floor + p.body_height + p.cabin_height / 2
+    cabin = slab((p.width * p.cabin_width, p.cabin_height * 1.4, p.cabin_length), (0, 0, 0), p.rounding)
+    windscreen = _shear(cabin, along=2, by=1, slope=-p.rake).translate((0, roof, p.cabin_position))
+    rear = _shear(cabin, along=2, by=1, slope=p.rake * 0.5).translate((0, roof, p.cabin_position))
+    turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    wheel = cylinder(p.wheel_radius, p.wheel_width / 2).rotate(turn)
+    side = p.width / 2 - p.wheel_width / 2 + 0.02
+    wheels = _union([_mirror(wheel.translate((side, p.wheel_radius, end * p.wheel_base / 2)), 0) for end in (-1, 1)])
+    body = smooth_union(lower, windscreen & rear, radius=0.08)
+    return (body | wheels).translate((0, -0.35, 0))
+
+
+BUILDERS: dict[str, Callable[[SimpleNamespace], Shape]] = {
+    "sofa": _sofa,
+    "plane": _plane,
+    "table": _table,
+    "car": _car,
+}

@@ -1,0 +1,83 @@
+"""Local mesh files as a dataset: a single mesh becomes a family by deformations, a folder is split into parts."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datasets.dataset import Split, seed_of
+from datasets.deform import deform
+from datasets.mesh import Mesh, normalise
+from datasets.meshes import find_meshes, load_mesh
+from renderers.checks import check_at_least, check_positive
+
+VERSION = 1  # to be raised when repair or deformation changes the shapes
+HELD_OUT = 0.2  # share of a folder's meshes that goes to validation, and to test
+
+
+@dataclass(frozen=True)
+class LocalMeshes:
+    """Shapes made from local mesh files.
+
+    One file: every shape is a seeded deformation of it, but for the first of the training part, which is the mesh
+    itself. A folder: its meshes are dealt out to the parts, and training goes on with deformations once each of its
+    meshes has been used.
+
+    Args:
+        path: a mesh file or a folder of them.
+        radius: of the sphere about the origin that holds a shape.
+        strength: of the deformations; 0 leaves a mesh as it is.
+    """
+
+    path: str
+    radius: float
+    strength: float
+
+    def __post_init__(self) -> None:
+        check_positive("dataset.radius", self.radius, "below 1, so that rays can start outside the shape")
+        check_at_least("dataset.strength", self.strength, 0, "0 switches deformations off")
+        find_meshes(self.path)
+
+    @property
+    def name(self) -> str:
+        """The file's or the folder's name, without suffix."""
+        return Path(self.path).resolve().stem
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """A shape as a closed mesh; its `repairs` say what was mended in the file."""
+        files = self.files(split)
+        mesh = _load(str(files[index % len(files)]), self.radius)
+        alone = len(find_meshes(self.path)) == 1
+        if index < len(files) and (split is Split.TRAIN or not alone):
+            return mesh
+        return normalise(deform(mesh, seed_of(split, index), strength=self.strength), self.radius)
+
+    def files(self, split: Split) -> list[Path]:
+        """The files that a part is made from; no part shares one with another, unless there are fewer than three."""
+        files = find_meshes(self.path)
+        order = [files[i] for i in np.random.default_rng(0).permutation(len(files))]
+        if len(files) == 1:
+            return order
+        held = max(1, round(HELD_OUT * len(files)))
+        test, rest = order[:held], order[held:]
+        validation, train = (rest[:held], rest[held:]) if len(rest) > held else (rest, rest)
+        return {Split.TEST: test, Split.VALIDATION: validation, Split.TRAIN: train}[split]
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the shapes: the files' contents, not where they lie."""
+        contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in find_meshes(self.path)]
+        return {
+            "name": "mesh",
+            "version": VERSION,
+            "contents": contents,
+            "radius": self.radius,
+            "strength": self.strength,
+        }
+
+
+@lru_cache(maxsize=64)
+def _load(path: str, radius: float) -> Mesh:
+    return normalise(load_mesh(path), radius)

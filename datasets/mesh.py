@@ -1,0 +1,139 @@
+"""The triangle mesh that the rest of the project passes around."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float32
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh, wound outward, with the repairs that made it so, each told in a sentence."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    repairs: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not (np.abs(vertices) < LARGEST).all():
+            raise ValueError(
+                f"vertices: must be numbers below {LARGEST:g} of shape [v, 3], found shape {list(vertices.shape)} with "
+                f"{np.count_nonzero(~(np.abs(vertices) < LARGEST))} NaN, infinite or too large; export the mesh again"
+            )
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise ValueError(
+                f"faces: must be one or more triangles of shape [f, 3], found shape {list(faces.shape)}; "
+                "export the mesh with its faces, as triangles"
+            )
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError(
+                f"faces: must index the {len(vertices)} vertices from 0, found {faces.min()} to {faces.max()}; "
+                "export the mesh again"
+            )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def crosses(self) -> Float[np.ndarray, "f 3"]:
+        """Normals of the faces, as long as twice their areas."""
+        corners = self.vertices[self.faces]
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    @property
+    def area(self) -> float:
+        """Area of the surface."""
+        return float(np.linalg.norm(self.crosses, axis=1).sum() / 2)
+
+    @property
+    def volume(self) -> float:
+        """Volume enclosed, positive where the faces wind outward; without meaning for an open mesh."""
+        return float(self.part_volumes.sum())
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding box's diagonal, over the vertices that faces use."""
+        return float(np.linalg.norm(np.ptp(self.vertices[np.unique(self.faces)], axis=0)))
+
+    @property
+    def open_faces(self) -> Bool[np.ndarray, " f"]:
+        """True for faces with an edge that is not walked as often one way as the other: a rim, or a wrong winding."""
+        steps = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        keys = steps.min(axis=1) * len(self.vertices) + steps.max(axis=1)
+        _, same = np.unique(keys, return_inverse=True)
+        balance = np.bincount(same, weights=np.sign(steps[:, 1] - steps[:, 0]))
+        return (balance[same] != 0).reshape(-1, 3).any(axis=1)
+
+    @property
+    def watertight(self) -> bool:
+        """True for a closed surface with one consistent winding."""
+        return not self.open_faces.any()
+
+    @cached_property
+    def parts(self) -> Int[np.ndarray, " f"]:
+        """Number of the connected part that each face belongs to, from 0."""
+        import trimesh
+
+        edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]])
+        labels = trimesh.graph.connected_component_labels(edges, node_count=len(self.vertices))
+        return np.unique(labels[self.faces[:, 0]], return_inverse=True)[1].reshape(-1)
+
+    @property
+    def part_volumes(self) -> Float[np.ndarray, " p"]:
+        """Volume that each part encloses, as `volume` does for the whole."""
+        heights = self.vertices[self.faces[:, 0]] - self.vertices.mean(axis=0)
+        return np.bincount(self.parts, weights=(heights * self.crosses).sum(axis=1) / 6)
+
+    @property
+    def holes(self) -> int:
+        """Number of loops of edges that have a face on one side only."""
+        import trimesh
+
+        steps = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, uses = np.unique(steps, axis=0, return_counts=True)
+        rim = edges[uses == 1]
+        labels = trimesh.graph.connected_component_labels(rim, node_count=len(self.vertices))
+        return len(np.unique(labels[rim]))
+
+    def compact(self) -> "Mesh":
+        """Gives the mesh without the vertices that no face uses."""
+        used, faces = np.unique(self.faces, return_inverse=True)
+        return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3))
+
+    def save(self, path: str | Path) -> None:
+        """Writes a binary .ply file."""
+        path = Path(path)
+        if path.suffix.lower() != ".ply":
+            raise ValueError(f"path: must end in .ply, found '{path.name}'; name it '{path.stem}.ply'")
+        header = (
+            "ply\nformat binary_little_endian 1.0\n"
+            f"element vertex {len(self.vertices)}\n"
+            "property double x\nproperty double y\nproperty double z\n"
+            f"element face {len(self.faces)}\n"
+            "property list uchar int vertex_indices\nend_header\n"
+        )
+        rows = np.empty(len(self.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+        rows["count"], rows["corners"] = 3, self.faces
+        path.write_bytes(header.encode("ascii") + self.vertices.astype("<f8").tobytes() + rows.tobytes())
+
+
+def normalise(mesh: Mesh, radius: float) -> Mesh:
+    """Moves the centre of the bounding box to the origin and scales until the farthest vertex is at `radius`.
+
+    Args:
+        mesh: any mesh; vertices that no face uses are moved along but not measured.
+        radius: positive, scene units.
+    """
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius: must be positive, found {radius}; the scenes use a little less than 1")
+    used = mesh.vertices[np.unique(mesh.faces)]
+    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    farthest = np.linalg.norm(used - centre, axis=1).max()
+    if farthest == 0:
+        raise ValueError("mesh: must have an extent, found all vertices at one place; export the mesh again")
+    return replace(mesh, vertices=(mesh.vertices - centre) * (radius / farthest))

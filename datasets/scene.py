@@ -1,0 +1,60 @@
+"""A scene: one shape, one camera, and what the camera saw of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from datasets.dataset import Dataset, Split, seed_of
+from datasets.mesh import Mesh
+from datasets.truth import Truth
+from datasets.views import ViewSampler
+from renderers.camera import Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the true images that it sees.
+
+    Args:
+        camera: its resolution is that of the images.
+        depth: camera z, in scene units; 0 on the background.
+        normals: unit, in world coordinates; 0 on the background.
+        mask: true on the foreground.
+    """
+
+    camera: Camera
+    depth: Float[Tensor, "height width"]
+    normals: Float[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A true shape and one view of it."""
+
+    name: str
+    mesh: Mesh
+    view: View
+
+
+def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
+    """Shape number `index` of a part of a dataset, seen by a camera that belongs to the shape."""
+    mesh = dataset.mesh(split, index)
+    view = see(Truth(mesh), views.draw(seed_of(split, index)))
+    if not bool(view.mask.any()):
+        raise ValueError(f"the camera sees nothing of {dataset.name} {index}: widen view.field_of_view or distance")
+    return Scene(f"{dataset.name} {split} {index}", mesh, view)
+
+
+def see(truth: Truth, camera: Camera) -> View:
+    """The true images of a mesh, by casting a ray through each pixel's centre."""
+    rays = camera.rays()
+    flat = rays.flat()
+    hits = truth.cast(flat.origins.numpy().astype(np.float64), flat.directions.numpy().astype(np.float64))
+    mask = torch.from_numpy(hits.hit).view(rays.shape)
+    distance = torch.from_numpy(np.where(hits.hit, hits.distance, 0.0).astype(np.float32)).view(rays.shape)
+    normals = torch.from_numpy(np.where(hits.hit[:, None], hits.normals, 0.0).astype(np.float32))
+    return View(camera, camera.depth(distance), normals.view(*rays.shape, 3), mask)

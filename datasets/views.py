@@ -1,0 +1,71 @@
+"""Where cameras stand."""
+
+from dataclasses import dataclass
+from math import radians, tan
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from renderers.camera import Camera
+from renderers.checks import check_at_least, check_positive
+
+
+@dataclass(frozen=True)
+class ViewSampler:
+    """Draws cameras that look at the origin, world y up.
+
+    Args:
+        distance: from the origin, in scene units.
+        field_of_view: full angle of the image's height, in degrees.
+        azimuth, elevation: least and largest angle, in degrees; azimuth 0 looks along -z, elevation 0 is level.
+        resolution: height and width of the image, in pixels.
+    """
+
+    distance: float
+    field_of_view: float
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+    resolution: int
+
+    def __post_init__(self) -> None:
+        check_positive("distance", self.distance, "2.5 sees the whole unit sphere at 50 degrees")
+        check_at_least("resolution", self.resolution, 4, "set scale.resolution=64")
+        if not 0 < self.field_of_view < 180:
+            raise ValueError(f"field_of_view must lie between 0 and 180 degrees, not {self.field_of_view}")
+        if not -90 < self.elevation[0] <= self.elevation[1] < 90:
+            raise ValueError(f"elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
+
+    def draw(self, seed: int) -> Camera:
+        """Camera number `seed`."""
+        generator = np.random.default_rng(seed)
+        return self.camera(generator.uniform(*self.azimuth), generator.uniform(*self.elevation))
+
+    def camera(self, azimuth: float, elevation: float) -> Camera:
+        """The camera at these angles, in degrees."""
+        across, up = radians(azimuth), radians(elevation)
+        toward = [np.cos(up) * np.sin(across), np.sin(up), np.cos(up) * np.cos(across)]
+        eye = self.distance * torch.tensor(toward, dtype=torch.float32)
+        focal = self.resolution / 2 / tan(radians(self.field_of_view) / 2)
+        middle = self.resolution / 2
+        intrinsics = torch.tensor([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+        return Camera(intrinsics, look_at(eye, torch.zeros(3)), self.resolution, self.resolution)
+
+
+def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """The world_to_camera of a camera at `eye` that sees `target` in its middle, with world y up in the image.
+
+    Raises:
+        ValueError: where the camera looks straight up or down, or stands on its target.
+    """
+    up = torch.tensor([0.0, 1.0, 0.0])
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.linalg.cross(forward, up)
+    if right.norm() < 1e-6:
+        raise ValueError(f"eye must not lie on, above or below target, not {eye.tolist()}: lower the elevation")
+    right = torch.nn.functional.normalize(right, dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    motion = torch.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, -rotation @ eye
+    return motion

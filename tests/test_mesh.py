@@ -1,0 +1,99 @@
+"""The mesh type: measures against closed forms, checks, saving and normalising."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.mesh import Mesh, normalise
+
+
+def box(extents=(1.0, 2.0, 3.0)) -> Mesh:
+    made = trimesh.creation.box(extents)
+    return Mesh(np.array(made.vertices), np.array(made.faces))
+
+
+def test_a_box_has_its_closed_form_measures():
+    mesh = box()
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(6)
+    assert mesh.area == pytest.approx(22)
+    assert mesh.diagonal == pytest.approx(np.sqrt(14))
+
+
+def test_volume_is_negative_inside_out_and_does_not_move_with_the_mesh():
+    mesh = box()
+    assert Mesh(mesh.vertices + 100, mesh.faces[:, ::-1]).volume == pytest.approx(-6)
+
+
+def test_two_boxes_are_two_parts():
+    mesh = box((1, 1, 1))
+    both = Mesh(np.concatenate([mesh.vertices, 2 * mesh.vertices + 9]), np.concatenate([mesh.faces, mesh.faces + 8]))
+    assert both.parts.tolist() == [0] * 12 + [1] * 12
+    assert both.part_volumes == pytest.approx([1, 8])
+
+
+@pytest.mark.parametrize("spoil", [lambda f: f[1:], lambda f: np.concatenate([f[:1, ::-1], f[1:]])])
+def test_a_rim_or_a_wrong_winding_is_not_watertight(spoil):
+    mesh = box()
+    spoilt = Mesh(mesh.vertices, spoil(mesh.faces))
+    assert not spoilt.watertight
+    assert 0 < spoilt.open_faces.sum() <= 4
+
+
+def test_holes_are_counted_by_their_rims():
+    mesh = box()
+    assert mesh.holes == 0
+    assert Mesh(mesh.vertices, mesh.faces[1:]).holes == 1
+    opposite = np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, 0]) < 0.49  # without the two sides across x
+    assert Mesh(mesh.vertices, mesh.faces[opposite]).holes == 2
+
+
+def test_compact_drops_only_unused_vertices():
+    mesh = box()
+    padded = Mesh(np.concatenate([[[9.0, 9.0, 9.0]], mesh.vertices]), mesh.faces + 1)
+    assert len(padded.compact().vertices) == 8
+    assert padded.compact().volume == pytest.approx(6)
+    assert padded.diagonal == pytest.approx(mesh.diagonal)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_numbers_that_are_no_positions_are_refused(bad):
+    vertices = np.zeros((3, 3))
+    vertices[1, 2] = bad
+    with pytest.raises(ValueError, match=r"vertices: must be numbers below 1e\+12.* with 1 NaN, infinite or too large"):
+        Mesh(vertices, np.array([[0, 1, 2]]))
+
+
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [
+        ([[0, 1, 3]], "faces: must index the 3 vertices from 0, found 0 to 3"),
+        ([[-1, 1, 2]], "faces: must index the 3 vertices from 0, found -1 to 2"),
+        (np.zeros((0, 3), dtype=int), "faces: must be one or more triangles"),
+    ],
+)
+def test_faces_that_are_no_triangles_of_the_vertices_are_refused(faces, message):
+    with pytest.raises(ValueError, match=message):
+        Mesh(np.eye(3), np.array(faces))
+
+
+def test_save_writes_what_others_read(tmp_path):
+    mesh = box()
+    path = tmp_path / "a böx.ply"
+    mesh.save(path)
+    read = trimesh.load_mesh(path, process=False)
+    assert np.array_equal(read.vertices, mesh.vertices)
+    assert np.array_equal(read.faces, mesh.faces)
+    with pytest.raises(ValueError, match=r"name it 'a\.ply'"):
+        mesh.save(tmp_path / "a.obj")
+
+
+def test_normalise_centres_the_box_and_reaches_the_radius():
+    mesh = box()
+    moved = normalise(Mesh(5 * mesh.vertices + [7, 8, 9], mesh.faces, repairs=("1 hole closed",)), 0.9)
+    assert np.linalg.norm(moved.vertices, axis=1).max() == pytest.approx(0.9)
+    assert moved.vertices.min(axis=0) == pytest.approx(-moved.vertices.max(axis=0))
+    assert moved.repairs == ("1 hole closed",)
+    for radius in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="radius: must be positive"):
+            normalise(mesh, radius)
