@@ -1,0 +1,90 @@
+"""The command line: Hydra underneath, with one clear line for every mistake."""
+
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bench.config import CONF, nearest, register
+
+USAGE = 2  # exit status of a command line that asks for what there is not
+FAILED = 1
+INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+
+def command_line(job: Callable[[DictConfig], None]) -> int:
+    """Composes the configuration of the command line and gives it to `job`, once, or in a sweep once a cell.
+
+    Returns:
+        the exit status: 0, or the status of a mistake that was told on standard error.
+    """
+    register()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
+    program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)
+    try:
+        program()
+    except KeyboardInterrupt:
+        return _tell("stopped by Ctrl-C", INTERRUPTED)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        return _tell(f"{error.strerror or error}{where}: free space, or set results_dir to a folder you can write")
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        return _tell(_explain(error), USAGE)
+    return 0
+
+
+def _tell(message: str, code: int = FAILED) -> int:
+    if any(argument.replace(" ", "") == "verbose=true" for argument in sys.argv[1:]):
+        traceback.print_exc()
+    print(f"error: {message}", file=sys.stderr)
+    return code
+
+
+def _explain(error: Exception) -> str:
+    """One line that names what is wrong and, for an unknown name, the nearest known one."""
+    chain = [error, error.__cause__, error.__context__]
+    for cause in chain:
+        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            group, _, name = str(cause.missing_cfg_file).rpartition("/")
+            what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
+            return what + nearest(name, list(cause.options or []))
+    message = " ".join(str(error).split())
+    if isinstance(error, ConfigCompositionException):
+        if found := re.search(r"Could not override '([^']+)'", message):
+            return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
+        if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
+            return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))
+        if error.__cause__ is not None:
+            detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
+            return f"{message}: {detail}" if detail not in message else message
+    return message
+
+
+def _choices(group: str) -> list[str]:
+    return [path.stem for path in (CONF / group).glob("*.yaml")]
+
+
+def _known_keys() -> list[str]:
+    """Every dotted key of the default configuration."""
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return list(_dotted(compose("config")))
+
+
+def _dotted(node: DictConfig, prefix: str = "") -> list[str]:
+    keys = []
+    for key in node:
+        name = f"{prefix}{key}"
+        keys.append(name)
+        child = node._get_node(key)
+        if OmegaConf.is_dict(child) and not child._is_missing() and not child._is_none():
+            keys += _dotted(child, f"{name}.")
+    return keys

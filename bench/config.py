@@ -1,0 +1,137 @@
+"""The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
+
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from hydra.core.config_store import ConfigStore
+from hydra.utils import get_class
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from datasets.dataset import Split
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+OURS = ("renderers", "datasets", "bench")
+
+
+class Device(StrEnum):
+    """Where tensors live; auto takes a GPU if there is one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+@dataclass
+class EvaluationSettings:
+    """How a result is judged; see conf/config.yaml."""
+
+    grid: int = MISSING
+    points: int = MISSING
+    fscore_threshold: float = MISSING
+    picture: int = MISSING
+
+
+@dataclass
+class Config:
+    """The top level of conf/config.yaml. Nodes of type Any are built by `build` from their `_target_`."""
+
+    task: Any = MISSING
+    renderer: Any = MISSING
+    dataset: Any = MISSING
+    prior: Any = MISSING
+    scale: Any = MISSING
+    view: Any = MISSING
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    split: str = MISSING
+    index: int = MISSING
+    seed: int = MISSING
+    device: Device = MISSING
+    threads: int | None = MISSING
+    results_dir: str = MISSING
+    priors_dir: str = MISSING
+    packages: list[str] = MISSING
+    verbose: bool = MISSING
+
+
+def register() -> None:
+    """Makes the schema known to Hydra, under the name that conf/config.yaml uses."""
+    ConfigStore.instance().store(name="schema", node=Config)
+
+
+def check_top_level(config: DictConfig) -> None:
+    """Raises ValueError for a value of the top level that no part checks by itself."""
+    if config.split not in list(Split):
+        raise ValueError(f"split must be one of {', '.join(Split)}, not {config.split!r}")
+    for name, least in (("index", 0), ("threads", 1), ("evaluation.grid", 8), ("evaluation.points", 1)):
+        value = OmegaConf.select(config, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
+
+
+def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (), target: str = "") -> Any:
+    """The object that a YAML node describes: its `_target_`, or `target`, with its other keys as arguments.
+
+    Args:
+        node: the node.
+        name: what it is called in the configuration, for errors.
+        packages: packages of the user's that a `_target_` may name, beside ours.
+        target: the class of a node that has no `_target_`.
+
+    Raises:
+        ValueError: for an unknown package, class, key or a value of the wrong type.
+    """
+    path = node.get("_target_", target)
+    if path.split(".")[0] not in (*OURS, *packages):
+        raise ValueError(f"{name}._target_ names {path!r}: add its package by packages=[{path.split('.')[0]}]")
+    try:
+        cls = get_class(path)
+    except Exception as error:
+        raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}") from error
+    for key in node:
+        if OmegaConf.is_missing(node, key):
+            raise ValueError(f"{name}.{key} must be given: set {name}.{key}=...")
+    arguments = {str(key): node[key] for key in node if key != "_target_"}
+    if not is_dataclass(cls):
+        return cls(**arguments)
+    names = [f.name for f in fields(cls)]
+    for key in arguments:
+        if key not in names:
+            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
+    return _typed(cls, arguments, name)
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """A hint at the end of an error message: the nearest known names, or all of them."""
+    close = get_close_matches(word, known, n=3, cutoff=0.5)
+    return f": did you mean {' or '.join(close)}?" if close else f": it has {', '.join(sorted(known))}"
+
+
+def _typed(cls: type, arguments: dict, name: str) -> Any:
+    """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
+    types = get_type_hints(cls)
+    nested = {key for key in arguments if is_dataclass(types[key])}
+    schema = OmegaConf.structured(cls)
+    OmegaConf.set_readonly(schema, False)  # frozen dataclasses give read-only nodes
+    try:
+        flat = OmegaConf.merge(schema, {key: value for key, value in arguments.items() if key not in nested})
+    except OmegaConfBaseException as error:
+        wanted = _type_name(types.get(str(error.full_key).split(".")[0], ""))
+        raise ValueError(f"{name}.{error.full_key}: {str(error).splitlines()[0]} (expected {wanted})") from None
+    values: Any = OmegaConf.to_container(flat, throw_on_missing=False)
+    values |= {key: build(arguments[key], f"{name}.{key}", target=_path(types[key])) for key in nested}
+    missing = [key for key, value in values.items() if value == MISSING]
+    if missing:
+        raise ValueError(f"{name}.{missing[0]} must be given: set {name}.{missing[0]}=...")
+    return cls(**values)
+
+
+def _path(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _type_name(wanted: Any) -> str:
+    return getattr(wanted, "__name__", None) if isinstance(wanted, type) else str(wanted).replace("typing.", "")

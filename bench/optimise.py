@@ -1,0 +1,93 @@
+"""The one optimisation loop. The clock runs around a step's forward and backward pass, and nothing else."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from bench.environment import MemoryPeak, synchronise
+from bench.records import RunStatus
+from bench.tasks.problem import OptimiserSettings, Problem
+from renderers.field import Counts
+
+DIVERGED = 100.0  # times its first value: a loss above that has diverged
+
+
+@dataclass
+class Course:
+    """How an optimisation went."""
+
+    status: RunStatus = RunStatus.OK
+    reason: str = ""
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
+    counts: Counts = field(default_factory=Counts)
+    peak_memory_bytes: int | None = None
+
+
+def optimise(
+    problem: Problem,
+    settings: OptimiserSettings,
+    device: torch.device,
+    *,
+    course: Course,
+    on_step: Callable[[dict[str, Any]], None],
+) -> None:
+    """Runs Adam on the problem's free parameters.
+
+    Args:
+        problem: gives the loss; its free parameters are changed in place.
+        settings: how long and how fast.
+        device: what to wait for when the clock is read.
+        course: an empty one, filled as the loop goes, so that it is there for a loop that is cut short. A loss that
+            becomes NaN or diverges ends the loop, and stands there as its status.
+        on_step: called off the clock with each line of the curve.
+    """
+    optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
+    course.seconds["warmup"] = _timed(device, lambda: problem.loss()["total"].backward())
+    before = Counts(problem.counts.value, problem.counts.gradient)
+    memory = MemoryPeak(device)
+    for iteration in range(settings.iterations):
+        optimiser.zero_grad(set_to_none=True)
+        terms: dict[str, torch.Tensor] = {}
+        forward = _timed(device, lambda terms=terms: terms.update(problem.loss()))
+        backward = _timed(device, lambda terms=terms: (terms["total"].backward(), optimiser.step()))
+        course.seconds["forward"] += forward
+        course.seconds["backward"] += backward
+        course.counts = problem.counts - before
+        line = {
+            "iteration": iteration,
+            "seconds": course.seconds["forward"] + course.seconds["backward"],
+            "value_evaluations": course.counts.value,
+            "gradient_evaluations": course.counts.gradient,
+            **{name: term.item() for name, term in terms.items()},
+        }
+        course.curve.append(line)
+        on_step(line)
+        course.peak_memory_bytes = memory.growth()
+        if _failed(course, problem):
+            break
+
+
+def _failed(course: Course, problem: Problem) -> bool:
+    """Notes in the course why it cannot go on, if so."""
+    loss, first = course.curve[-1]["total"], course.curve[0]["total"]
+    iteration = course.curve[-1]["iteration"]
+    finite = all(bool(parameter.isfinite().all()) for parameter in problem.parameters)
+    if loss != loss or not finite:
+        what = "the loss" if loss != loss else "a free parameter"
+        course.status, course.reason = RunStatus.NAN, f"{what} is not a number at iteration {iteration}"
+    elif loss > DIVERGED * first:
+        course.status = RunStatus.DIVERGED
+        course.reason = f"the loss rose from {first:.3g} to {loss:.3g} by iteration {iteration}"
+    return course.status is not RunStatus.OK
+
+
+def _timed(device: torch.device, work: Callable[[], Any]) -> float:
+    synchronise(device)
+    start = time.perf_counter()
+    work()
+    synchronise(device)
+    return time.perf_counter() - start

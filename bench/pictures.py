@@ -1,0 +1,173 @@
+"""Pictures of a run: what was given, what was found before and after, what is true. Off every clock."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+
+from datasets.scene import View
+
+STYLE = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
+LOST, FALSE, BOTH, PAPER = (0.84, 0.15, 0.16), (0.12, 0.47, 0.71), (0.82, 0.82, 0.82), (1.0, 1.0, 1.0)
+LIGHT = np.array([-0.35, -0.6, -0.72])  # from the camera's upper left, in camera axes
+TERMS = {"total": "#222222", "depth": "#1f77b4", "silhouette": "#d62728", "code": "#7f7f7f"}
+
+
+@dataclass(frozen=True)
+class Looks:
+    """The same two cameras' views of one shape: the given one, and one from behind."""
+
+    title: str
+    front: View
+    back: View
+
+
+def draw_all(
+    folder: Path,
+    *,
+    looks: tuple[Looks, Looks, Looks],
+    given: tuple[View, Bool[np.ndarray, "height width"]],
+    curve: list[dict[str, Any]],
+    title: str,
+) -> None:
+    """Writes the pictures of a run: summary.png and its parts.
+
+    Args:
+        folder: the run folder.
+        looks: before, after, truth.
+        given: the given view and its observed pixels.
+        curve: lines of curve.jsonl.
+        title: of the summary.
+    """
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(STYLE):
+        figures = {
+            "input": _input(*given),
+            "depth": _row(looks, _show_depth, "Depth (camera z, scene units)"),
+            "normals": _row(looks, _show_normals, "Normals (right, up, towards the camera as red, green, blue)"),
+            "silhouette": _row(looks[:2], _show_silhouette(looks[2]), "Silhouette error"),
+            "curve": _curve(curve),
+            "summary": _summary(looks, given, title),
+        }
+        for name, figure in figures.items():
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+
+
+def _summary(looks: tuple[Looks, ...], given: tuple[View, np.ndarray], title: str) -> Figure:
+    columns = {
+        "depth": _show_depth,
+        "normals": _show_normals,
+        "silhouette error": _show_silhouette(looks[2]),
+        "from behind": _show_shaded,
+    }
+    figure = Figure(figsize=(9.6, 7.6), layout="constrained")
+    axes = figure.subplots(3, 4)
+    shared = _depth_range(looks)
+    for row, look in zip(axes, looks, strict=True):
+        for axis, (name, show) in zip(row, columns.items(), strict=True):
+            if look is looks[2] and name == "silhouette error":
+                _show_given(axis, *given)
+                axis.set_title("what was given")
+            else:
+                image = show(axis, look, shared)
+                axis.set_title(name if look is looks[0] else "")
+                if name == "depth" and look is looks[2]:
+                    figure.colorbar(image, ax=axes[:, 0], location="left", shrink=0.5, label="depth (scene units)")
+        row[1].text(-1.22, 0.5, look.title, transform=row[1].transAxes, rotation=90, va="center", weight="bold")
+    figure.suptitle(title)
+    return figure
+
+
+def _row(looks: tuple[Looks, ...], show: Any, title: str) -> Figure:
+    figure = Figure(figsize=(3.2 * len(looks) + 0.6, 3.5), layout="constrained")
+    axes = figure.subplots(1, len(looks))
+    for axis, look in zip(axes, looks, strict=True):
+        image = show(axis, look, _depth_range(looks))
+        axis.set_title(look.title)
+    if show is _show_depth:
+        figure.colorbar(image, ax=axes, shrink=0.8)
+    figure.suptitle(title)
+    return figure
+
+
+def _input(view: View, observed: Bool[np.ndarray, "height width"]) -> Figure:
+    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+    axis = figure.subplots()
+    points = _show_given(axis, view, observed)
+    figure.colorbar(points, ax=axis, label="depth (scene units)", shrink=0.8)
+    axis.set_title(f"Given: the mask (grey) and {int(observed.sum())} depths")
+    return figure
+
+
+def _curve(curve: list[dict[str, Any]]) -> Figure:
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
+        for name, colour in TERMS.items():
+            values = [line[name] for line in curve if name in line]
+            if any(value > 0 for value in values):
+                axis.semilogy([line[key] for line in curve], values, label=name, color=colour, lw=1.4)
+        axis.set_xlabel(label)
+    figure.axes[0].set_ylabel("weighted loss")
+    figure.axes[0].legend(frameon=False)
+    return figure
+
+
+def _show_depth(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+    shown = np.where(look.front.mask.numpy(), look.front.depth.numpy(), np.nan)
+    return _bare(axis).imshow(shown, cmap="viridis_r", vmin=limits[0], vmax=limits[1], interpolation="nearest")
+
+
+def _show_normals(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+    view = look.front
+    flipped = _camera_normals(view) * [1, -1, -1]  # to right, up, towards the camera
+    return _bare(axis).imshow(np.where(view.mask.numpy()[..., None], flipped / 2 + 0.5, 1.0).clip(0, 1))
+
+
+def _show_shaded(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+    view = look.back
+    shade = 0.25 + 0.75 * (_camera_normals(view) @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
+    return _bare(axis).imshow(np.where(view.mask.numpy(), shade, 1.0), cmap="gray", vmin=0, vmax=1)
+
+
+def _show_silhouette(truth: Looks) -> Any:
+    def show(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+        found, true = look.front.mask.numpy(), truth.front.mask.numpy()
+        cases = [(found & true)[..., None], (true & ~found)[..., None], (found & ~true)[..., None]]
+        image = np.select(cases, [BOTH, LOST, FALSE], PAPER)
+        lost, false = int((true & ~found).sum()), int((found & ~true).sum())
+        _bare(axis).imshow(image, interpolation="nearest")
+        axis.text(0.02, 0.06, f"{lost} px lost", color=LOST, transform=axis.transAxes, fontsize=8)
+        axis.text(0.02, 0.01, f"{false} px false", color=FALSE, transform=axis.transAxes, fontsize=8)
+
+    return show
+
+
+def _show_given(axis: Any, view: View, observed: Bool[np.ndarray, "height width"]) -> Any:
+    mask = view.mask.numpy()
+    _bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    rows, columns = np.nonzero(observed)
+    size = max(2.0, 600 / max(mask.shape))
+    return axis.scatter(columns, rows, c=view.depth.numpy()[rows, columns], s=size, cmap="viridis_r", marker="s")
+
+
+def _camera_normals(view: View) -> Float[np.ndarray, "height width 3"]:
+    return view.normals.numpy() @ view.camera.world_to_camera[:3, :3].numpy().T
+
+
+def _depth_range(looks: tuple[Looks, ...]) -> tuple[float, float]:
+    depths = np.concatenate([look.front.depth.numpy()[look.front.mask.numpy()] for look in looks])
+    return (float(depths.min()), float(depths.max())) if depths.size else (0.0, 1.0)
+
+
+def _bare(axis: Any) -> Any:
+    axis.set_xticks([])
+    axis.set_yticks([])
+    for spine in axis.spines.values():
+        spine.set_visible(True)
+        spine.set_color("#bbbbbb")
+    return axis

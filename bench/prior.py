@@ -1,0 +1,33 @@
+"""`python -m bench.prior dataset=sofa`: trains the prior of a dataset by hand, or says where it is."""
+
+import sys
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from bench.command import command_line
+
+
+def main() -> int:
+    """Finds or trains the prior; prints its path."""
+
+    def one(config: DictConfig) -> None:
+        from bench.config import build
+        from bench.environment import pick_device
+        from bench.prior_store import find, make_prior
+        from bench.progress import live_progress
+        from bench.stage import prior_settings
+
+        dataset = build(config.dataset, "dataset", list(config.packages))
+        settings = prior_settings(config)
+        path = find(dataset, settings, Path(config.priors_dir))
+        if path is None:
+            with live_progress() as progress:
+                path = make_prior(dataset, settings, Path(config.priors_dir), pick_device(config.device), progress)
+        print(path)
+
+    return command_line(one)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Where priors are kept: some are shipped, others are trained on first use and cached by what they were made from."""
+
+import json
+import time
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from bench.autodecoder import Prior, PriorSettings, distance_samples, fit_error, train
+from bench.environment import describe
+from bench.progress import Report
+from bench.records import digest, to_json, write_text
+from datasets.dataset import Dataset, Split
+from renderers.fields.mlp import Decoder
+
+SHIPPED = Path(__file__).resolve().parent.parent / "datasets" / "priors"
+VERSION = 1  # to be raised when training changes, so that no prior of the old training is taken for a new one
+HELD_OUT = 8  # validation shapes on which a new prior is checked
+
+
+def prior_for(
+    dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
+) -> Prior:
+    """The prior of a dataset: a shipped one, else one in `priors_dir`, else a new one, which is kept there."""
+    path = find(dataset, settings, priors_dir) or make_prior(dataset, settings, priors_dir, device, progress)
+    return _load(path, settings)
+
+
+def find(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | None:
+    """Where the prior of a dataset is, if it was made already."""
+    key = prior_key(dataset, settings)
+    found = [path for folder in (SHIPPED, priors_dir) for path in folder.glob(f"*-{key}.safetensors")]
+    return found[0] if found else None
+
+
+def prior_key(dataset: Dataset, settings: PriorSettings) -> str:
+    """A hash of what decides a prior: the shapes, the settings and the version of the training."""
+    return digest({"version": VERSION, "dataset": dataset.identity(), "settings": asdict(settings)})
+
+
+def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: torch.device, progress: Report) -> Path:
+    """Trains a prior and writes it into `folder` as NAME-KEY.safetensors, with its record as NAME-KEY.json."""
+    started = time.perf_counter()
+    samples = distance_samples(dataset, Split.TRAIN, settings, settings.shapes, progress)
+    sampled = time.perf_counter()
+    prior = train(samples, settings, device, progress)
+    trained = time.perf_counter()
+    record = {
+        "key": prior_key(dataset, settings),
+        "version": VERSION,
+        "dataset": dataset.identity(),
+        "settings": asdict(settings),
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": {"sampling": sampled - started, "training": trained - sampled},
+        "parameters": sum(p.numel() for p in prior.decoder.parameters()),
+        "surface_error": _surface_errors(prior, dataset, samples, settings, progress),
+        "probe": probe(dataset),
+        "environment": describe(device),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{dataset.name}-{record['key']}.safetensors"
+    scratch = path.with_suffix(".partial")
+    save_file({**prior.decoder.state_dict(), "codes": prior.codes}, scratch)
+    write_text(path.with_suffix(".json"), to_json(record))
+    scratch.replace(path)
+    return path
+
+
+def probe(dataset: Dataset) -> list[float]:
+    """Area and volume of the first two training shapes: a test compares them, to see a change of the sampler."""
+    meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]
+    return [number for mesh in meshes for number in (mesh.area, mesh.volume)]
+
+
+def shipped_records() -> list[dict[str, Any]]:
+    """The records of the shipped priors."""
+    return [json.loads(path.read_text()) for path in sorted(SHIPPED.glob("*.json"))]
+
+
+def _surface_errors(
+    prior: Prior, dataset: Dataset, samples: Any, settings: PriorSettings, progress: Report
+) -> dict[str, float]:
+    """Mean |field| near the surface, in scene units, of training and unseen shapes whose codes were fitted anew."""
+    unseen = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress)
+    return {
+        "training": fit_error(prior.decoder, samples.first(HELD_OUT)),
+        "validation": fit_error(prior.decoder, unseen),
+        "mean_shape": fit_error(prior.decoder, unseen, steps=0),
+    }
+
+
+def _load(path: Path, settings: PriorSettings) -> Prior:
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"the prior {path} cannot be read ({error}): delete it, and it is trained again") from error
+    decoder = Decoder(**asdict(settings.network))
+    codes = tensors.pop("codes")
+    decoder.load_state_dict(tensors)
+    return Prior(decoder, codes)

@@ -1,0 +1,88 @@
+"""One self-contained page of all runs: a row each, failed ones too, with pictures, definitions and machine."""
+
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from bench.report import format
+from bench.report.records import read_records
+
+# How a status is coloured; a status of no kind listed here is shown as bad.
+TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute"}
+FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
+# Metrics with a column of their own, and those that say nothing new beside `chamfer_l2`: kept to the details.
+COLUMNS = ("accuracy", "completeness", "fscore", "normal_consistency", "depth_mae", "mask_iou")
+_NOT_OTHERS = ("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", *COLUMNS)
+
+
+def write_index(results_dir: Path) -> Path:
+    """Writes `results_dir/index.html` from all run folders in `results_dir/runs` and gives its path.
+
+    Raises:
+        ValueError: if `results_dir` is not a folder.
+    """
+    records, problems = read_records(results_dir)
+    page = results_dir / "index.html"
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters = (format.number, format.count, format.size, format.seconds)
+    environment.filters |= {function.__name__: function for function in filters}
+    text = environment.get_template("index.html").render(
+        runs=[_run(record, results_dir / "runs" / record["folder"]) for record in records],
+        problems=problems,
+        statuses=Counter(record["status"] for record in records),
+        machines=Counter(_machine(record) for record in records),
+        tones=TONES,
+    )
+    # Names and reasons may hold bytes that are not text; they must not cost the page.
+    page.write_bytes(text.encode("utf-8", "backslashreplace"))
+    return page
+
+
+def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """All that the template shows of one run; links are relative to the page and lead to files that exist."""
+    pictures = sorted(folder.glob("*.png"), key=lambda picture: (picture.name != "summary.png", picture.name))
+    names = sorted({*record["metrics"], *record["metrics_start"]}, key=lambda name: (name in _NOT_OTHERS, name))
+    machine, threads = _machine(record)
+    return {
+        **{name: record[name] for name in ("folder", "task", "renderer", "dataset", "seed", "status", "reason")},
+        **{name: record[name] for name in ("started", "definitions", "environment", "reused", "notes")},
+        **{name: _number(record, name) for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
+        "metrics": {name: _number(record["metrics"], name) for name in names},
+        "start": {name: _number(record["metrics_start"], name) for name in names},
+        "others": [name for name in names if name not in _NOT_OTHERS],
+        "seconds": {name: _number(record["seconds"], name) for name in ("total", *record["seconds"])},
+        "evaluations": {name: _number(record["evaluations"], name) for name in ("value", "gradient", "per_ray")},
+        "machine": machine,
+        "threads": threads,
+        "files": {name: _link(folder / name) for name in FILES if (folder / name).is_file()},
+        "pictures": {picture.name: _link(picture) for picture in pictures},
+    }
+
+
+def _machine(record: dict[str, Any]) -> tuple[str, str]:
+    """What the run's times depend on: processor with accelerator, and threads."""
+    environment = record["environment"]
+    parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
+    label = " + ".join(part for part in parts if part and part != "cpu")
+    return label or format.MISSING, str(environment.get("threads") or format.MISSING)
+
+
+def _number(values: dict[str, Any], name: str) -> int | float | None:
+    """The number of that name; None, shown as missing, where there is none."""
+    value = values.get(name)
+    return value if isinstance(value, int | float) else None
+
+
+def _link(path: Path) -> str:
+    """The address of a file of a run folder as seen from the page, percent-encoded byte for byte."""
+    return "/".join(quote(os.fsencode(part), safe="") for part in ("runs", path.parent.name, path.name))

@@ -1,0 +1,74 @@
+"""The objects that a run's configuration describes, built and ready."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import torch
+from omegaconf import DictConfig
+
+from bench.autodecoder import Prior, PriorSettings
+from bench.config import EvaluationSettings, build, check_top_level
+from bench.environment import pick_device
+from bench.prior_store import prior_for
+from bench.progress import Report
+from bench.tasks.problem import Problem, Task, Unsupported
+from datasets.dataset import Dataset, Split
+from datasets.scene import Scene, make_scene
+from datasets.views import ViewSampler
+from renderers.rendering import Renderer
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a run works with."""
+
+    task: Task
+    renderer: Renderer
+    scene: Scene
+    views: ViewSampler
+    prior: Prior
+    evaluation: EvaluationSettings
+    seed: int
+    device: torch.device
+
+    def problem(self) -> Problem:
+        """The task's problem.
+
+        Raises:
+            Unsupported: where the renderer cannot do what the task or its field needs.
+        """
+        problem = self.task.problem(self.scene, self.prior, self.renderer, seed=self.seed, device=self.device)
+        kind, needs = problem.field().kind, self.renderer.capabilities.needs
+        if kind not in needs:
+            names = " or ".join(need.value for need in needs)
+            raise Unsupported(f"{type(self.renderer).__name__} needs a {names} field, not a {kind.value} field")
+        return problem
+
+
+def set_up(config: DictConfig, progress: Report) -> Stage:
+    """Builds everything that a configuration names; checks all of it before the first slow step.
+
+    Raises:
+        ValueError: for anything in it that cannot be.
+    """
+    check_top_level(config)
+    torch.manual_seed(config.seed)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    device = pick_device(config.device)
+    packages = list(config.packages)
+    renderer = build(config.renderer, "renderer", packages)
+    task = build(config.task, "task", packages)
+    dataset = cast(Dataset, build(config.dataset, "dataset", packages))
+    views = build(config.view, "view", target="datasets.views.ViewSampler")
+    evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
+    settings = prior_settings(config)
+    scene = make_scene(dataset, views, split=Split(config.split), index=config.index)
+    prior = prior_for(dataset, settings, Path(config.priors_dir), device, progress)
+    return Stage(task, renderer, scene, views, prior, evaluation, config.seed, device)
+
+
+def prior_settings(config: DictConfig) -> PriorSettings:
+    """The `prior` node."""
+    return build(config.prior, "prior", target="bench.autodecoder.PriorSettings")

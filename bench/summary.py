@@ -1,0 +1,47 @@
+"""The short table that a run ends with."""
+
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from bench.records import Record
+from bench.report.format import count, number, seconds
+
+ROWS = (  # metric, what it is called, factor, better when
+    ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),
+    ("accuracy", "accuracy (x1000)", 1000.0, "lower"),
+    ("completeness", "completeness (x1000)", 1000.0, "lower"),
+    ("fscore", "F-score", 1.0, "higher"),
+    ("normal_consistency", "normal consistency", 1.0, "higher"),
+    ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
+    ("mask_iou", "mask IoU", 1.0, "higher"),
+)
+
+
+def show(folder: Path, record: Record, index: Path) -> None:
+    """Prints what a run came to; the last line on standard output is its folder."""
+    console = Console(highlight=False)
+    table = Table(box=box.SIMPLE_HEAD, title=f"{record.task}, {record.renderer}, {record.scene or record.dataset}")
+    for heading in ("", "before", "after", "better"):
+        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
+    for name, label, factor, better in ROWS:
+        if name in record.metrics_start:
+            before, after = record.metrics_start[name], record.metrics.get(name)
+            table.add_row(label, number(before, factor), number(after, factor), better)
+    if table.row_count:
+        console.print(table)
+    if record.evaluations:
+        loop = record.seconds["forward"] + record.seconds["backward"]
+        console.print(
+            f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "
+            f"{count(record.evaluations['value'])} values, {count(record.evaluations['gradient'])} gradients, "
+            f"{number(record.evaluations['per_ray'])} values a ray and iteration"
+        )
+    for note in record.notes:
+        console.print(f"note: {note}")
+    console.print(f"report: {index}")
+    if record.status != "ok":
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"{record.status}: {record.reason}", markup=False)
+    print(folder)
