@@ -104,6 +104,19 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
     return _typed(cls, arguments, name)
 
 
+def load(group: str, name: str, **arguments: Any) -> Any:
+    """The object of conf/GROUP/NAME.yaml, for use as a library: `load("renderer", "dist", steps=100)`.
+
+    Raises:
+        ValueError: for an unknown group or name, an unknown key or a value of the wrong type.
+    """
+    path = CONF / group / f"{name}.yaml"
+    if not path.is_file():
+        known = [file.stem for file in (CONF / group).glob("*.yaml")]
+        raise ValueError(f"unknown {group} {name!r}{nearest(name, known)}")
+    return build(OmegaConf.merge(OmegaConf.load(path), arguments), group)  # type: ignore[arg-type]
+
+
 def nearest(word: str, known: list[str]) -> str:
     """A hint at the end of an error message: the nearest known names, or all of them."""
     close = get_close_matches(word, known, n=3, cutoff=0.5)

@@ -64,20 +64,21 @@ def _summary(looks: tuple[Looks, ...], given: tuple[View, np.ndarray], title: st
         "silhouette error": _show_silhouette(looks[2]),
         "from behind": _show_shaded,
     }
-    figure = Figure(figsize=(9.6, 7.6), layout="constrained")
+    figure = Figure(figsize=(9.2, 7.4), layout="constrained")
     axes = figure.subplots(3, 4)
-    shared = _depth_range(looks)
     for row, look in zip(axes, looks, strict=True):
         for axis, (name, show) in zip(row, columns.items(), strict=True):
             if look is looks[2] and name == "silhouette error":
                 _show_given(axis, *given)
-                axis.set_title("what was given")
+                axis.set_xlabel(f"given: mask and {int(given[1].sum())} depths")
             else:
-                image = show(axis, look, shared)
-                axis.set_title(name if look is looks[0] else "")
-                if name == "depth" and look is looks[2]:
-                    figure.colorbar(image, ax=axes[:, 0], location="left", shrink=0.5, label="depth (scene units)")
-        row[1].text(-1.22, 0.5, look.title, transform=row[1].transAxes, rotation=90, va="center", weight="bold")
+                image = show(axis, look, looks)
+            if look is looks[0]:
+                axis.set_title(name)
+            if name == "depth":
+                axis.set_ylabel(look.title, weight="bold")
+                depth_image = image
+    figure.colorbar(depth_image, ax=axes[:, 0], location="bottom", shrink=0.85, pad=0.02, label="camera z, scene units")
     figure.suptitle(title)
     return figure
 
@@ -86,7 +87,7 @@ def _row(looks: tuple[Looks, ...], show: Any, title: str) -> Figure:
     figure = Figure(figsize=(3.2 * len(looks) + 0.6, 3.5), layout="constrained")
     axes = figure.subplots(1, len(looks))
     for axis, look in zip(axes, looks, strict=True):
-        image = show(axis, look, _depth_range(looks))
+        image = show(axis, look, looks)
         axis.set_title(look.title)
     if show is _show_depth:
         figure.colorbar(image, ax=axes, shrink=0.8)
@@ -97,7 +98,7 @@ def _row(looks: tuple[Looks, ...], show: Any, title: str) -> Figure:
 def _input(view: View, observed: Bool[np.ndarray, "height width"]) -> Figure:
     figure = Figure(figsize=(4.6, 4.0), layout="constrained")
     axis = figure.subplots()
-    points = _show_given(axis, view, observed)
+    points = _show_given(axis, view, observed, inches=3.5)
     figure.colorbar(points, ax=axis, label="depth (scene units)", shrink=0.8)
     axis.set_title(f"Given: the mask (grey) and {int(observed.sum())} depths")
     return figure
@@ -117,42 +118,62 @@ def _curve(curve: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _show_depth(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+def _show_depth(axis: Any, look: Looks, looks: tuple[Looks, ...]) -> Any:
+    low, high = _depth_range(looks)
     shown = np.where(look.front.mask.numpy(), look.front.depth.numpy(), np.nan)
-    return _bare(axis).imshow(shown, cmap="viridis_r", vmin=limits[0], vmax=limits[1], interpolation="nearest")
+    window = _window([other.front.mask.numpy() for other in looks])
+    return _bare(axis).imshow(shown[window], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
 
 
-def _show_normals(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
-    view = look.front
-    flipped = _camera_normals(view) * [1, -1, -1]  # to right, up, towards the camera
-    return _bare(axis).imshow(np.where(view.mask.numpy()[..., None], flipped / 2 + 0.5, 1.0).clip(0, 1))
+def _show_normals(axis: Any, look: Looks, looks: tuple[Looks, ...]) -> Any:
+    flipped = _camera_normals(look.front) * [1, -1, -1]  # to right, up, towards the camera
+    shown = np.where(look.front.mask.numpy()[..., None], flipped / 2 + 0.5, 1.0).clip(0, 1)
+    return _bare(axis).imshow(shown[_window([other.front.mask.numpy() for other in looks])])
 
 
-def _show_shaded(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
-    view = look.back
-    shade = 0.25 + 0.75 * (_camera_normals(view) @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
-    return _bare(axis).imshow(np.where(view.mask.numpy(), shade, 1.0), cmap="gray", vmin=0, vmax=1)
+def _show_shaded(axis: Any, look: Looks, looks: tuple[Looks, ...]) -> Any:
+    shade = 0.25 + 0.75 * (_camera_normals(look.back) @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
+    shown = np.where(look.back.mask.numpy(), shade, 1.0)
+    window = _window([other.back.mask.numpy() for other in looks])
+    return _bare(axis).imshow(shown[window], cmap="gray", vmin=0, vmax=1)
 
 
 def _show_silhouette(truth: Looks) -> Any:
-    def show(axis: Any, look: Looks, limits: tuple[float, float]) -> Any:
+    def show(axis: Any, look: Looks, looks: tuple[Looks, ...]) -> None:
         found, true = look.front.mask.numpy(), truth.front.mask.numpy()
         cases = [(found & true)[..., None], (true & ~found)[..., None], (found & ~true)[..., None]]
         image = np.select(cases, [BOTH, LOST, FALSE], PAPER)
-        lost, false = int((true & ~found).sum()), int((found & ~true).sum())
-        _bare(axis).imshow(image, interpolation="nearest")
-        axis.text(0.02, 0.06, f"{lost} px lost", color=LOST, transform=axis.transAxes, fontsize=8)
-        axis.text(0.02, 0.01, f"{false} px false", color=FALSE, transform=axis.transAxes, fontsize=8)
+        lost, false = 100 * (true & ~found).sum() / true.sum(), 100 * (found & ~true).sum() / true.sum()
+        window = _window([other.front.mask.numpy() for other in (*looks, truth)])
+        _bare(axis).imshow(image[window], interpolation="nearest")
+        axis.text(0.02, 0.09, f"lost {lost:.1f} %", color=LOST, transform=axis.transAxes, fontsize=8)
+        axis.text(0.02, 0.02, f"false {false:.1f} %", color=FALSE, transform=axis.transAxes, fontsize=8)
 
     return show
 
 
-def _show_given(axis: Any, view: View, observed: Bool[np.ndarray, "height width"]) -> Any:
+def _show_given(axis: Any, view: View, observed: Bool[np.ndarray, "height width"], inches: float = 2.0) -> Any:
+    """The mask, and a square of a pixel's size for each observed depth, on axes that are `inches` wide."""
     mask = view.mask.numpy()
+    rows, columns = _window([mask])
     _bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    rows, columns = np.nonzero(observed)
-    size = max(2.0, 600 / max(mask.shape))
-    return axis.scatter(columns, rows, c=view.depth.numpy()[rows, columns], s=size, cmap="viridis_r", marker="s")
+    axis.set_xlim(columns.start - 0.5, columns.stop - 0.5)
+    axis.set_ylim(rows.stop - 0.5, rows.start - 0.5)
+    at = np.nonzero(observed)
+    size = (72 * inches / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
+    return axis.scatter(at[1], at[0], c=view.depth.numpy()[at], s=size, cmap="viridis_r", marker="s", linewidths=0)
+
+
+def _window(masks: list[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
+    """The square part of an image that holds all masks, with a margin."""
+    together = np.any(masks, axis=0)
+    if not together.any():
+        return slice(0, together.shape[0]), slice(0, together.shape[1])
+    low = np.array([np.nonzero(together.any(1 - axis))[0][0] for axis in (0, 1)])
+    high = np.array([np.nonzero(together.any(1 - axis))[0][-1] + 1 for axis in (0, 1)])
+    size = min(int((high - low).max() * 1.12) + 2, min(together.shape))
+    start = np.clip((low + high - size) // 2, 0, np.array(together.shape) - size)
+    return slice(start[0], start[0] + size), slice(start[1], start[1] + size)
 
 
 def _camera_normals(view: View) -> Float[np.ndarray, "height width 3"]:

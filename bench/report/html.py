@@ -57,6 +57,7 @@ def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
         **{name: record[name] for name in ("folder", "task", "renderer", "dataset", "seed", "status", "reason")},
         **{name: record[name] for name in ("started", "definitions", "environment", "reused", "notes")},
         **{name: _number(record, name) for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
+        "scene": record.get("scene") or record["dataset"],  # a run that failed early never had a scene
         "metrics": {name: _number(record["metrics"], name) for name in names},
         "start": {name: _number(record["metrics_start"], name) for name in names},
         "others": [name for name in names if name not in _NOT_OTHERS],
