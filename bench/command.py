@@ -33,11 +33,11 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         program()
     except KeyboardInterrupt:
         return _tell("stopped by Ctrl-C", INTERRUPTED)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
+        return _tell(_explain(error), USAGE)
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         return _tell(f"{error.strerror or error}{where}: free space, or set results_dir to a folder you can write")
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
-        return _tell(_explain(error), USAGE)
     return 0
 
 

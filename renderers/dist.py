@@ -25,14 +25,14 @@ class DIST:
         right direction at each pixel and a wrong scale, alpha * samples * cos(angle of incidence); see
         `gradients.approximate`. That of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
-    Deviates from the paper: `extra_step_cap`, `silhouette_signed` and `silhouette_average` are ours, `step_clamp` is
-        the official code's; each is named, and off in the paper's setting. A ray that begins at negative values stops
-        at once and says so. Coarse to fine applies to rays that say that they are an image; others march at full
-        resolution.
+    Deviates from the paper: `extra_step_cap`, `careful_split`, `silhouette_signed` and `silhouette_average` are ours,
+        `step_clamp` is the official code's; each is named, and off in the paper's setting. A ray that begins at
+        negative values stops at once and says so. Coarse to fine applies to rays that say that they are an image;
+        others march at full resolution.
 
     Args:
         steps: most marching steps a ray.
-        epsilon, alpha, extra_step_cap, step_clamp, active_only: see `march.Stepping`.
+        epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split: see `march.Stepping`.
         coarse_to_fine: begin with a ray for each 4 x 4 pixels.
         samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
@@ -46,6 +46,7 @@ class DIST:
     step_clamp: float | None
     active_only: bool
     coarse_to_fine: bool
+    careful_split: bool
     samples: int
     sphere_radius: float
     silhouette_signed: bool
@@ -109,7 +110,12 @@ class DIST:
 
     def _trace(self, field: Field, rays: Rays) -> Front:
         stepping = Stepping(
-            self.epsilon, self.alpha, self.extra_step_cap, self.step_clamp, active_only=self.active_only
+            self.epsilon,
+            self.alpha,
+            self.extra_step_cap,
+            self.step_clamp,
+            active_only=self.active_only,
+            careful_split=self.careful_split,
         )
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(

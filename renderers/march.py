@@ -16,6 +16,7 @@ from renderers.rendering import Status
 
 PYRAMID = (4, 2)  # pixels a side of a coarse ray's block, at the first levels (DIST, Sec. 3.2)
 PYRAMID_STEPS = 3  # steps at each of these levels
+CAREFUL = 2.0  # careful_split: the closest sample is not the closest point, so "closer" allows for twice the distance
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Stepping:
         extra_step_cap: bound on (alpha - 1) times the value, the part of a step that may pass a surface; None for none.
         step_clamp: bound on the magnitude of a whole step; None for none.
         active_only: ask the field only for rays that have not finished; else for every ray that meets the sphere.
+        careful_split: a ray goes on not from where its coarse ray is, but from where that came closest to the surface,
+            if it came about as close as the two rays lie apart there. Else rays beside an edge begin behind it.
     """
 
     epsilon: float
@@ -35,6 +38,7 @@ class Stepping:
     extra_step_cap: float | None
     step_clamp: float | None
     active_only: bool
+    careful_split: bool
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """The signed step along the ray after the field gave `value`."""
@@ -76,17 +80,24 @@ class Front:
             sample_value=torch.full_like(entry, torch.inf)[:, None].repeat(1, samples),
         )
 
-    def split(self, parent: Int[Tensor, "children"], rays: Rays, radius: float) -> "Front":
-        """The front of finer rays, each going on from where its coarse `parent` is.
+    def split(
+        self, parent: Int[Tensor, "children"], coarse: Rays, rays: Rays, *, radius: float, careful: bool
+    ) -> "Front":
+        """The front of finer rays, each going on from where its coarse `parent` is; for `careful`, see Stepping.
 
         A ray whose coarse ray met no sphere, or started inside the shape, begins anew. One whose coarse ray has left
         the sphere has left it too, and keeps the coarse ray's samples, the only ones that it has.
         """
         child = Front.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
         inherits = self.meets[parent] & (self.status[parent] != Status.STARTED_INSIDE)
-        child.distance = torch.where(inherits, torch.maximum(self.distance[parent], child.distance), child.distance)
+        start = self.distance[parent]
+        if careful:
+            closest, least = self.sample_distance[parent, 0], self.sample_value[parent, 0].abs()
+            apart = torch.linalg.vector_norm(coarse[parent].at(closest) - rays.at(closest), dim=-1)
+            start = torch.where(least <= CAREFUL * apart, closest, start)
+        child.distance = torch.where(inherits, torch.maximum(start, child.distance), child.distance)
         child.fresh = ~inherits
-        gone = child.meets & inherits & (child.distance > child.leave)
+        gone = child.meets & inherits & (child.distance >= child.leave)
         child.active &= ~gone
         child.status[gone] = Status.MISS
         child.sample_distance[gone] = self.sample_distance[parent[gone]]
@@ -126,7 +137,8 @@ def march_coarse_to_fine(
         march(field, level.flat(), front, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
         finer = rays.coarser(factor) if factor > 1 else rays
-        front = front.split(_parents(level.shape, finer.shape, front.status.device), finer.flat(), radius)
+        parents = _parents(level.shape, finer.shape, front.status.device)
+        front = front.split(parents, level.flat(), finer.flat(), radius=radius, careful=stepping.careful_split)
         level = finer
     march(field, level.flat(), front, stepping, steps)
     return front
