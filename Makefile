@@ -8,7 +8,7 @@ demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
 
 test: .venv/ready ## set up once, then the tests (under 6 minutes on 2 cores)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: .venv/ready ## the minutes-long tests
 	$(BIN)/python -m pytest -m slow

@@ -20,7 +20,7 @@ def main() -> int:
         show(folder, record, write_index(folder.parent.parent))
         statuses.append(record.status)
         if record.status == "killed":
-            raise KeyboardInterrupt  # a sweep stops with its run
+            raise KeyboardInterrupt(f"killed: {record.reason}")  # a sweep stops with its run
 
     code = command_line(one)
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)

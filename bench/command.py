@@ -9,7 +9,7 @@ from collections.abc import Callable
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -28,11 +28,27 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     """
     register()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
-    program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)
+    unwritable: list[OSError] = []
+
+    def guarded(config: DictConfig) -> None:
+        try:
+            job(config)
+        except OSError as error:  # Hydra would print a line of its own about it
+            unwritable.append(error)
+
+    program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         program()
-    except KeyboardInterrupt:
-        return _tell("stopped by Ctrl-C", INTERRUPTED)
+        if unwritable:
+            raise unwritable[0]
+    except KeyboardInterrupt as error:
+        return _tell(str(error) or "stopped by Ctrl-C", INTERRUPTED)
+    except OverrideParseException as error:
+        return _tell(
+            f"cannot read {error.override!r}: write key=value, and quote a value with special characters as "
+            f"'key=\"value\"'",
+            USAGE,
+        )
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         return _tell(_explain(error), USAGE)
     except OSError as error:
@@ -42,7 +58,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
 
 
 def _tell(message: str, code: int = FAILED) -> int:
-    if any(argument.replace(" ", "") == "verbose=true" for argument in sys.argv[1:]):
+    if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
     print(f"error: {message}", file=sys.stderr)
     return code

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from datasets.dataset import Split
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
+LEAST = {"seed": 0, "index": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1, "evaluation.picture": 4}
 OURS = ("renderers", "datasets", "bench")
 
 
@@ -66,7 +67,9 @@ def check_top_level(config: DictConfig) -> None:
     """Raises ValueError for a value of the top level that no part checks by itself."""
     if config.split not in list(Split):
         raise ValueError(f"split must be one of {', '.join(Split)}, not {config.split!r}")
-    for name, least in (("index", 0), ("threads", 1), ("evaluation.grid", 8), ("evaluation.points", 1)):
+    if not config.evaluation.fscore_threshold > 0:
+        raise ValueError(f"evaluation.fscore_threshold must be positive, not {config.evaluation.fscore_threshold}")
+    for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
         if value is not None and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
@@ -135,6 +138,7 @@ def _typed(cls: type, arguments: dict, name: str) -> Any:
         wanted = _type_name(types.get(str(error.full_key).split(".")[0], ""))
         raise ValueError(f"{name}.{error.full_key}: {str(error).splitlines()[0]} (expected {wanted})") from None
     values: Any = OmegaConf.to_container(flat, throw_on_missing=False)
+    values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
     values |= {key: build(arguments[key], f"{name}.{key}", target=_path(types[key])) for key in nested}
     missing = [key for key, value in values.items() if value == MISSING]
     if missing:

@@ -102,4 +102,4 @@ def _load(path: Path, settings: PriorSettings) -> Prior:
     decoder = Decoder(**asdict(settings.network))
     codes = tensors.pop("codes")
     decoder.load_state_dict(tensors)
-    return Prior(decoder, codes)
+    return Prior(decoder.requires_grad_(False), codes)

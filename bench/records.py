@@ -85,7 +85,7 @@ def digest(data: Any) -> str:
 def write_text(path: Path, text: str) -> None:
     """Writes a file beside its place, flushes it to the disk and renames it there."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    with scratch.open("w") as file:
+    with scratch.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
@@ -94,14 +94,15 @@ def write_text(path: Path, text: str) -> None:
 
 def to_json(data: Any) -> str:
     """JSON in which the floats that it lacks stand as the strings "inf", "-inf" and "nan"."""
-    return json.dumps(_plain(data), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The same data with the floats that JSON lacks as the strings "inf", "-inf" and "nan"."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float) and not isfinite(value):
         return str(value)
     return value

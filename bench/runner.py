@@ -4,6 +4,7 @@ import json
 import logging
 import time
 import traceback
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from bench.judge import Judgement, judge
 from bench.metrics import DEFINITIONS
 from bench.optimise import Course, optimise
 from bench.progress import Report, live_progress
-from bench.records import Record, RunStatus, claim_folder, digest, write_text
+from bench.records import Record, RunStatus, claim_folder, digest, plain, write_text
 from bench.stage import Stage, set_up
 from bench.tasks.problem import Problem, Unsupported
 
@@ -45,10 +46,10 @@ def run(config: DictConfig) -> tuple[Path, Record]:
     """
     choices = _choices()
     # As far as it can be resolved: a value that is missing is an error of the run, not of its record.
-    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    identity = {key: value for key, value in plain.items() if key not in NEUTRAL}
+    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    identity = {key: value for key, value in values.items() if key not in NEUTRAL}
     folder = claim_folder(Path(config.results_dir), "-".join([*choices.values(), digest(identity)[:8]]))
-    record = Record(folder.name, **choices, seed=config.seed, config=plain)
+    record = Record(folder.name, **choices, seed=config.seed, config=values)
     record.write(folder)
     log = _open_log(folder)
     started = time.perf_counter()
@@ -103,10 +104,10 @@ def _execute(config: DictConfig, folder: Path, record: Record, progress: Report)
 
 def _optimise(stage: Stage, problem: Problem, folder: Path, course: Course, progress: Report) -> None:
     """The loop, with each line of its curve written as it comes."""
-    with (folder / "curve.jsonl").open("w", buffering=1) as curve:
+    with (folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
         def on_step(line: dict[str, Any]) -> None:
-            curve.write(json.dumps(line) + "\n")
+            curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
             progress("optimising", line["iteration"] + 1, stage.task.optimiser.iterations, line["total"])
 
         optimise(problem, stage.task.optimiser, stage.device, course=course, on_step=on_step)
@@ -156,17 +157,22 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+class _LogFile(logging.FileHandler):
+    """A log file that a full disk silences, but does not make a nuisance of."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """The record of the run says what went wrong."""
+
+
 def _open_log(folder: Path) -> logging.Logger:
-    log = logging.getLogger(f"bench.run.{folder.name}")
-    log.setLevel(logging.INFO)
-    log.propagate = False
-    handler = logging.FileHandler(folder / "log.txt")
+    log = logging.Logger(folder.name, logging.INFO)  # not registered: Hydra disables registered ones between jobs
+    handler = _LogFile(folder / "log.txt", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     log.addHandler(handler)
     return log
 
 
 def _close_log(log: logging.Logger) -> None:
-    for handler in list(log.handlers):
-        handler.close()
-        log.removeHandler(handler)
+    for handler in log.handlers:
+        with suppress(OSError):
+            handler.close()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bench.records import Record
@@ -23,7 +24,9 @@ ROWS = (  # metric, what it is called, factor, better when
 def show(folder: Path, record: Record, index: Path) -> None:
     """Prints what a run came to; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, title=f"{record.task}, {record.renderer}, {record.scene or record.dataset}")
+    table = Table(
+        box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.renderer}, {record.scene or record.dataset}")
+    )
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
     for name, label, factor, better in ROWS:
@@ -40,8 +43,8 @@ def show(folder: Path, record: Record, index: Path) -> None:
             f"{number(record.evaluations['per_ray'])} values a ray and iteration"
         )
     for note in record.notes:
-        console.print(f"note: {note}")
-    console.print(f"report: {index}")
-    if record.status != "ok":
+        print(f"note: {note}")
+    print(f"report: {index}")
+    if record.status not in ("ok", "killed"):  # the program ends by telling of killed
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"{record.status}: {record.reason}", markup=False)
     print(folder)

@@ -1,7 +1,7 @@
 """What a set of shapes is to the rest: numbered closed meshes in three parts that share none."""
 
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from datasets.mesh import Mesh
 
@@ -16,6 +16,7 @@ class Split(StrEnum):
     TEST = "test"
 
 
+@runtime_checkable
 class Dataset(Protocol):
     """Numbered shapes, each a closed mesh in the unit sphere."""
 

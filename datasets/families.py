@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from math import inf
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from datasets.dataset import Split, seed_of
 from datasets.extract import extract
 from datasets.mesh import Mesh, normalise
-from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.checks import check_at_least, check_choice, check_share
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union
 
 VERSION = 1  # to be raised when a builder changes, so that no prior of the old shapes is taken for the new ones
@@ -33,12 +34,16 @@ class Family:
     name: str
     resolution: int
     radius: float
-    ranges: dict[str, list[float]]
+    ranges: dict[str, Any]
 
     def __post_init__(self) -> None:
         check_choice("name", self.name, tuple(BUILDERS))
+        for name, bounds in self.ranges.items():
+            numbers = len(bounds) == 2 and all(isinstance(bound, int | float) for bound in bounds)
+            if not numbers or not -inf < bounds[0] <= bounds[1] < inf:
+                raise ValueError(f"dataset.ranges.{name} must be two rising numbers, not {bounds}: write [0.1, 0.2]")
         check_at_least("resolution", self.resolution, 16, "128 keeps legs and wings")
-        check_positive("radius", self.radius, "below 1, so that rays can start outside the shape")
+        check_share("dataset.radius", self.radius, "rays start on the unit sphere, 0.97 leaves them room")
 
     def draw(self, split: Split, index: int) -> dict[str, float]:
         """The parameters of a shape."""

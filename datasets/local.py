@@ -12,7 +12,7 @@ from datasets.dataset import Split, seed_of
 from datasets.deform import deform
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
-from renderers.checks import check_at_least, check_positive
+from renderers.checks import check_at_least, check_share
 
 VERSION = 1  # to be raised when repair or deformation changes the shapes
 HELD_OUT = 0.2  # share of a folder's meshes that goes to validation, and to test
@@ -37,7 +37,7 @@ class LocalMeshes:
     strength: float
 
     def __post_init__(self) -> None:
-        check_positive("dataset.radius", self.radius, "below 1, so that rays can start outside the shape")
+        check_share("dataset.radius", self.radius, "rays start on the unit sphere, 0.97 leaves them room")
         check_at_least("dataset.strength", self.strength, 0, "0 switches deformations off")
         find_meshes(self.path)
 
@@ -49,7 +49,8 @@ class LocalMeshes:
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh; its `repairs` say what was mended in the file."""
         files = self.files(split)
-        mesh = _load(str(files[index % len(files)]), self.radius)
+        file = files[index % len(files)]
+        mesh = _load(file, file.stat().st_mtime_ns, self.radius)
         alone = len(find_meshes(self.path)) == 1
         if index < len(files) and (split is Split.TRAIN or not alone):
             return mesh
@@ -79,5 +80,6 @@ class LocalMeshes:
 
 
 @lru_cache(maxsize=64)
-def _load(path: str, radius: float) -> Mesh:
+def _load(path: Path, changed: int, radius: float) -> Mesh:
+    """The mesh of a file, read again when the file has changed."""
     return normalise(load_mesh(path), radius)

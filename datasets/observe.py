@@ -19,28 +19,33 @@ def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "h
         ValueError: for anything else, or for more points than the foreground has.
     """
     foreground = view.mask.flatten().nonzero().squeeze(-1)
-    count = _count(str(points).strip(), foreground.numel())
-    order = torch.randperm(foreground.numel(), generator=torch.Generator().manual_seed(seed))
+    available = foreground.numel()
+    amount, is_share = parse_amount(points)
+    count = max(1, round(available * amount)) if is_share else round(amount)
+    if count > available:
+        raise ValueError(f"points must be at most the {available} pixels of the shape, not {points}: raise resolution")
+    order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
     observed = torch.zeros(view.mask.numel(), dtype=torch.bool)
-    observed[foreground[order[:count]].to("cpu")] = True
+    observed[foreground[order[:count]]] = True
     return observed.view(view.mask.shape)
 
 
-def _count(points: str, available: int) -> int:
-    remedy = 'write "dense", a share such as "10%", or a number such as 100'
-    if points == "dense":
-        return available
-    number = points.removesuffix("%")
+def parse_amount(points: str | int) -> tuple[float, bool]:
+    """An amount such as "dense", "10%" or 100, and whether it is a share of what there is.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    text, remedy = str(points).strip(), 'write "dense", a share such as "10%", or a number such as 100'
+    if text == "dense":
+        return 1.0, True
+    is_share = text.endswith("%")
     try:
-        value = float(number) if points.endswith("%") else int(number)
+        value = float(text.removesuffix("%")) / 100 if is_share else float(int(text))
     except ValueError:
-        raise ValueError(f"points must be an amount, not {points!r}: {remedy}") from None
-    if value <= 0:
-        raise ValueError(f"points must be positive, not {points!r}: {remedy}")
-    if points.endswith("%"):
-        if value > 100:
-            raise ValueError(f"points must be at most 100%, not {points!r}: {remedy}")
-        return max(1, round(available * value / 100))
-    if value > available:
-        raise ValueError(f"points must be at most the {available} pixels of the shape, not {points}: raise resolution")
-    return int(value)
+        raise ValueError(f"points must be an amount, not {text!r}: {remedy}") from None
+    if not value > 0:
+        raise ValueError(f"points must be positive, not {text!r}: {remedy}")
+    if is_share and value > 1:
+        raise ValueError(f"points must be at most 100%, not {text!r}: {remedy}")
+    return value, is_share

@@ -1,7 +1,7 @@
 """Where cameras stand."""
 
 from dataclasses import dataclass
-from math import radians, tan
+from math import inf, radians, tan
 
 import numpy as np
 import torch
@@ -31,9 +31,11 @@ class ViewSampler:
 
     def __post_init__(self) -> None:
         check_positive("distance", self.distance, "2.5 sees the whole unit sphere at 50 degrees")
-        check_at_least("resolution", self.resolution, 4, "set scale.resolution=64")
+        check_at_least("view.resolution", self.resolution, 4, "set scale.resolution=64 or view.resolution=64")
         if not 0 < self.field_of_view < 180:
             raise ValueError(f"field_of_view must lie between 0 and 180 degrees, not {self.field_of_view}")
+        if not -inf < self.azimuth[0] <= self.azimuth[1] < inf:
+            raise ValueError(f"azimuth must rise and be finite, in degrees, not {list(self.azimuth)}")
         if not -90 < self.elevation[0] <= self.elevation[1] < 90:
             raise ValueError(f"elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
 

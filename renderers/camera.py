@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -25,6 +25,8 @@ class Rays:
                 f"origins and directions must both have shape [*rays, 3], not {tuple(self.origins.shape)} and "
                 f"{tuple(self.directions.shape)}: expand one to the other"
             )
+        if not bool(torch.isfinite(self.origins).all()):
+            raise ValueError("origins must be finite, not NaN or infinite: check the camera")
         length = torch.linalg.vector_norm(self.directions.detach(), dim=-1)
         if length.numel() and not bool(((length - 1).abs() < 1e-3).all()):
             raise ValueError("directions must have unit length: pass them through torch.nn.functional.normalize")
@@ -42,7 +44,7 @@ class Rays:
         """The points at `distance` along the rays."""
         return self.origins + distance[..., None] * self.directions
 
-    def __getitem__(self, index: Bool[Tensor, "*rays"]) -> "Rays":
+    def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, "n"]) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
 
     def to(self, device: torch.device) -> "Rays":
@@ -83,6 +85,8 @@ class Camera:
         if self.height < 1 or self.width < 1:
             raise ValueError(f"height and width must be at least 1 pixel, not {self.height} x {self.width}")
         rotation = self.world_to_camera.detach()[:3, :3]
+        if not bool(torch.isfinite(self.world_to_camera).all()):
+            raise ValueError("world_to_camera must hold finite numbers, not NaN or infinity: check the pose")
         identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
         if not torch.allclose(rotation @ rotation.T, identity, atol=1e-4) or torch.linalg.det(rotation) < 0:
             raise ValueError("world_to_camera must hold a rotation (orthogonal, determinant +1) in its top left 3 x 3")

@@ -15,6 +15,12 @@ def check_at_least(name: str, value: float, least: float, remedy: str) -> None:
         raise ValueError(f"{name} must be at least {least}, not {value}: {remedy}")
 
 
+def check_share(name: str, value: float, remedy: str) -> None:
+    """Raises ValueError unless `value` is above 0 and at most 1."""
+    if not 0 < value <= 1:
+        raise ValueError(f"{name} must be above 0 and at most 1, not {value}: {remedy}")
+
+
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Raises ValueError unless `value` is one of `choices`."""
     if value not in choices:

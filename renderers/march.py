@@ -54,6 +54,7 @@ class Front:
     """Where the front ends of n rays are, and the `samples` least field values that each has met."""
 
     distance: Float[Tensor, "n"]
+    entry: Float[Tensor, "n"]  # where it entered the bounding sphere; a ray that is led behind it began inside
     leave: Float[Tensor, "n"]
     meets: Bool[Tensor, "n"]  # the ray meets the bounding sphere
     active: Bool[Tensor, "n"]
@@ -70,6 +71,7 @@ class Front:
         status = torch.where(meets, Status.OUT_OF_STEPS, Status.MISS).to(torch.int8)
         return Front(
             distance=entry,
+            entry=entry.clone(),
             leave=leave,
             meets=meets,
             active=meets.clone(),
@@ -86,7 +88,7 @@ class Front:
         """The front of finer rays, each going on from where its coarse `parent` is; for `careful`, see Stepping.
 
         A ray whose coarse ray met no sphere, or started inside the shape, begins anew. One whose coarse ray has left
-        the sphere has left it too, and keeps the coarse ray's samples, the only ones that it has.
+        the sphere has left it too. The samples of a coarse ray that hit nothing are kept: its nearest may lie behind.
         """
         child = Front.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
         inherits = self.meets[parent] & (self.status[parent] != Status.STARTED_INSIDE)
@@ -100,8 +102,9 @@ class Front:
         gone = child.meets & inherits & (child.distance >= child.leave)
         child.active &= ~gone
         child.status[gone] = Status.MISS
-        child.sample_distance[gone] = self.sample_distance[parent[gone]]
-        child.sample_value[gone] = self.sample_value[parent[gone]]
+        keeps = child.meets & inherits & (self.status[parent] != Status.HIT)
+        child.sample_distance[keeps] = self.sample_distance[parent[keeps]]
+        child.sample_value[keeps] = self.sample_value[parent[keeps]]
         return child
 
 
@@ -164,6 +167,10 @@ def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], s
     step = torch.where(converged, value, torch.where(inside, 0.0, stepping.length(value)))
     moved = distance + step
     left = ~converged & (moved > front.leave[asked])
+    behind = moved < front.entry[asked] - stepping.epsilon
+    inside |= behind
+    converged &= ~behind
+    moved = torch.where(behind, front.entry[asked], moved)
 
     status = torch.full_like(front.status[asked], Status.OUT_OF_STEPS)
     status[left] = Status.MISS

@@ -26,4 +26,5 @@ def hinge_silhouette_loss(
     """
     soft = (closest if signed else closest.abs()) - epsilon
     violation = torch.where(mask, soft, -soft).clamp_min(0)
-    return violation.mean() if average == "all" else violation.sum() / (violation > 0).sum().clamp_min(1)
+    count = torch.full_like(mask, True) if average == "all" else violation > 0
+    return violation.sum() / count.sum().clamp_min(1)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.autodecoder import Prior
 from bench.tasks.problem import OptimiserSettings, Unsupported
-from datasets.observe import observed_pixels
+from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -42,6 +42,7 @@ class Completion:
     learning_rate: float
 
     def __post_init__(self) -> None:
+        parse_amount(self.points)
         check_choice("task.code_average", self.code_average, ("sum", "mean"))
         check_at_least("task.iterations", self.iterations, 1, "the paper uses 100")
         check_positive("task.learning_rate", self.learning_rate, "the paper uses 1e-2")

@@ -1,7 +1,7 @@
 """What a task is to the runner: it builds a Problem, which has free parameters, a loss, and a field to judge."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool
@@ -25,6 +25,7 @@ class OptimiserSettings:
     learning_rate: float
 
 
+@runtime_checkable
 class Problem(Protocol):
     """An inverse problem. Every evaluation that `loss` makes is counted in `counts`."""
 
@@ -42,6 +43,7 @@ class Problem(Protocol):
         ...
 
 
+@runtime_checkable
 class Task(Protocol):
     """Builds problems. It names no renderer."""
 

@@ -87,7 +87,7 @@ def sphere(radius: Numbers = 1.0, center: Numbers = (0.0, 0.0, 0.0)) -> Shape:
 
 def plane(normal: Numbers = (0.0, 1.0, 0.0), offset: Numbers = 0.0) -> Shape:
     """The half space below `normal . x = offset`; exact distance. `normal` [3] need not have unit length."""
-    return Shape(lambda p: (p * torch.nn.functional.normalize(_like(normal, p), dim=-1)).sum(-1) - _like(offset, p))
+    return Shape(lambda p: ((p * _like(normal, p)).sum(-1) - _like(offset, p)) / _norm(_like(normal, p)))
 
 
 def box(half_sizes: Numbers) -> Shape:

@@ -1,0 +1,138 @@
+"""The decoder with its code folded in against the plain network on concatenated inputs, in float64."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from renderers.field import Field, Kind
+from renderers.fields import mlp
+from renderers.fields.mlp import Decoder
+
+NETWORKS = {
+    "no-skip": {"layers": 3, "width": 8, "code_length": 4, "skip": 0, "narrow": False},
+    "skip": {"layers": 4, "width": 8, "code_length": 4, "skip": 2, "narrow": False},
+    "narrow": {"layers": 4, "width": 12, "code_length": 4, "skip": 2, "narrow": True},
+    "skip-first": {"layers": 3, "width": 12, "code_length": 4, "skip": 1, "narrow": True},
+    "skip-last": {"layers": 3, "width": 8, "code_length": 4, "skip": 2, "narrow": False},
+    "one-layer": {"layers": 1, "width": 8, "code_length": 4, "skip": 0, "narrow": False},
+    "no-code": {"layers": 3, "width": 8, "code_length": 0, "skip": 0, "narrow": False},
+    "no-code-skip": {"layers": 3, "width": 8, "code_length": 0, "skip": 2, "narrow": True},
+}
+
+
+def make(name: str) -> Decoder:
+    torch.manual_seed(0)
+    return Decoder(**NETWORKS[name]).double()
+
+
+def plain(decoder: Decoder, code: Tensor, points: Tensor) -> Tensor:
+    """The network as the paper draws it: code and point side by side, given to the first layer and to the skip."""
+    inputs = torch.cat([code.expand(*points.shape[:-1], -1), points], dim=-1)
+    features = inputs
+    for index, layer in enumerate(decoder.hidden):
+        if index > 0 and index == decoder.skip:
+            features = torch.cat([features, inputs], dim=-1)
+        features = torch.relu(features @ layer.weight.T + layer.bias)
+    return (features @ decoder.last.weight.T + decoder.last.bias)[..., 0]
+
+
+def draw(decoder: Decoder, *shape: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    code = torch.randn(decoder.code_length, dtype=torch.float64, generator=generator, requires_grad=True)
+    points = torch.randn(*shape, 3, dtype=torch.float64, generator=generator, requires_grad=True)
+    return code, points
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("shape", [(5,), (), (0,), (2, 3)])
+def test_a_folded_code_gives_the_plain_network(name, shape):
+    decoder = make(name)
+    code, points = draw(decoder, *shape)
+    torch.testing.assert_close(decoder.at(code)(points), plain(decoder, code, points), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_gradients_are_those_of_the_plain_network(name):
+    decoder = make(name)
+    code, points = draw(decoder, 6)
+    wanted = (code, points, *decoder.parameters())
+    folded = torch.autograd.grad(decoder.at(code)(points).square().sum(), wanted, allow_unused=not decoder.code_length)
+    reference = torch.autograd.grad(plain(decoder, code, points).square().sum(), wanted)
+    if not decoder.code_length:  # an empty code has an empty gradient
+        folded, reference = folded[1:], reference[1:]
+    torch.testing.assert_close(folded, reference, rtol=1e-11, atol=1e-12)
+    assert all(gradient.abs().sum() > 0 for gradient in folded)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("batch", [(3,), (2, 3)])
+def test_a_batch_of_codes_is_each_code_by_itself(name, batch):
+    decoder = make(name)
+    codes = torch.randn(*batch, decoder.code_length, dtype=torch.float64)
+    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
+    values = decoder.at(codes)(points)
+    assert values.shape == (*batch, 5)
+    for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
+        one = tuple(index)
+        torch.testing.assert_close(values[one], plain(decoder, codes[one], points[one]), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [0, 1, 6, 7, 8, 20])
+def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
+    decoder = make("skip")
+    code, points = draw(decoder, count)
+    whole = decoder.at(code)(points)
+    sizes = []
+    decoder_pass = mlp.BoundDecoder._forward
+    monkeypatch.setattr(mlp.BoundDecoder, "_forward", lambda self, p: (sizes.append(len(p)), decoder_pass(self, p))[1])
+    monkeypatch.setattr(mlp, "CHUNK", 7)
+    chunked = decoder.at(code)(points)
+    torch.testing.assert_close(chunked, whole, rtol=0, atol=1e-14)
+    assert sum(sizes) == count
+    assert max(sizes) <= 7
+    gradients = [torch.autograd.grad(values.square().sum(), (code, points)) for values in (whole, chunked)]
+    torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-13)
+
+
+def test_flops_are_two_a_weight_without_the_code():
+    # Layers 3 -> 8, 8 -> 8, (8 + 3) -> 8, 8 -> 8, 8 -> 1: 24 + 64 + 88 + 64 + 8 = 248 weights.
+    assert make("skip").at(torch.zeros(4, dtype=torch.float64)).flops == 496
+    # 3 -> 12, 12 -> 5 (narrowed by 4 + 3), 5 + 3 -> 12, 12 -> 12, 12 -> 1: 36 + 60 + 96 + 144 + 12 = 348.
+    assert make("narrow").at(torch.zeros(4, dtype=torch.float64)).flops == 696
+    # 3 -> 8, 8 -> 5, (5 + 3) -> 8, 8 -> 1: 24 + 40 + 64 + 8 = 136.
+    assert make("no-code-skip").at(torch.zeros(0, dtype=torch.float64)).flops == 272
+
+
+def test_the_paper_network_has_deepsdfs_layers():
+    decoder = Decoder(layers=8, width=512, code_length=256, skip=4, narrow=True)
+    sizes = [(layer.in_features, layer.out_features) for layer in (*decoder.hidden, decoder.last)]
+    narrow = 512 - 259
+    assert sizes == [(259, 512), (512, 512), (512, 512), (512, narrow), *[(512, 512)] * 4, (512, 1)]
+
+
+def test_a_bound_decoder_is_a_field_that_claims_a_distance_and_no_lipschitz_bound():
+    field = make("skip").at(torch.zeros(4, dtype=torch.float64))
+    assert isinstance(field, Field)
+    assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"skip": 4}, "skip must lie between 0 .* layers - 1 = 3, not 4"),
+        ({"skip": -1}, "skip must lie between 0 .*, not -1"),
+        ({"width": 7, "narrow": True}, r"width must exceed code_length \+ 3 = 7 .*, not 7"),
+        ({"layers": 0, "skip": 0}, "layers must be at least 1, not 0"),
+        ({"width": 0}, "width must be at least 1, not 0"),
+        ({"code_length": -1}, "code_length must be at least 0, not -1"),
+    ],
+)
+def test_impossible_networks_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        Decoder(**(NETWORKS["skip"] | change))
+
+
+@pytest.mark.parametrize("length", [3, 5, 0])
+def test_a_code_of_the_wrong_length_is_refused(length):
+    with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
+        make("skip").at(torch.zeros(length, dtype=torch.float64))

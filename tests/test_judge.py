@@ -1,0 +1,98 @@
+"""What a field is worth against a scene whose truth is known."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.autodecoder import Prior
+from bench.config import EvaluationSettings
+from bench.judge import judge, look
+from bench.metrics import DEFINITIONS
+from bench.stage import Stage
+from datasets.mesh import Mesh
+from datasets.scene import Scene, see
+from datasets.truth import Truth
+from datasets.views import ViewSampler
+from renderers import Naive
+from renderers.fields.analytic import Shape, sphere
+from renderers.fields.mlp import Decoder
+
+VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 0.0), elevation=(0.0, 0.0), resolution=24)
+RADIUS = 0.6
+
+
+@pytest.fixture(scope="module")
+def stage() -> Stage:
+    """A sphere as the truth, judged with 3,000 samples."""
+    made = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    renderer = Naive(steps=40, epsilon=1e-4, sphere_radius=1.0, silhouette_signed=True, silhouette_average="violating")
+    decoder = Decoder(layers=1, width=2, code_length=0, skip=0, narrow=False)
+    return Stage(
+        task=Mock(),
+        renderer=renderer,
+        scene=Scene("sphere test 0", mesh, see(Truth(mesh), VIEWS.camera(30.0, 20.0))),
+        views=VIEWS,
+        prior=Prior(decoder, torch.zeros(1, 0)),
+        evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16),
+        seed=0,
+        device=torch.device("cpu"),
+    )
+
+
+def test_the_truth_itself_scores_best(stage):
+    judgement = judge(sphere(RADIUS), stage)
+    metrics = judgement.metrics
+    assert set(metrics) == set(DEFINITIONS)
+    floor = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
+    assert metrics["accuracy"] == pytest.approx(floor, rel=0.15)
+    assert metrics["completeness"] == pytest.approx(floor, rel=0.15)
+    assert metrics["fscore"] > 0.99
+    assert metrics["normal_consistency"] > 0.99
+    assert metrics["depth_mae"] < 3e-3
+    assert metrics["mask_iou"] > 0.98
+    assert np.linalg.norm(judgement.mesh.vertices, axis=1) == pytest.approx(RADIUS, abs=2e-3)
+
+
+def test_a_larger_sphere_is_off_by_the_difference(stage):
+    metrics = judge(sphere(RADIUS + 0.2), stage).metrics
+    assert metrics["accuracy"] == pytest.approx(0.2, abs=0.01)
+    assert metrics["completeness"] == pytest.approx(0.2, abs=0.01)
+    assert metrics["chamfer_l2"] == pytest.approx(2 * 0.2**2, rel=0.1)
+    assert metrics["fscore"] == 0.0
+    assert metrics["mask_iou"] < 0.7
+
+
+def test_what_a_field_says_outside_the_unit_sphere_is_not_judged(stage):
+    corner = sphere(0.3, (1.0, 1.0, 1.0))
+    spoilt = judge(sphere(RADIUS) | corner, stage)
+    assert spoilt.metrics == pytest.approx(judge(sphere(RADIUS), stage).metrics)
+    assert np.linalg.norm(spoilt.mesh.vertices, axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize("value", [1.0, float("nan")])
+def test_a_field_without_a_surface_scores_worst(stage, value):
+    judgement = judge(Shape(lambda p: torch.full_like(p[..., 0], value) + 0 * p.sum(-1)), stage)
+    assert judgement.mesh is None
+    assert judgement.metrics["chamfer_l2"] == judgement.metrics["depth_mae"] == np.inf
+    assert judgement.metrics["fscore"] == judgement.metrics["mask_iou"] == 0.0
+
+
+def test_judging_follows_the_seed(stage):
+    first, again = judge(sphere(0.5), stage).metrics, judge(sphere(0.5), stage).metrics
+    assert first == again
+    assert judge(sphere(0.5), replace(stage, seed=1)).metrics["accuracy"] != first["accuracy"]
+
+
+def test_a_look_is_what_the_camera_would_see_of_the_mesh(stage):
+    seen, truth = look(sphere(RADIUS), stage.scene.view.camera, stage), stage.scene.view
+    both = seen.mask & truth.mask
+    assert both.sum() > 0.97 * truth.mask.sum()
+    assert (seen.depth - truth.depth)[both].abs().max() < 0.02
+    assert (seen.normals * truth.normals).sum(-1)[both].min() > 0.98
+    assert seen.depth[~seen.mask].abs().sum() == 0
+    assert seen.normals[~seen.mask].abs().sum() == 0

@@ -1,0 +1,140 @@
+"""The optimisation loop on problems small enough to know the answer."""
+
+import time
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+
+from bench.optimise import DIVERGED, Course, optimise
+from bench.records import RunStatus
+from bench.tasks.problem import OptimiserSettings
+from renderers.field import Counts, Meter
+from renderers.fields.analytic import sphere
+
+CPU = torch.device("cpu")
+POINTS = 7  # evaluations that a toy's loss makes
+
+
+@dataclass
+class Toy:
+    """A radius to be found: the field at a point 3 from the origin is to be zero there.
+
+    `spoil` multiplies the loss of the call of that number, from 0, which is the warm-up.
+    """
+
+    spoil: dict[int, float] = field(default_factory=dict)
+    counts: Counts = field(default_factory=Counts)
+    calls: int = 0
+    rays_per_iteration: int = POINTS
+    observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
+
+    def __post_init__(self):
+        self.radius = torch.tensor(1.0, requires_grad=True)
+        self.parameters = [self.radius]
+
+    def field(self):
+        return sphere(self.radius.detach())
+
+    def loss(self):
+        metered = Meter(sphere(self.radius), self.counts)
+        values = metered(torch.tensor([3.0, 0, 0]).expand(POINTS, 3))
+        square = values.square().mean() * self.spoil.get(self.calls, 1.0)
+        self.calls += 1
+        return {"total": square, "square": square}
+
+
+def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None) -> Course:
+    course = Course()
+    optimise(problem, OptimiserSettings(iterations, rate), CPU, course=course, on_step=on_step)
+    return course
+
+
+def test_it_finds_the_answer():
+    toy = Toy()
+    course = go(toy, 200, rate=0.1)
+    assert toy.radius.item() == pytest.approx(3.0, abs=1e-2)
+    assert (course.status, course.reason) == (RunStatus.OK, "")
+    assert course.curve[0]["total"] == pytest.approx(4.0)
+    assert course.curve[-1]["total"] < 1e-3
+
+
+def test_the_curve_has_a_line_an_iteration_each_given_as_it_comes():
+    given = []
+    course = go(Toy(), 5, on_step=lambda line: given.append(dict(line)))
+    assert course.curve == given
+    assert [line["iteration"] for line in given] == [0, 1, 2, 3, 4]
+    seconds = [line["seconds"] for line in given]
+    assert seconds == sorted(seconds)
+    assert seconds[0] > 0
+    assert seconds[-1] == pytest.approx(course.seconds["forward"] + course.seconds["backward"])
+    assert all(line["total"] == line["square"] for line in given)
+    assert given[-1]["value_evaluations"] == course.counts.value
+
+
+def test_the_warm_up_is_neither_counted_nor_part_of_the_first_step():
+    toy, gradients = Toy(), []
+    course = go(toy, 4, on_step=lambda line: gradients.append(toy.radius.grad.item()))
+    assert toy.calls == 5
+    assert (course.counts.value, course.counts.gradient) == (4 * POINTS, 4 * POINTS)
+    assert [line["value_evaluations"] for line in course.curve] == [POINTS * n for n in (1, 2, 3, 4)]
+    assert [line["gradient_evaluations"] for line in course.curve] == [POINTS * n for n in (1, 2, 3, 4)]
+    assert course.seconds["warmup"] > 0
+    assert gradients[0] == pytest.approx(-4.0)  # d/dr (3 - r)^2 at 1, not twice that
+
+
+def test_what_on_step_does_is_off_the_clock():
+    course = go(Toy(), 3, on_step=lambda line: time.sleep(0.2))
+    assert course.seconds["forward"] + course.seconds["backward"] < 0.4
+
+
+def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
+    course = go(Toy(spoil={4: float("nan")}))
+    assert course.status is RunStatus.NAN
+    assert course.reason == "the loss is not a number at iteration 3"
+    assert len(course.curve) == 4
+
+
+def test_a_parameter_that_is_no_number_ends_the_loop():
+    class Cornered(Toy):
+        def loss(self):
+            self.calls += 1
+            return {"total": (self.radius - 1.0).abs().sqrt()}  # 0 with an infinite slope at the start
+
+    course = go(Cornered())
+    assert course.status is RunStatus.NAN
+    assert course.reason == "a free parameter is not a number at iteration 0"
+    assert len(course.curve) == 1
+
+
+@pytest.mark.parametrize(("factor", "diverges"), [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
+def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
+    course = go(Toy(spoil={3: factor}), 5, rate=1e-4)
+    assert course.status is (RunStatus.DIVERGED if diverges else RunStatus.OK)
+    assert len(course.curve) == (3 if diverges else 5)
+    if diverges:
+        assert "the loss rose from 4 to" in course.reason
+        assert "by iteration 2" in course.reason
+
+
+def test_the_warm_up_is_not_the_first_value():
+    assert go(Toy(spoil={0: 1e-6})).status is RunStatus.OK
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_the_course_is_there_when_the_loop_is_cut_short(error):
+    def stop(line):
+        if line["iteration"] == 2:
+            raise error
+
+    course = Course()
+    with pytest.raises(error):
+        optimise(Toy(), OptimiserSettings(10, 0.1), CPU, course=course, on_step=stop)
+    assert [line["iteration"] for line in course.curve] == [0, 1, 2]
+    assert course.counts.value == 3 * POINTS
+    assert course.seconds["forward"] > 0
+
+
+def test_memory_is_measured_or_unknown():
+    peak = go(Toy(), 2).peak_memory_bytes
+    assert peak is None or peak >= 0
