@@ -146,8 +146,9 @@ def _show_silhouette(truth: Looks) -> Any:
         lost, false = 100 * (true & ~found).sum() / true.sum(), 100 * (found & ~true).sum() / true.sum()
         window = _window([other.front.mask.numpy() for other in (*looks, truth)])
         _bare(axis).imshow(image[window], interpolation="nearest")
-        axis.text(0.02, 0.09, f"lost {lost:.1f} %", color=LOST, transform=axis.transAxes, fontsize=8)
-        axis.text(0.02, 0.02, f"false {false:.1f} %", color=FALSE, transform=axis.transAxes, fontsize=8)
+        label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
+        axis.text(0.02, 0.10, f"lost {lost:.1f} %", color=LOST, **label)
+        axis.text(0.02, 0.02, f"false {false:.1f} %", color=FALSE, **label)
 
     return show
 
