@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -36,6 +37,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         except OSError as error:  # Hydra would print a line of its own about it
             unwritable.append(error)
 
+    signal.signal(signal.SIGTERM, _stop)  # as Ctrl-C: the record says what happened
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         program()
@@ -55,6 +57,10 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         where = f" ({error.filename})" if error.filename else ""
         return _tell(f"{error.strerror or error}{where}: free space, or set results_dir to a folder you can write")
     return 0
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
 
 
 def _tell(message: str, code: int = FAILED) -> int:

@@ -1,6 +1,7 @@
 """Where priors are kept: some are shipped, others are trained on first use and cached by what they were made from."""
 
 import json
+import sys
 import time
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -27,7 +28,10 @@ def prior_for(
     dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
 ) -> Prior:
     """The prior of a dataset: a shipped one, else one in `priors_dir`, else a new one, which is kept there."""
-    path = find(dataset, settings, priors_dir) or make_prior(dataset, settings, priors_dir, device, progress)
+    path = find(dataset, settings, priors_dir)
+    if path is None:
+        print(f"training a prior of {dataset.name}, once; it is kept in {priors_dir}", file=sys.stderr)
+        path = make_prior(dataset, settings, priors_dir, device, progress)
     return _load(path, settings)
 
 

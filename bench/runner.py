@@ -57,8 +57,9 @@ def run(config: DictConfig) -> tuple[Path, Record]:
         write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
         with live_progress() as progress:
             _execute(config, folder, record, progress)
-    except KeyboardInterrupt:
-        record.status, record.reason = RunStatus.KILLED, "stopped by Ctrl-C; the same command starts it anew"
+    except KeyboardInterrupt as error:
+        who = str(error) or "stopped by Ctrl-C"
+        record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
     except (MemoryError, torch.OutOfMemoryError) as error:

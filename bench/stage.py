@@ -59,6 +59,9 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     device = pick_device(config.device)
     packages = list(config.packages)
     renderer = build(config.renderer, "renderer", packages)
+    if not isinstance(renderer, Renderer):
+        name = type(renderer).__name__
+        raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
     task = build(config.task, "task", packages)
     dataset = cast(Dataset, build(config.dataset, "dataset", packages))
     views = build(config.view, "view", target="datasets.views.ViewSampler")

@@ -40,7 +40,7 @@ def write_index(results_dir: Path) -> Path:
         runs=[_run(record, results_dir / "runs" / record["folder"]) for record in records],
         problems=problems,
         statuses=Counter(record["status"] for record in records),
-        machines=Counter(_machine(record) for record in records),
+        machines=Counter(_machine(record) for record in records if record["environment"]),
         tones=TONES,
     )
     # Names and reasons may hold bytes that are not text; they must not cost the page.
