@@ -296,7 +296,7 @@ def test_a_real_process_ends_with_one_line_and_its_folder(tmp_path):
     assert (Path(done.stdout.splitlines()[-1]) / "record.json").is_file()
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
 def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path, name):
     # A shell that starts the tests in the background has them ignore Ctrl-C, and their children with them.
     start = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
@@ -324,10 +324,11 @@ def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path, name):
     assert record["reason"]
     assert len(lines) > 3
     assert [json.loads(line)["iteration"] for line in lines[:-1]] == list(range(len(lines) - 1))
-    if name == "SIGINT":
+    if name != "SIGKILL":
+        by = "stopped by Ctrl-C" if name == "SIGINT" else "stopped by SIGTERM"
         assert running.returncode == 130
-        assert_one_line(err, "stopped by Ctrl-C")
-        assert "stopped by Ctrl-C" in record["reason"]
+        assert_one_line(err, by)
+        assert by in record["reason"]
         assert record["evaluations"]["iterations"] in (len(lines), len(lines) - 1)
         assert record["metrics_start"]
         assert folder.name in (tmp_path / "index.html").read_text()
