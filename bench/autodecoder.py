@@ -158,9 +158,19 @@ def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 400, n
         optimiser.zero_grad()
         error.mean().backward()
         optimiser.step()
-    with torch.no_grad():
-        error = (decoder.at(codes)(samples.points) - samples.distances).abs()
-    return error[samples.distances.abs() < near].mean().item()
+    return surface_error(decoder, codes, samples, near=near)
+
+
+@torch.no_grad()
+def surface_error(
+    decoder: Decoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples, *, near: float = 0.02
+) -> float:
+    """Mean error of the distance within `near` of the surface, in scene units, at the codes of the samples' shapes."""
+    errors = []
+    for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
+        close = distances.abs() < near
+        errors.append((decoder.at(code)(points[close]) - distances[close]).abs())
+    return torch.cat(errors).mean().item()
 
 
 @torch.no_grad()

@@ -14,7 +14,16 @@ from omegaconf.errors import OmegaConfBaseException
 from datasets.dataset import Split
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
-LEAST = {"seed": 0, "index": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1, "evaluation.picture": 4}
+LEAST = {
+    "seed": 0,
+    "index": 0,
+    "threads": 1,
+    "evaluation.grid": 8,
+    "evaluation.points": 1,
+    "evaluation.picture": 4,
+    "evaluation.every": 1,
+}
+RESERVED = ("_target_", "_package_")  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
 
 
@@ -34,6 +43,7 @@ class EvaluationSettings:
     points: int = MISSING
     fscore_threshold: float = MISSING
     picture: int = MISSING
+    every: int | None = MISSING
 
 
 @dataclass
@@ -50,6 +60,8 @@ class Config:
     split: str = MISSING
     index: int = MISSING
     seed: int = MISSING
+    label: str | None = MISSING
+    experiment: str | None = MISSING
     device: Device = MISSING
     threads: int | None = MISSING
     results_dir: str = MISSING
@@ -59,8 +71,9 @@ class Config:
 
 
 def register() -> None:
-    """Makes the schema known to Hydra, under the name that conf/config.yaml uses."""
+    """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
     ConfigStore.instance().store(name="schema", node=Config)
+    OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
 
 
 def check_top_level(config: DictConfig) -> None:
@@ -79,7 +92,7 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
     """The object that a YAML node describes: its `_target_`, or `target`, with its other keys as arguments.
 
     Args:
-        node: the node.
+        node: the node. Its key `_package_` names one more package that its `_target_` may name.
         name: what it is called in the configuration, for errors.
         packages: packages of the user's that a `_target_` may name, beside ours.
         target: the class of a node that has no `_target_`.
@@ -87,8 +100,10 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
     Raises:
         ValueError: for an unknown package, class, key or a value of the wrong type.
     """
+    if OmegaConf.is_missing(node, "_target_"):
+        raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
     path = node.get("_target_", target)
-    if path.split(".")[0] not in (*OURS, *packages):
+    if path.split(".")[0] not in (*OURS, *packages, node.get("_package_")):
         raise ValueError(f"{name}._target_ names {path!r}: add its package by packages=[{path.split('.')[0]}]")
     try:
         cls = get_class(path)
@@ -97,7 +112,7 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
     for key in node:
         if OmegaConf.is_missing(node, key):
             raise ValueError(f"{name}.{key} must be given: set {name}.{key}=...")
-    arguments = {str(key): node[key] for key in node if key != "_target_"}
+    arguments = {str(key): node[key] for key in node if key not in RESERVED}
     if not is_dataclass(cls):
         return cls(**arguments)
     names = [f.name for f in fields(cls)]

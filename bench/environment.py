@@ -1,9 +1,11 @@
 """What a run ran on: commit, versions, hardware, threads, load, and the machine's own speed limit."""
 
+import ctypes
 import os
 import platform
 import subprocess
 import time
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -75,6 +77,7 @@ class MemoryPeak:
             torch.cuda.reset_peak_memory_stats(device)
             self.start: int | None = torch.cuda.memory_allocated(device)
         else:
+            _give_back_free_memory()
             self.start = _resident("VmRSS") if _reset_high_water() else None
 
     def growth(self) -> int | None:
@@ -85,6 +88,12 @@ class MemoryPeak:
             return torch.cuda.max_memory_allocated(self.device) - self.start
         peak = _resident("VmHWM")
         return None if peak is None else max(peak - self.start, 0)
+
+
+def _give_back_free_memory() -> None:
+    """Else what is allocated next lies in memory that the process still holds, and does not show."""
+    with suppress(OSError, AttributeError):  # of glibc alone
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _reset_high_water() -> bool:

@@ -51,9 +51,7 @@ def draw_run(
 def _cameras(stage: Stage) -> tuple[Camera, Camera]:
     """The scene's camera with finer pixels, and one behind the shape."""
     camera, size = stage.scene.view.camera, stage.evaluation.picture
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:2] *= size / camera.height
     x, _, z = camera.center.tolist()
     views = replace(stage.views, resolution=size)
     behind = views.camera(degrees(atan2(x, z)) + BEHIND, BEHIND_ELEVATION)
-    return Camera(intrinsics, camera.world_to_camera, size, size), behind
+    return camera.resized(size, size), behind

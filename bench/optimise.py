@@ -43,16 +43,16 @@ def optimise(
         device: what to wait for when the clock is read.
         course: an empty one, filled as the loop goes, so that it is there for a loop that is cut short. A loss that
             becomes NaN or diverges ends the loop, and stands there as its status.
-        on_step: called off the clock with each line of the curve.
+        on_step: called off the clock with each line of the curve, to which it may add.
     """
     optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
-    course.seconds["warmup"] = _timed(device, lambda: problem.loss()["total"].backward())
+    course.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
     before = Counts(problem.counts.value, problem.counts.gradient)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
         optimiser.zero_grad(set_to_none=True)
         terms: dict[str, torch.Tensor] = {}
-        forward = _timed(device, lambda terms=terms: terms.update(problem.loss()))
+        forward = _timed(device, lambda i=iteration, terms=terms: terms.update(problem.loss(i)))
         backward = _timed(device, lambda terms=terms: (terms["total"].backward(), optimiser.step()))
         course.seconds["forward"] += forward
         course.seconds["backward"] += backward

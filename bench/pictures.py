@@ -57,6 +57,22 @@ def draw_all(
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
 
 
+def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
+    """Writes a picture of a view beside the true one: normals of both, and what was lost and what is false."""
+    matplotlib.use("Agg")
+    pair = Looks("rendered", found, found), Looks("reference", true, true)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9.2, 3.5), layout="constrained")
+        axes = figure.subplots(1, 3)
+        for axis, look in zip(axes, pair, strict=False):
+            _show_normals(axis, look, pair)
+            axis.set_title(f"normals, {look.title}")
+        _show_silhouette(pair[1])(axes[2], pair[0], pair)
+        axes[2].set_title("silhouette error")
+        figure.suptitle(title)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
 def _summary(looks: tuple[Looks, ...], given: tuple[View, np.ndarray], title: str) -> Figure:
     columns = {
         "depth": _show_depth,

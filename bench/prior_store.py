@@ -12,7 +12,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from bench.autodecoder import Prior, PriorSettings, distance_samples, fit_error, train
+from bench.autodecoder import Prior, PriorSettings, distance_samples, fit_error, surface_error, train
 from bench.environment import describe
 from bench.progress import Report
 from bench.records import digest, to_json, write_text
@@ -89,7 +89,12 @@ def shipped_records() -> list[dict[str, Any]]:
 def _surface_errors(
     prior: Prior, dataset: Dataset, samples: Any, settings: PriorSettings, progress: Report
 ) -> dict[str, float]:
-    """Mean |field| near the surface, in scene units, of training and unseen shapes whose codes were fitted anew."""
+    """Mean |field| near the surface, in scene units, of training and unseen shapes whose codes were fitted anew.
+
+    A network of one shape has no other shapes: it is judged on its own, at its own code.
+    """
+    if settings.shapes == 1:
+        return {"training": surface_error(prior.decoder, prior.codes, samples)}
     unseen = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress)
     return {
         "training": fit_error(prior.decoder, samples.first(HELD_OUT)),

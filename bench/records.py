@@ -54,6 +54,11 @@ class Record:
     reused: bool = False
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def name(self) -> str:
+        """What tables call it: its label, or else its renderer."""
+        return self.config.get("label") or self.renderer
+
     def write(self, folder: Path) -> None:
         """Writes `record.json` so that a reader, or a crash, never meets half of one."""
         write_text(folder / "record.json", to_json({"schema": SCHEMA, **self.__dict__}))

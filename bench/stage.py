@@ -12,7 +12,7 @@ from bench.config import EvaluationSettings, build, check_top_level
 from bench.environment import pick_device
 from bench.prior_store import prior_for
 from bench.progress import Report
-from bench.tasks.problem import Problem, Task, Unsupported
+from bench.records import Record
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene
 from datasets.views import ViewSampler
@@ -23,7 +23,6 @@ from renderers.rendering import Renderer
 class Stage:
     """What a run works with."""
 
-    task: Task
     renderer: Renderer
     scene: Scene
     views: ViewSampler
@@ -31,19 +30,17 @@ class Stage:
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
+    cache: Path  # where what is slow to make is kept
 
-    def problem(self) -> Problem:
-        """The task's problem.
 
-        Raises:
-            Unsupported: where the renderer cannot do what the task or its field needs.
-        """
-        problem = self.task.problem(self.scene, self.prior, self.renderer, seed=self.seed, device=self.device)
-        kind, needs = problem.field().kind, self.renderer.capabilities.needs
-        if kind not in needs:
-            names = " or ".join(need.value for need in needs)
-            raise Unsupported(f"{type(self.renderer).__name__} needs a {names} field, not a {kind.value} field")
-        return problem
+@dataclass(frozen=True)
+class Cell:
+    """One run under way: what it works with, where its files go, and its record, which is filled as it goes."""
+
+    stage: Stage
+    folder: Path
+    record: Record
+    progress: Report
 
 
 def set_up(config: DictConfig, progress: Report) -> Stage:
@@ -62,14 +59,13 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     if not isinstance(renderer, Renderer):
         name = type(renderer).__name__
         raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
-    task = build(config.task, "task", packages)
     dataset = cast(Dataset, build(config.dataset, "dataset", packages))
     views = build(config.view, "view", target="datasets.views.ViewSampler")
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
     scene = make_scene(dataset, views, split=Split(config.split), index=config.index)
     prior = prior_for(dataset, settings, Path(config.priors_dir), device, progress)
-    return Stage(task, renderer, scene, views, prior, evaluation, config.seed, device)
+    return Stage(renderer, scene, views, prior, evaluation, config.seed, device, Path(config.priors_dir))
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

@@ -25,7 +25,7 @@ def show(folder: Path, record: Record, index: Path) -> None:
     """Prints what a run came to; the last line on standard output is its folder."""
     console = Console(highlight=False)
     table = Table(
-        box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.renderer}, {record.scene or record.dataset}")
+        box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}")
     )
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
@@ -35,7 +35,9 @@ def show(folder: Path, record: Record, index: Path) -> None:
             table.add_row(label, number(before, factor), number(after, factor), better)
     if table.row_count:
         console.print(table)
-    if record.evaluations:
+    elif record.metrics:
+        console.print(_measured(record))
+    if "iterations" in record.evaluations:
         loop = record.seconds["forward"] + record.seconds["backward"]
         console.print(
             f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "
@@ -48,3 +50,13 @@ def show(folder: Path, record: Record, index: Path) -> None:
     if record.status not in ("ok", "killed"):  # the program ends by telling of killed
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"{record.status}: {record.reason}", markup=False)
     print(folder)
+
+
+def _measured(record: Record) -> Table:
+    """All numbers of a task that measures and does not optimise."""
+    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene}"))
+    table.add_column("")
+    table.add_column("measured", justify="right")
+    for name, value in record.metrics.items():
+        table.add_row(name, number(value))
+    return table

@@ -2,12 +2,16 @@
 
 from renderers.camera import Camera, Rays
 from renderers.dist import DIST
+from renderers.dvr import DVR
 from renderers.field import Field, Kind, Meter
+from renderers.idr import IDR
 from renderers.naive import Naive
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 
 __all__ = [
     "DIST",
+    "DVR",
+    "IDR",
     "Camera",
     "Capabilities",
     "Field",

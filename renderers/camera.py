@@ -101,6 +101,31 @@ class Camera:
         """Where the camera is, in world coordinates."""
         return self.camera_to_world[:3, 3]
 
+    def resized(self, height: int, width: int) -> "Camera":
+        """The same view in other pixels."""
+        intrinsics = self.intrinsics.clone()
+        intrinsics[0] *= width / self.width
+        intrinsics[1] *= height / self.height
+        return Camera(intrinsics, self.world_to_camera, height, width)
+
+    def moved(self, twist: Float[Tensor, "6"]) -> "Camera":
+        """The camera after a rigid motion in its own axes; gradients flow to the twist.
+
+        Args:
+            twist: element of se(3): translation in scene units, then rotation vector in radians. World points in the
+                camera's coordinates go through its matrix exponential.
+        """
+        x, y, z = twist[3:]
+        zero = torch.zeros_like(x)
+        turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+        rows = torch.cat([turn, twist[:3, None]], dim=1)
+        motion = torch.linalg.matrix_exp(torch.cat([rows, torch.zeros_like(rows[:1])]))
+        return Camera(self.intrinsics, motion @ self.world_to_camera, self.height, self.width)
+
+    def double(self) -> "Camera":
+        """The same camera in float64."""
+        return Camera(self.intrinsics.double(), self.world_to_camera.double(), self.height, self.width)
+
     def rays(self) -> Rays:
         """The rays [height, width] through the pixel centres; gradients flow to both matrices."""
         bearings = self._bearings()

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from renderers.camera import Rays, distance_to_origin
+from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind
-from renderers.gradients import approximate
+from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
-from renderers.rendering import Capabilities, Rendering
+from renderers.rendering import Capabilities, Rendering, assemble
 from renderers.silhouette import hinge_silhouette_loss
 
 
@@ -72,28 +72,9 @@ class DIST:
         flat = rays.flat()
         with torch.no_grad():
             front = self._trace(field, rays)
-        hit = front.status == 0
-        met = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
-        wanted = front.sample_value[met].clone()
-        wanted[~hit[met], 1:] = torch.inf  # a ray that hit nothing needs its closest sample only
-        carried, least = approximate(
-            field,
-            flat[met],
-            front.distance[met],
-            alpha=self.alpha,
-            sample_distance=front.sample_distance[met],
-            sample_value=wanted,
-        )
-        # Rays that miss the sphere have a soft silhouette too: how far they pass it by (DIST, A.3).
-        closest = distance_to_origin(flat) - self.sphere_radius
-        closest = torch.where(front.meets, torch.ones_like(closest), closest).index_put((met,), least)
-        distance = torch.where(hit, front.distance.index_put((met,), carried), front.distance)
-        return Rendering(
-            distance=distance.view(rays.shape),
-            status=front.status.view(rays.shape),
-            points=rays.at(distance.view(rays.shape)),
-            residual=front.value.view(rays.shape),
-            closest=closest.view(rays.shape),
+        distance, closest = approximate_front(field, flat, front, alpha=self.alpha)
+        return assemble(
+            rays, self.sphere_radius, distance=distance, status=front.status, residual=front.value, closest=closest
         )
 
     def silhouette_loss(

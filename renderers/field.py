@@ -21,17 +21,24 @@ class Kind(Enum):
     LEVEL = "level"
 
 
+@dataclass(frozen=True)
+class Flops:
+    """Floating-point operations that one point costs: its value, and going back through it in backward."""
+
+    value: int
+    gradient: int
+
+
 @runtime_checkable
 class Field(Protocol):
     """Points [*batch, 3] to values [*batch], negative inside.
 
-    `lipschitz` bounds the length of the gradient where a bound is known. `flops` is what one value costs in
-    floating-point operations where that is known; a value with its gradient is counted as three times that.
+    `lipschitz` bounds the length of the gradient, and `flops` says what a point costs, where that is known.
     """
 
     kind: Kind
     lipschitz: float | None
-    flops: int | None
+    flops: Flops | None
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
@@ -44,8 +51,10 @@ class Counts:
     gradient: int = 0
 
     def flops(self, field: Field) -> int | None:
-        """What the field spent on them, in floating-point operations; a backward pass costs about two values."""
-        return None if field.flops is None else field.flops * (self.value + 2 * self.gradient)
+        """What the field spent on them, in floating-point operations."""
+        if field.flops is None:
+            return None
+        return field.flops.value * self.value + field.flops.gradient * self.gradient
 
     def __sub__(self, other: "Counts") -> "Counts":
         return Counts(self.value - other.value, self.gradient - other.gradient)
@@ -55,8 +64,8 @@ class Counts:
 class Meter:
     """A Field that counts what is asked of the field that it wraps, so that no renderer can under-report.
 
-    A value evaluation is one point passed to the field. A gradient evaluation is one point whose value was
-    back-propagated through, counted when the backward pass arrives there.
+    A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
+    gradient other than zero was propagated back, counted when the backward pass arrives there.
     """
 
     inner: Field
@@ -71,7 +80,7 @@ class Meter:
         return self.inner.lipschitz
 
     @property
-    def flops(self) -> int | None:
+    def flops(self) -> Flops | None:
         return self.inner.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -82,7 +91,7 @@ class Meter:
         return values
 
     def _count_backward(self, gradient: Tensor) -> None:
-        self.counts.gradient += gradient.numel()
+        self.counts.gradient += int(gradient.count_nonzero())
 
 
 def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -108,3 +117,49 @@ def central_difference_normals(
     ahead = field(points[..., None, :] + offsets)
     behind = field(points[..., None, :] - offsets)
     return torch.nn.functional.normalize((ahead - behind) / (2 * delta), dim=-1)
+
+
+@runtime_checkable
+class Occupancy(Protocol):
+    """Points [*batch, 3] to logits [*batch] of the probability p of being inside: any callable."""
+
+    def __call__(self, points: Float[Tensor, "*batch 3"], /) -> Float[Tensor, "*batch"]: ...
+
+
+@dataclass(frozen=True)
+class _OccupancyField:
+    logits: Occupancy
+    level: float
+    flops: Flops | None
+    kind: Kind = Kind.LEVEL
+    lipschitz: float | None = None
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.level - self.logits(points)
+
+
+def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None = None) -> Field:
+    """The level set p = threshold (DVR, Sec. 3.1) as a field: logit(threshold) - logit(p), negative where p is above.
+
+    Args:
+        logits: logit(p) at points.
+        threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
+        flops: what a point costs, where that is known.
+    """
+    if not 0 < threshold < 1:
+        raise ValueError(f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5")
+    level = torch.tensor(threshold, dtype=torch.float64).logit().item()
+    return _OccupancyField(logits, level, flops)  # pyright: ignore[reportReturnType] (it is frozen)
+
+
+def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:
+    """Logits of occupancy from a field's values; 0 on the surface, so a threshold other than 0.5 is taken off.
+
+    Args:
+        values: of the field.
+        width: length over which a distance or a bound changes the logit by 1, in scene units, positive. A level set
+            has no length: its values are negated only.
+    """
+    if not 0 < width < float("inf"):
+        raise ValueError(f"width must be positive, not {width}: 0.02 suits distances in the unit sphere")
+    return -values if field.kind is Kind.LEVEL else -values / width

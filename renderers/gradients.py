@@ -1,11 +1,13 @@
 """The gradient rules, each once. A rule attaches a gradient to distances that were found without a graph."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
+from renderers.march import Front
+from renderers.rendering import Status
 
 
 def approximate(
@@ -35,9 +37,73 @@ def approximate(
     Returns:
         the distances with their gradient, and the field's value at each ray's first sample.
     """
+    if not torch.is_grad_enabled():
+        return distance, sample_value[:, 0]
     exists = sample_value.isfinite()
     ray, _ = exists.nonzero(as_tuple=True)
     values = field(rays.origins[ray] + sample_distance[exists][:, None] * rays.directions[ray])
     table = torch.zeros_like(sample_value).masked_scatter(exists, values)
     total = table.sum(dim=1)
     return distance + alpha * (total - total.detach()), table[:, 0]
+
+
+def approximate_front(
+    field: Field, rays: Rays, front: Front, *, alpha: float
+) -> tuple[Float[Tensor, "n"], tuple[Int[Tensor, "m"], Float[Tensor, "m"]]]:
+    """The approximate gradient for all n rays of a front, whose samples carry it.
+
+    Returns:
+        the distances, with a gradient where the ray has hit, and the rays on which the field was asked, each with its
+        value of least magnitude.
+    """
+    hit = front.status == Status.HIT
+    asked = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
+    wanted = front.sample_value[asked].clone()
+    wanted[~hit[asked], 1:] = torch.inf  # a ray that hit nothing needs its closest sample only
+    carried, least = approximate(
+        field,
+        rays[asked],
+        front.distance[asked],
+        alpha=alpha,
+        sample_distance=front.sample_distance[asked],
+        sample_value=wanted,
+    )
+    return torch.where(hit, front.distance.index_put((asked,), carried), front.distance), (asked, least)
+
+
+def fixed_samples(
+    field: Field, rays: Rays, distance: Float[Tensor, "n"], value: Float[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """The field's values at fixed distances along rays, known as `value`; asked again where a gradient is wanted."""
+    return field(rays.at(distance.detach())) if torch.is_grad_enabled() else value
+
+
+def implicit(field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_slope: float) -> Float[Tensor, "n"]:
+    """The gradient of the distance to a level set, by implicit differentiation.
+
+    Source: DVR, Eqs. 8 and 11. On the ray o + d w, the level set stays under the ray's end if
+    d distance = -(d field + grad field . d(o + d w)) / (grad field . w): towards the field's parameters by its first
+    term, towards the ray by its second one. Exact at a root; where the distance is off, it is the gradient of a
+    level set beside it. The surface must be crossed: what comes into view or leaves it has no part in this gradient.
+
+    Args:
+        rays: n rays whose distance is to get a gradient.
+        distance: where they cross the surface.
+        least_slope: least magnitude of the field's slope along the ray, grad field . w, in field units a scene unit.
+            A flatter crossing is divided by this, with the slope's own sign; rays enter, so zero counts as negative.
+    """
+    if not torch.is_grad_enabled():
+        return distance
+    reached = rays.at(distance.detach())
+    at = reached.detach().requires_grad_(True)
+    towards_field = field(at.detach()[:0]).requires_grad  # asked of no point, so at no cost
+    if not (towards_field or reached.requires_grad):
+        return distance
+    value = field(at)
+    (gradient,) = torch.autograd.grad(value.sum(), at, retain_graph=True)
+    slope = (gradient * rays.directions.detach()).sum(-1)
+    slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
+    change = (gradient * (reached - reached.detach())).sum(-1)
+    if towards_field:
+        change = change + value - value.detach()
+    return distance.detach() - change / slope

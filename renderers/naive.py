@@ -1,4 +1,4 @@
-"""Sphere tracing as first written, with every step in the graph: the baseline that the others are measured against."""
+"""Sphere tracing as first written: the baseline that the others are measured against."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,35 +7,43 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from renderers.camera import Rays, distance_to_origin, sphere_span
+from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind
-from renderers.rendering import Capabilities, Rendering, Status
+from renderers.gradients import approximate_front
+from renderers.march import Front, Stepping, march
+from renderers.rendering import Capabilities, Rendering, Status, assemble
 from renderers.silhouette import hinge_silhouette_loss
 
 
 @dataclass(frozen=True)
 class Naive:
-    """Fully unrolled sphere tracing. Honest and slow: not for real use.
+    """Sphere tracing that asks every ray that meets the sphere at every step. Honest and slow: not for real use.
 
-    Every ray that meets the sphere is asked at every step, whether it has finished or not, and all steps stay in the
-    graph: time and memory grow with rays times steps.
+    With the unrolled gradient all steps stay in the graph, so that time and memory grow with rays times steps. Its
+    other settings are the first rows of DIST's Table 1: rays one by one or all at once, and the practical gradient.
 
     Source: DIST, Algorithm 1, begun on the bounding sphere (Sec. 3.2), since a network means nothing outside it.
-    Differentiable in: field parameters and rays, by unrolling. Exact in the limit of many steps; short of it by a
-        factor 1 - (1 - cos(angle of incidence))^steps, which shows near grazing.
+    Differentiable in: field parameters and rays. Unrolled, exact in the limit of many steps; short of it by a
+        factor 1 - (1 - cos(angle of incidence))^steps, which shows near grazing. Practical, as DIST at alpha = 1.
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: a ray that begins at negative values stops at once and says so.
 
     Args:
         steps: marching steps, all of them taken.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
+        gradient: "unrolled" through all steps, or "practical", DIST's rule (Eq. 4) at the closest samples.
+        samples: K of the practical gradient.
+        serial: march the rays one after the other.
         sphere_radius: of the sphere about the origin that holds the shape.
         silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
     """
 
     steps: int
     epsilon: float
+    gradient: str
+    samples: int
+    serial: bool
     sphere_radius: float
     silhouette_signed: bool
     silhouette_average: str
@@ -47,26 +55,26 @@ class Naive:
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
         check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
+        check_choice("gradient", self.gradient, ("unrolled", "practical"))
+        check_at_least("samples", self.samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """Marches all rays through all steps with the graph kept."""
+        """Marches all rays through all steps."""
         flat = rays.flat()
-        entry, leave, meets = sphere_span(flat, self.sphere_radius)
-        inside = flat[meets]
-        distance, status, value, closest = self._march(field, inside, entry[meets], leave[meets])
-
-        def scatter(into: Tensor, what: Tensor) -> Tensor:
-            return into.masked_scatter(meets, what).view(rays.shape)
-
-        ended = scatter(entry, distance)
+        render = self._unrolled if self.gradient == "unrolled" else self._practical
+        if not self.serial or flat.shape.numel() == 0:
+            parts = [render(field, flat)]
+        else:
+            parts = [render(field, flat[one]) for one in torch.arange(flat.shape.numel()).split(1)]
+        distance = torch.cat([part.distance for part in parts]).view(rays.shape)
         return Rendering(
-            distance=ended,
-            status=scatter(torch.full_like(meets, Status.MISS, dtype=torch.int8), status),
-            points=rays.at(ended),
-            residual=scatter(torch.zeros_like(entry), value.detach()),
-            closest=scatter(distance_to_origin(flat) - self.sphere_radius, closest),
+            distance=distance,
+            status=torch.cat([part.status for part in parts]).view(rays.shape),
+            points=rays.at(distance),
+            residual=torch.cat([part.residual for part in parts]).view(rays.shape),
+            closest=torch.cat([part.closest for part in parts]).view(rays.shape),
         )
 
     def silhouette_loss(
@@ -79,6 +87,29 @@ class Naive:
             epsilon=self.epsilon,
             signed=self.silhouette_signed,
             average=self.silhouette_average,
+        )
+
+    def _practical(self, field: Field, rays: Rays) -> Rendering:
+        with torch.no_grad():
+            front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.samples)
+            stepping = Stepping(self.epsilon, 1.0, None, None, active_only=False, careful_split=False)
+            march(field, rays, front, stepping, self.steps)
+        distance, closest = approximate_front(field, rays, front, alpha=1.0)
+        return assemble(
+            rays, self.sphere_radius, distance=distance, status=front.status, residual=front.value, closest=closest
+        )
+
+    def _unrolled(self, field: Field, rays: Rays) -> Rendering:
+        entry, leave, meets = sphere_span(rays, self.sphere_radius)
+        distance, status, value, closest = self._march(field, rays[meets], entry[meets], leave[meets])
+        missed = torch.full_like(meets, Status.MISS, dtype=torch.int8)
+        return assemble(
+            rays,
+            self.sphere_radius,
+            distance=entry.masked_scatter(meets, distance),
+            status=missed.masked_scatter(meets, status),
+            residual=torch.zeros_like(entry).masked_scatter(meets, value.detach()),
+            closest=(meets.nonzero().squeeze(-1), closest),
         )
 
     def _march(

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
-from renderers.camera import Rays
+from renderers.camera import Rays, distance_to_origin
 from renderers.field import Field, Kind
 
 
@@ -74,3 +74,47 @@ class Renderer(Protocol):
     ) -> Float[Tensor, ""]:
         """The method's own loss between its rendering and a binary mask, true on the foreground."""
         ...
+
+
+@runtime_checkable
+class Scheduled(Protocol):
+    """A renderer whose settings change as an optimisation goes on."""
+
+    def at_iteration(self, iteration: int) -> Renderer:
+        """The renderer as it is at an iteration, counted from 0."""
+        ...
+
+
+def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
+    """The renderer as it is at an iteration of an optimisation: itself, unless it has a schedule."""
+    return renderer.at_iteration(iteration) if isinstance(renderer, Scheduled) else renderer
+
+
+def assemble(
+    rays: Rays,
+    radius: float,
+    *,
+    distance: Float[Tensor, "n"],
+    status: Int8[Tensor, "n"],
+    residual: Float[Tensor, "n"],
+    closest: tuple[Int[Tensor, "m"], Float[Tensor, "m"]],
+) -> Rendering:
+    """The rendering of rays of any leading shape, from one answer a ray in one row.
+
+    Args:
+        rays: all n of them.
+        radius: of the sphere about the origin that holds the shape.
+        distance, status, residual: as in Rendering.
+        closest: the rays on which the field was asked, and its value of least magnitude on these. For the others,
+            `closest` is how far they pass by the sphere (DIST, A.3).
+    """
+    asked, least = closest
+    passing_by = distance_to_origin(rays.flat()) - radius
+    shaped = distance.view(rays.shape)
+    return Rendering(
+        distance=shaped,
+        status=status.view(rays.shape),
+        points=rays.at(shaped),
+        residual=residual.detach().view(rays.shape),
+        closest=passing_by.index_put((asked,), least).view(rays.shape),
+    )

@@ -17,6 +17,11 @@ settings.register_profile("implicit-bench", deadline=None, derandomize=True)
 settings.load_profile("implicit-bench")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The renderer of yours that the contract takes: `-k custom --renderer=mypkg.Mine`."""
+    parser.addoption("--renderer", default="tests.user_renderer.Mine", help="class of a renderer, as PACKAGE.CLASS")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Lets pass what beartype says of OmegaConf's classes, which build on `typing`; all other warnings are errors."""
     config.addinivalue_line("filterwarnings", "ignore::beartype.roar.BeartypeDecorHintPep585DeprecationWarning")

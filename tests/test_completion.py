@@ -9,13 +9,11 @@ import torch
 from omegaconf import OmegaConf
 
 from bench.autodecoder import Prior
-from bench.config import CONF, EvaluationSettings, build
-from bench.stage import Stage
+from bench.config import CONF, build
 from bench.tasks.completion import Completion
-from bench.tasks.problem import Unsupported
+from bench.tasks.problem import Unsupported, check_kind
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View
-from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
@@ -85,7 +83,7 @@ def problem_of(scene, prior):
 
 
 def values(problem) -> dict[str, float]:
-    return {name: term.item() for name, term in problem.loss().items()}
+    return {name: term.item() for name, term in problem.loss(0).items()}
 
 
 def test_depth_is_compared_where_it_is_given_and_hit(problem_of):
@@ -105,7 +103,7 @@ def test_depth_is_compared_at_the_given_points_only(problem_of):
 
 def test_no_pixel_to_compare_costs_nothing(problem_of):
     problem = problem_of(Fake(status=((Status.MISS,) * 2,) * 2))
-    terms = problem.loss()
+    terms = problem.loss(0)
     assert terms["depth"].item() == 0.0
     terms["total"].backward()
     assert problem.code.grad.isfinite().all()
@@ -142,7 +140,7 @@ def test_dense_depth_implies_the_mask(problem_of):
 
 def test_the_gradient_reaches_the_code_and_nothing_else(problem_of):
     problem = problem_of()
-    problem.loss()["total"].backward()
+    problem.loss(0)["total"].backward()
     assert [id(one) for one in problem.parameters] == [id(problem.code)]
     assert problem.code.grad.abs().max() > 0
     assert all(parameter.grad is None for parameter in problem.decoder.parameters())
@@ -151,7 +149,7 @@ def test_the_gradient_reaches_the_code_and_nothing_else(problem_of):
 def test_the_gradient_is_that_of_the_loss(problem_of, prior):
     """d depth / d code = weight / 2 * cosine * sum of sign(error) * d field / d code over the two pixels."""
     problem = problem_of(silhouette_weight=0.0)
-    problem.loss()["total"].backward()
+    problem.loss(0)["total"].backward()
     code = torch.zeros(4, requires_grad=True)
     field = prior.decoder.at(code)(problem.rays.at(torch.ones(2, 2)))
     (expected,) = torch.autograd.grad(field[0, 0] - field[0, 1], code)
@@ -161,7 +159,7 @@ def test_the_gradient_is_that_of_the_loss(problem_of, prior):
 def test_evaluations_are_counted_and_judging_is_not(problem_of):
     problem = problem_of()
     assert problem.rays_per_iteration == 4
-    problem.loss()["total"].backward()
+    problem.loss(0)["total"].backward()
     assert (problem.counts.value, problem.counts.gradient) == (4, 4)
     field = problem.field()
     assert not field(torch.zeros(5, 3)).requires_grad
@@ -181,13 +179,12 @@ def test_a_renderer_without_a_gradient_towards_the_field_is_unsupported(problem_
 
 
 @pytest.mark.parametrize(("needs", "names"), [((Kind.LEVEL,), "level"), ((Kind.BOUND, Kind.LEVEL), "bound or level")])
-def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(scene, prior, needs, names):
+def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(problem_of, needs, names):
     picky = Fake(capabilities=Capabilities(needs, field_gradient=True, ray_gradient=True))
-    views = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 0.0), elevation=(0.0, 0.0), resolution=4)
-    stage = Stage(SETTINGS, picky, scene, views, prior, EvaluationSettings(8, 1, 0.02, 8), 0, CPU)
+    field = problem_of().field()
     with pytest.raises(Unsupported, match=f"Fake needs a {names} field, not a distance field"):
-        stage.problem()
-    assert replace(stage, renderer=Fake()).problem().parameters
+        check_kind(picky, field)
+    check_kind(Fake(), field)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Field, Kind
+from renderers.field import Field, Flops, Kind
 from renderers.fields import mlp
 from renderers.fields.mlp import Decoder
 
@@ -96,11 +96,11 @@ def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
 
 def test_flops_are_two_a_weight_without_the_code():
     # Layers 3 -> 8, 8 -> 8, (8 + 3) -> 8, 8 -> 8, 8 -> 1: 24 + 64 + 88 + 64 + 8 = 248 weights.
-    assert make("skip").at(torch.zeros(4, dtype=torch.float64)).flops == 496
+    assert make("skip").at(torch.zeros(4, dtype=torch.float64)).flops == Flops(496, 2 * 496)
     # 3 -> 12, 12 -> 5 (narrowed by 4 + 3), 5 + 3 -> 12, 12 -> 12, 12 -> 1: 36 + 60 + 96 + 144 + 12 = 348.
-    assert make("narrow").at(torch.zeros(4, dtype=torch.float64)).flops == 696
+    assert make("narrow").at(torch.zeros(4, dtype=torch.float64)).flops == Flops(696, 2 * 696)
     # 3 -> 8, 8 -> 5, (5 + 3) -> 8, 8 -> 1: 24 + 40 + 64 + 8 = 136.
-    assert make("no-code-skip").at(torch.zeros(0, dtype=torch.float64)).flops == 272
+    assert make("no-code-skip").at(torch.zeros(0, dtype=torch.float64)).flops == Flops(272, 2 * 272)
 
 
 def test_the_paper_network_has_deepsdfs_layers():

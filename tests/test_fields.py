@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from renderers.field import Counts, Field, Kind, Meter, autograd_normals, central_difference_normals
+from renderers.field import Counts, Field, Flops, Kind, Meter, autograd_normals, central_difference_normals
 from renderers.fields.analytic import (
     Shape,
     box,
@@ -360,10 +360,10 @@ def test_the_meter_counts_chunks_as_their_points():
 
 
 def test_the_meter_is_the_field_that_it_wraps_and_tells_its_cost():
-    shape = Shape(A.function, Kind.LEVEL, 2.5, flops=10)
+    shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
     meter = Meter(shape)
-    assert (meter.kind, meter.lipschitz, meter.flops) == (Kind.LEVEL, 2.5, 10)
+    assert (meter.kind, meter.lipschitz, meter.flops) == (Kind.LEVEL, 2.5, Flops(10, 20))
     # A value with its gradient costs three values.
-    assert Counts(value=5, gradient=2).flops(meter) == 10 * (5 + 2 * 2)
+    assert Counts(value=5, gradient=2).flops(meter) == 10 * 5 + 20 * 2
     assert Counts(5, 2).flops(A) is None
     assert Counts(5, 7) - Counts(1, 2) == Counts(4, 5)

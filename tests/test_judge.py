@@ -1,7 +1,6 @@
 """What a field is worth against a scene whose truth is known."""
 
 from dataclasses import replace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import torch
 import trimesh
 
 from bench.autodecoder import Prior
-from bench.config import EvaluationSettings
+from bench.config import EvaluationSettings, load
 from bench.judge import judge, look
 from bench.metrics import DEFINITIONS
 from bench.stage import Stage
@@ -17,7 +16,6 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
-from renderers import Naive
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
 
@@ -30,15 +28,14 @@ def stage() -> Stage:
     """A sphere as the truth, judged with 3,000 samples."""
     made = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     mesh = Mesh(np.array(made.vertices), np.array(made.faces))
-    renderer = Naive(steps=40, epsilon=1e-4, sphere_radius=1.0, silhouette_signed=True, silhouette_average="violating")
+    renderer = load("renderer", "naive", steps=40, epsilon=1e-4)
     decoder = Decoder(layers=1, width=2, code_length=0, skip=0, narrow=False)
     return Stage(
-        task=Mock(),
         renderer=renderer,
         scene=Scene("sphere test 0", mesh, see(Truth(mesh), VIEWS.camera(30.0, 20.0))),
         views=VIEWS,
         prior=Prior(decoder, torch.zeros(1, 0)),
-        evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16),
+        evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16, every=None),
         seed=0,
         device=torch.device("cpu"),
     )

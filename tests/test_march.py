@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers import DIST, Naive
+from bench.config import load
+from renderers import DIST
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
@@ -17,7 +18,7 @@ from tests.analytic_cases import vector
 PLAIN = Stepping(epsilon=5e-5, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, careful_split=False)
 AGGRESSIVE = replace(PLAIN, alpha=1.5)
 WALL = plane((0, 0, -1), 0.0)  # solid beyond z = 0: at z the value is -z
-NAIVE = Naive(steps=50, epsilon=5e-5, sphere_radius=1.0, silhouette_signed=True, silhouette_average="all")
+NAIVE = load("renderer", "naive", steps=50, epsilon=5e-5, silhouette_average="all")
 FINE = DIST(
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=0.01, step_clamp=None, active_only=True, coarse_to_fine=False,
     careful_split=True, samples=1, sphere_radius=1.0, silhouette_signed=True, silhouette_average="all",

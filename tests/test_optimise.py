@@ -36,7 +36,7 @@ class Toy:
     def field(self):
         return sphere(self.radius.detach())
 
-    def loss(self):
+    def loss(self, iteration):
         metered = Meter(sphere(self.radius), self.counts)
         values = metered(torch.tensor([3.0, 0, 0]).expand(POINTS, 3))
         square = values.square().mean() * self.spoil.get(self.calls, 1.0)
@@ -97,7 +97,7 @@ def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
 
 def test_a_parameter_that_is_no_number_ends_the_loop():
     class Cornered(Toy):
-        def loss(self):
+        def loss(self, iteration):
             self.calls += 1
             return {"total": (self.radius - 1.0).abs().sqrt()}  # 0 with an infinite slope at the start
 

@@ -24,7 +24,8 @@ PARTS = ("distance", "status", "points", "residual", "closest")
 
 @pytest.fixture(scope="module", params=sorted(path.stem for path in (CONF / "renderer").glob("*.yaml")))
 def renderer(request, compose_config) -> Renderer:
-    return build(compose_config(f"renderer={request.param}").renderer, "renderer")
+    yours = [f"renderer._target_={request.config.getoption('--renderer')}"] if request.param == "custom" else []
+    return build(compose_config(f"renderer={request.param}", *yours).renderer, "renderer")
 
 
 def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:

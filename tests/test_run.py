@@ -6,7 +6,6 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -17,13 +16,13 @@ from hydra.core.global_hydra import GlobalHydra
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
-from bench import runner
+from bench import runner, solve
 from bench.__main__ import main
 from bench.judge import Judgement
 from bench.optimise import Course
-from bench.records import RunStatus
+from bench.records import Record, RunStatus
 from bench.report.records import read_records
-from bench.stage import Stage
+from bench.stage import Cell, Stage
 from bench.tasks.problem import OptimiserSettings, Unsupported
 from datasets.mesh import Mesh
 
@@ -186,7 +185,7 @@ def test_evaluations_add_up(finished):
     width, inputs = 128, 67  # the shipped network: 4 layers with a skip; the code is folded into the biases
     weights = 3 * width + width * width + (width + 3) * width + width * width + width
     assert inputs == 64 + 3
-    assert finished.record["flops"] == 2 * weights * (evaluations["value"] + 2 * evaluations["gradient"])
+    assert finished.record["flops"] == 2 * weights * (evaluations["value"] + evaluations["gradient"])
 
 
 def test_naive_asks_every_ray_that_meets_the_sphere_at_every_step(finished):
@@ -296,10 +295,10 @@ def curve_after(tmp_path, monkeypatch):
                 on_step({"iteration": iteration, "total": total})
                 seen.append((tmp_path / "curve.jsonl").read_text())
 
-        monkeypatch.setattr(runner, "optimise", optimise)
-        task = SimpleNamespace(optimiser=OptimiserSettings(len(totals), 0.1))
-        stage = Mock(spec=Stage, task=task, device=None)
-        runner._optimise(stage, Mock(), tmp_path, Course(), lambda *_: None)
+        monkeypatch.setattr(solve, "optimise", optimise)
+        stage = Mock(spec=Stage, device=None, evaluation=Mock(every=None))
+        cell = Cell(stage, tmp_path, Mock(spec=Record), lambda *_: None)
+        solve._optimise(Mock(), OptimiserSettings(len(totals), 0.1), cell, Course())
         return seen
 
     return write
@@ -329,6 +328,6 @@ def test_the_curve_is_json_whatever_the_loss(curve_after):
 def test_a_run_is_judged_by_its_own_loss_and_surface(course, mesh, status):
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     judgement = Judgement(Mesh(corners, np.array([[0, 1, 2]])) if mesh else None, {})
-    found, reason = runner._verdict(course, judgement)
+    found, reason = solve._verdict(course, judgement)
     assert found is status
     assert bool(reason) is (status is not RunStatus.OK)

@@ -1,17 +1,18 @@
-"""`python -m bench.report [results_dir=PATH]`: writes the page and the table of all runs; prints the page last."""
+"""`python -m bench.report [results_dir=PATH]`: writes all tables, figures and the page; prints the page last."""
 
 import sys
 from pathlib import Path
 
 from bench.report.frame import write_frame
 from bench.report.html import write_index
+from bench.report.paper import write_paper
 from bench.report.records import read_records
 
 USAGE = "usage: python -m bench.report [results_dir=PATH]   (results_dir is `results` unless given)"
 
 
 def main(arguments: list[str]) -> None:
-    """Writes `runs.csv` and `index.html`; exits with a message where the command line or the folder is wrong."""
+    """Writes `runs.csv`, the experiments' files and `index.html`; exits with a message where an input is wrong."""
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
         return
@@ -22,7 +23,10 @@ def main(arguments: list[str]) -> None:
             sys.exit(f"argument must be results_dir=PATH, found {argument!r}\n{USAGE}")
         results_dir = Path(value)
     try:
-        print(write_frame(read_records(results_dir)[0], results_dir))
+        records = read_records(results_dir)[0]
+        print(write_frame(records, results_dir))
+        for path in write_paper(records, results_dir):
+            print(path)
         print(write_index(results_dir))
     except ValueError as error:
         sys.exit(str(error))

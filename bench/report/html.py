@@ -1,4 +1,4 @@
-"""One self-contained page of all runs: a row each, failed ones too, with pictures, definitions and machine."""
+"""One page: the tables and figures of the experiments, then a row for each run, failed ones too, with its details."""
 
 import os
 from collections import Counter
@@ -9,6 +9,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bench.report import format
+from bench.report.paper import find_paper
 from bench.report.records import read_records
 
 # How a status is coloured; a status of no kind listed here is shown as bad.
@@ -38,6 +39,7 @@ def write_index(results_dir: Path) -> Path:
     environment.filters |= {function.__name__: function for function in filters}
     text = environment.get_template("index.html").render(
         runs=[_run(record, results_dir / "runs" / record["folder"]) for record in records],
+        papers=find_paper(results_dir),
         problems=problems,
         statuses=Counter(record["status"] for record in records),
         machines=Counter(_machine(record) for record in records if record["environment"]),

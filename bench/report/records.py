@@ -64,7 +64,7 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
             problems.append(f"{folder.name}: no record.json; the run has not finished, or its record was removed")
         except (OSError, ValueError, RecursionError) as error:
             problems.append(f"{folder.name}: {error}")
-    records.sort(key=_started, reverse=True)
+    records.sort(key=started, reverse=True)
     return records, problems
 
 
@@ -78,23 +78,24 @@ def _read(folder: Path) -> dict[str, Any]:
     if record.get("schema") != SCHEMA:
         raise ValueError(f"record.json must have schema {SCHEMA}, found {record.get('schema')!r}")
     record.setdefault("notes", [])
-    record |= {name: _decoded(record[name]) for name in _NUMERIC if name in record}
+    record |= {name: decoded(record[name]) for name in _NUMERIC if name in record}
     for name, kind in _FIELDS.items():
         if name not in record:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], kind):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
-    _started(record)  # a time that cannot be read is found here, not in the sort
+    started(record)  # a time that cannot be read is found here, not in the sort
     return record | {"folder": folder.name}
 
 
-def _decoded(value: Any) -> Any:
+def decoded(value: Any) -> Any:
+    """The same data with the strings "inf", "-inf" and "nan" as the floats that they stand for."""
     if isinstance(value, dict):
-        return {name: _decoded(inner) for name, inner in value.items()}
+        return {name: decoded(inner) for name, inner in value.items()}
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value
 
 
-def _started(record: dict[str, Any]) -> datetime:
+def started(record: dict[str, Any]) -> datetime:
     """When the run started; a time without an offset is UTC."""
-    started = datetime.fromisoformat(record["started"])
-    return started if started.tzinfo else started.replace(tzinfo=UTC)
+    time = datetime.fromisoformat(record["started"])
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.autodecoder import Prior
+from bench.solve import solve
+from bench.stage import Cell
 from bench.tasks.problem import OptimiserSettings, Unsupported
 from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene
@@ -14,7 +16,7 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, at_iteration
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class Completion:
     def optimiser(self) -> OptimiserSettings:
         """For how long and how fast."""
         return OptimiserSettings(self.iterations, self.learning_rate)
+
+    def execute(self, cell: Cell) -> None:
+        """Optimises the code, and judges the shape before and after."""
+        solve(self, cell)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -103,10 +109,11 @@ class CompletionProblem:
         """The shape as it stands."""
         return self.decoder.at(self.code.detach())
 
-    def loss(self) -> dict[str, Tensor]:
+    def loss(self, iteration: int) -> dict[str, Tensor]:
         """DIST, Eq. 5, with the weights and the regulariser of B.4."""
         metered = Meter(self.decoder.at(self.code), self.counts)
-        rendering = self.renderer.render(metered, self.rays)
+        renderer = at_iteration(self.renderer, iteration)
+        rendering = renderer.render(metered, self.rays)
         compared = self.observed & rendering.hit
         error = (rendering.distance * self.depth_of_distance - self.depth).abs()
         squares = self.code.square()
@@ -116,6 +123,6 @@ class CompletionProblem:
             * (squares.sum() if self.settings.code_average == "sum" else squares.mean()),
         }
         if self.mask is not None:
-            silhouette = self.renderer.silhouette_loss(metered, self.rays, rendering, self.mask)
+            silhouette = renderer.silhouette_loss(metered, self.rays, rendering, self.mask)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return {"total": torch.stack(list(terms.values())).sum(), **terms}

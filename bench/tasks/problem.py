@@ -1,4 +1,4 @@
-"""What a task is to the runner: it builds a Problem, which has free parameters, a loss, and a field to judge."""
+"""What a task is to the runner, and what an inverse problem is to the one loop that solves it."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -8,6 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bench.autodecoder import Prior
+from bench.stage import Cell
 from datasets.scene import Scene
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer
@@ -34,8 +35,8 @@ class Problem(Protocol):
     rays_per_iteration: int
     observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
 
-    def loss(self) -> dict[str, Tensor]:
-        """The loss as "total", beside its weighted terms."""
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        """The loss at an iteration, counted from 0, as "total", beside its weighted terms."""
         ...
 
     def field(self) -> Field:
@@ -45,7 +46,20 @@ class Problem(Protocol):
 
 @runtime_checkable
 class Task(Protocol):
-    """Builds problems. It names no renderer."""
+    """Something that is done with a renderer and a scene. It names no renderer."""
+
+    def execute(self, cell: Cell) -> None:
+        """Does it, and fills the cell's record and folder.
+
+        Raises:
+            Unsupported: where the renderer cannot do what the task or its field needs.
+        """
+        ...
+
+
+@runtime_checkable
+class InverseTask(Protocol):
+    """A task that is an inverse problem; `bench.solve` executes it."""
 
     optimiser: OptimiserSettings
 
@@ -56,3 +70,11 @@ class Task(Protocol):
             Unsupported: where the renderer has no gradient that the task needs.
         """
         ...
+
+
+def check_kind(renderer: Renderer, field: Field) -> None:
+    """Raises Unsupported where a field is not of a kind that the renderer is meant for."""
+    needs = renderer.capabilities.needs
+    if field.kind not in needs:
+        names = " or ".join(need.value for need in needs)
+        raise Unsupported(f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field")

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderers.field import Kind
+from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
 
@@ -23,7 +23,7 @@ class Shape:
     function: Callable[[Tensor], Tensor]
     kind: Kind = Kind.DISTANCE
     lipschitz: float | None = 1.0
-    flops: int | None = None
+    flops: Flops | None = None
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return self.function(points)

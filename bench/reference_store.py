@@ -1,0 +1,65 @@
+"""Float64 renderings of a network in a view, made once and kept by what they were made from."""
+
+import hashlib
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from bench.autodecoder import Prior
+from bench.records import digest
+from renderers.camera import Camera
+from renderers.field import Field, autograd_normals
+from renderers.reference import steepest, trace
+
+VERSION = 1  # to be raised when the reference changes
+LEAST_STEP = 2e-4  # scene units: what is thinner along a ray may be missed; a pixel at 512 x 512 is 9e-3 wide
+RADIUS = 1.0  # scene units, of the sphere that rays start on
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a camera sees of a field, in float64, on the CPU; distance and normals are 0 where nothing is hit."""
+
+    distance: Float[Tensor, "height width"]
+    normals: Float[Tensor, "height width 3"]
+    hit: Bool[Tensor, "height width"]
+
+
+def in_float64(prior: Prior) -> Prior:
+    """A copy of a prior in float64, on the CPU."""
+    return Prior(deepcopy(prior.decoder).cpu().double(), prior.codes.cpu().double())
+
+
+def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
+    """The reference of a prior's first shape in a view, from `folder`, or made and kept there."""
+    path = folder / f"reference-{_key(prior, camera)}.safetensors"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        twin = in_float64(prior)
+        scratch = path.with_suffix(".partial")
+        save_file(vars(make_reference(twin.decoder.at(twin.codes[0]), camera)), scratch)
+        scratch.replace(path)
+    return Reference(**load_file(path))
+
+
+def make_reference(field: Field, camera: Camera) -> Reference:
+    """Traces a float64 field through every pixel's centre."""
+    rays = camera.double().rays()
+    lipschitz = steepest(field, radius=RADIUS)
+    rendering = trace(field, rays, lipschitz=lipschitz, least_step=LEAST_STEP, radius=RADIUS)
+    normals = torch.zeros_like(rendering.points)
+    normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
+    return Reference(rendering.distance * rendering.hit, normals, rendering.hit)
+
+
+def _key(prior: Prior, camera: Camera) -> str:
+    weights = hashlib.sha256()
+    for tensor in (*prior.decoder.state_dict().values(), prior.codes[0]):
+        weights.update(tensor.cpu().contiguous().numpy().tobytes())
+    numbers = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
+    return digest({"version": VERSION, "weights": weights.hexdigest(), "camera": numbers})

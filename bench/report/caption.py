@@ -1,0 +1,64 @@
+"""Sentences that every caption has: on what it was measured, what failed, what was left out."""
+
+import textwrap
+from typing import Any
+
+from bench.report.experiments import Experiment, setting
+
+LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
+
+
+def setup(experiment: Experiment) -> str:
+    """Scenes, asked resolution, network, machine and threads, as one sentence."""
+    config, records = experiment.asked(), experiment.records
+    scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in records))
+    known = [scene for scene in scenes if scene] or [records[0]["dataset"]]
+    resolution = setting(config, "view", "resolution")
+    environment = next((record["environment"] for record in records if record["environment"]), {})
+    machine = [str(environment.get(name) or "") for name in ("cpu", "device")]
+    threads = environment.get("threads")
+    parts = [
+        f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",
+        f"{resolution}×{resolution} pixels" if resolution else "",
+        _network(setting(config, "prior", "network") or setting(config, "scale", "network")),
+        " + ".join(part for part in machine if part and part != "cpu"),
+        f"{threads} thread{'s' if threads != 1 else ''}" if threads else "",
+    ]
+    return "; ".join(part for part in parts if part) + "."
+
+
+def outcome(experiment: Experiment) -> str:
+    """How many rows ended ok, and each that did not with its status and reason."""
+    pairs = zip(experiment.names(), experiment.records, strict=True)
+    failed = [_failure(name, record) for name, record in pairs if record["status"] != "ok"]
+    total = len(experiment.records)
+    if not failed:
+        return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
+    return f"{len(failed)} of {total} runs did not end ok: {'; '.join(failed)}."
+
+
+def omitted(experiment: Experiment) -> str:
+    """How many records of this experiment are not shown, and why; empty where all are."""
+    if not experiment.left_out:
+        return ""
+    runs = "1 run" if experiment.left_out == 1 else f"{experiment.left_out} runs"
+    return f"Not shown: {runs} of this experiment with another scene, setting or machine."
+
+
+def joined(*sentences: str) -> str:
+    """The sentences that are not empty, as one paragraph."""
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _failure(name: str, record: dict[str, Any]) -> str:
+    reason = textwrap.shorten(record["reason"] or "no reason recorded", LONGEST_REASON, placeholder=" …")
+    return f"{name}: {record['status']} ({reason.rstrip('.')})"
+
+
+def _network(network: Any) -> str:
+    layers, width = setting(network, "layers"), setting(network, "width")
+    return f"decoder of {layers} layers of {width}" if layers and width else ""
+
+
+def _listed(names: list[str], most: int = 4) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,142 @@
+"""Which records make up an experiment: the newest, those that may be compared with it, and their rows."""
+
+from collections import Counter
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bench.report.records import started
+
+TASKS = {"table1": "ablation", "fig4": "ablation", "fig5": "completion", "fig7": "ablation", "gradients": "gradients"}
+ROW_KEYS = {"renderer", "label", "seed", "index"}  # of a configuration: what the rows of one experiment may differ in
+NEUTRAL_KEYS = {"results_dir", "priors_dir", "verbose", "packages"}  # of a configuration: what changes no result
+MACHINE = ("cpu", "device", "threads")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The comparable records of an experiment, one a row, in the order of its rows.
+
+    `left_out` counts the records of the same experiment that may not be compared with these.
+    """
+
+    name: str
+    results_dir: Path
+    records: list[dict[str, Any]]
+    left_out: int = 0
+
+    def folder(self, record: dict[str, Any]) -> Path:
+        """The record's run folder."""
+        return self.results_dir / "runs" / record["folder"]
+
+    def asked(self) -> dict[str, Any]:
+        """A configuration of the experiment; all rows agree on what is not a row's own."""
+        return self.records[0]["config"]
+
+    def names(self) -> list[str]:
+        """A readable name for each record: its row's, with seed and shape where the rows differ in these."""
+        seeds, shapes = ({part(record) for record in self.records} for part in (_seed, _index))
+        return [
+            row_name(record)
+            + (f", seed {_seed(record)}" if len(seeds) > 1 else "")
+            + (f", shape {_index(record)}" if len(shapes) > 1 else "")
+            for record in self.records
+        ]
+
+    def of_newest_scene(self) -> "Experiment":
+        """The same, with only those rows that have the seed and the shape of the row that started last."""
+        newest = max(self.records, key=started)
+        kept = [r for r in self.records if (_seed(r), _index(r)) == (_seed(newest), _index(newest))]
+        return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
+
+
+def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Experiment | None:
+    """The experiment's newest record and those that share all but the row's own with it; None without a record.
+
+    What must be shared: the configuration but for `ROW_KEYS` and `NEUTRAL_KEYS`, and the machine with its threads. A
+    run that failed before it could name its machine counts as of any. Rows stand in the order in which they first
+    started; a row that was run more than once is its newest record.
+    """
+    found = [r for r in records if r["config"].get("experiment") == name and r["task"] == TASKS[name]]
+    if not found:
+        return None
+    found.sort(key=started)
+    same = [r for r in found if _shared(r) == _shared(found[-1])]
+    machines = [machine for r in same if (machine := _machine(r))]
+    same = [r for r in same if _machine(r) in (machines[-1], None)] if machines else same
+    rows: dict[Hashable, dict[str, Any]] = {}
+    for record in same:
+        rows[_key(record, name)] = record  # takes the place of the first, with the content of the newest
+    return Experiment(name, results_dir, list(rows.values()), len(found) - len(same))
+
+
+def row_name(record: dict[str, Any]) -> str:
+    """The name of the record's row: its label, or else its renderer's name."""
+    return str(record["config"].get("label") or record["renderer"])
+
+
+def measured(record: dict[str, Any], name: str) -> int | float | None:
+    """The metric of that name; None where there is no such number."""
+    value = record["metrics"].get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def setting(config: dict[str, Any], *path: str) -> Any:
+    """The value of a configuration under nested keys; None where a key is missing."""
+    node: Any = config
+    for key in path:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
+
+
+def identity(record: dict[str, Any]) -> dict[str, Any]:
+    """What tells rows apart, and what became of them: the columns that every table of an experiment has."""
+    columns = {"row": row_name(record), "renderer": record["renderer"], "seed": _seed(record), "index": _index(record)}
+    return {**columns, "status": record["status"], "reason": record["reason"], "folder": record["folder"]}
+
+
+def definitions(records: list[dict[str, Any]], names: dict[str, str]) -> list[str]:
+    """A line for each definition of a metric that is shown, under the headings of its columns.
+
+    Args:
+        records: of the experiment. A definition may be of several metrics, such as "lost, false", of all that begin
+            alike, such as "depth_error", or of one band's, such as "frontal.code_cosine".
+        names: heading by metric.
+    """
+    lines: dict[str, str] = {}
+    for record in records:
+        for key, text in record["definitions"].items():
+            parts = [part.strip().rsplit(".", 1)[-1] for part in key.split(",")]
+            own = [h for name, h in names.items() if any(name == p or name.startswith(f"{p}_") for p in parts)]
+            if own:
+                lines.setdefault(", ".join(dict.fromkeys(own)), text)
+    return [f"{headings}: {text}" for headings, text in lines.items()]
+
+
+def repeated(records: list[dict[str, Any]]) -> str:
+    """How often the times were taken, in words; empty where no record says so."""
+    times = Counter(n for record in records if (n := measured(record, "repeats")) is not None)
+    return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""
+
+
+def _key(record: dict[str, Any], name: str) -> Hashable:
+    epsilon = setting(record["config"], "renderer", "epsilon") if name == "fig7" else None
+    return (row_name(record), _seed(record), _index(record), str(epsilon))
+
+
+def _seed(record: dict[str, Any]) -> Any:
+    return record["seed"]
+
+
+def _index(record: dict[str, Any]) -> Any:
+    return record["config"].get("index")
+
+
+def _shared(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record["config"].items() if key not in ROW_KEYS | NEUTRAL_KEYS}
+
+
+def _machine(record: dict[str, Any]) -> tuple[Any, ...] | None:
+    environment = record["environment"]
+    return tuple(environment.get(name) for name in MACHINE) if environment else None

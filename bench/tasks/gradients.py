@@ -1,0 +1,204 @@
+"""How true a renderer's gradients are: against central differences in float64, by angle of incidence."""
+
+from dataclasses import dataclass
+from math import cos, radians
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bench.jacobians import Differences, differences, image_differences
+from bench.records import RunStatus
+from bench.reference_store import RADIUS, Reference, in_float64, reference_for
+from bench.stage import Cell
+from bench.tasks.problem import Unsupported, check_kind
+from renderers.camera import Camera
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Counts, Meter
+from renderers.fields.mlp import Decoder
+from renderers.reference import steepest
+from renderers.rendering import Renderer
+
+BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
+ASTRAY = 0.01  # scene units: a renderer whose hit lies further off is at another surface, and is not judged there
+
+DEFINITIONS = {
+    "BAND": "angle between ray and inward normal: frontal to 30 degrees, oblique to 70, grazing beyond; silhouette: "
+    "pixels beside the outline",
+    "pixels, excluded": "pixels judged; pixels drawn but not judged, since visibility changes there, the root is not "
+    "found again, or the renderer does not hit that surface",
+    "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and its truth, median over pixels; "
+    "code: along `task.directions` orthogonal directions, camera: six rigid motions (scene units, radians)",
+    "code_pooled_cosine, camera_pooled_cosine": "cosine between the gradients of all pixels of the band, one after the "
+    "other, and the truth: a scale that differs between pixels lowers it",
+    "code_scale, camera_scale": "length of the gradient along the truth over that of the truth, median over pixels",
+    "code_median_error, code_p99_error": "length of the difference over that of the truth, over pixels",
+    "image_cosine, image_scale": "pooled cosine and scale of the image of distances, with the sphere's far side as "
+    "background, towards the code, against differences of a supersampled image, in which visibility changes",
+}
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Compares the gradients of distance with central differences, on the first shape of a prior, all in float64.
+
+    Args:
+        pixels: drawn in each band of angles.
+        directions: of the code, orthogonal and drawn at random.
+        outline: pixels drawn beside the outline.
+        outline_directions: of the code, there.
+        outline_step: length of the step of the code there.
+        supersampling: rays a side of a pixel there.
+    """
+
+    pixels: int
+    directions: int
+    outline: int
+    outline_directions: int
+    outline_step: float
+    supersampling: int
+
+    def __post_init__(self) -> None:
+        for name in ("pixels", "directions", "outline", "outline_directions", "supersampling"):
+            check_at_least(f"task.{name}", getattr(self, name), 1, "conf/task/gradients.yaml holds values that work")
+        check_positive("task.outline_step", self.outline_step, "conf/task/gradients.yaml holds one that works")
+
+    def execute(self, cell: Cell) -> None:
+        """Judges, and fills the record."""
+        stage, record = cell.stage, cell.record
+        record.definitions = DEFINITIONS
+        twin = in_float64(stage.prior)
+        reference = reference_for(stage.prior, stage.scene.view.camera, stage.cache)
+        subject = Subject(
+            stage.renderer,
+            twin.decoder.requires_grad_(False),
+            twin.codes[0],
+            stage.scene.view.camera.double(),
+            Counts(),
+        )
+        subject.check()
+        generator = torch.Generator().manual_seed(stage.seed)
+        axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
+        directions = torch.linalg.qr(axes).Q
+        metrics: dict[str, float] = {}
+        for number, (band, pixels) in enumerate(_bands(reference, subject.camera).items()):
+            cell.progress("bands", number, len(BANDS) + 1)
+            drawn = _draw(pixels, self.pixels, generator)
+            numbers = self._judge(subject, drawn, reference.distance.flatten()[drawn], directions)
+            metrics |= {f"{band}.{name}": value for name, value in numbers.items()}
+        outline = _draw(_outline(reference.hit), self.outline, generator)
+        numbers = self._judge_outline(subject, outline, directions[:, : self.outline_directions])
+        metrics |= {f"silhouette.{name}": value for name, value in numbers.items()}
+        record.metrics = metrics
+        record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}
+        record.status, record.reason = RunStatus.OK, ""
+
+    def _judge(
+        self,
+        subject: "Subject",
+        pixels: Int[Tensor, "m"],
+        distance: Float[Tensor, "m"],
+        directions: Float[Tensor, "code_length directions"],
+    ) -> dict[str, float]:
+        """The numbers of one band."""
+        if not pixels.numel():
+            return {"pixels": 0, "excluded": 0}
+        truth: Differences = differences(
+            subject.decoder, subject.code, directions, camera=subject.camera, pixels=pixels, distance=distance
+        )
+        by_code, by_camera, found, hit = subject.gradients(pixels)
+        judged = truth.valid & hit & ((found - distance).abs() < ASTRAY)
+        numbers: dict[str, float] = {"pixels": int(judged.sum()), "excluded": int((~judged).sum())}
+        if judged.any():
+            numbers |= _compare((by_code @ directions)[judged], truth.code[judged], "code")
+            if subject.renderer.capabilities.ray_gradient:
+                numbers |= _compare(by_camera[judged], truth.camera[judged], "camera")
+        return numbers
+
+    def _judge_outline(
+        self, subject: "Subject", pixels: Int[Tensor, "m"], directions: Float[Tensor, "code_length directions"]
+    ) -> dict[str, float]:
+        """The numbers across the silhouette."""
+        lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
+        truth = image_differences(
+            lambda shift: subject.decoder.at(subject.code + shift),
+            directions,
+            camera=subject.camera,
+            pixels=pixels,
+            step=self.outline_step,
+            supersampling=self.supersampling,
+            lipschitz=lipschitz,
+        )
+        by_code, _, _, hit = subject.gradients(pixels)
+        image = (by_code @ directions) * hit[:, None]  # the background does not move
+        numbers: dict[str, float] = {"pixels": len(pixels)}
+        numbers["image_cosine"] = torch.cosine_similarity(image.flatten(), truth.flatten(), dim=0).item()
+        numbers["image_scale"] = ((image * truth).sum() / truth.square().sum()).item()
+        return numbers
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A renderer before a network, all in float64."""
+
+    renderer: Renderer
+    decoder: Decoder
+    code: Float[Tensor, "code_length"]
+    camera: Camera
+    counts: Counts
+
+    def check(self) -> None:
+        """Raises Unsupported where the renderer cannot do this."""
+        check_kind(self.renderer, self.decoder.at(self.code))
+        if not self.renderer.capabilities.field_gradient:
+            raise Unsupported(f"{type(self.renderer).__name__} has no gradient towards the field")
+
+    def gradients(
+        self, pixels: Int[Tensor, "m"]
+    ) -> tuple[Float[Tensor, "m code_length"], Float[Tensor, "m 6"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
+        """Of each pixel: the gradient of its distance towards code and camera, the distance, and whether it hits."""
+        code = self.code.clone().requires_grad_(True)
+        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        rays = self.camera.moved(twist).rays().flat()
+        rendering = self.renderer.render(Meter(self.decoder.at(code), self.counts), rays[pixels])
+        by_code = torch.zeros(len(pixels), len(code), dtype=torch.float64)
+        by_camera = torch.zeros(len(pixels), 6, dtype=torch.float64)
+        for row in rendering.hit.nonzero().squeeze(-1).tolist():
+            found = torch.autograd.grad(rendering.distance[row], (code, twist), retain_graph=True, allow_unused=True)
+            for table, gradient in zip((by_code, by_camera), found, strict=True):
+                if gradient is not None:
+                    table[row] = gradient
+        return by_code, by_camera, rendering.distance.detach(), rendering.hit
+
+
+def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str) -> dict[str, float]:
+    length = torch.linalg.vector_norm(true, dim=1)
+    error = torch.linalg.vector_norm(found - true, dim=1) / length
+    middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
+    return {
+        f"{name}_cosine": torch.cosine_similarity(found, true, dim=1).median().item(),
+        f"{name}_pooled_cosine": torch.cosine_similarity(found.flatten(), true.flatten(), dim=0).item(),
+        f"{name}_scale": ((found * true).sum(1) / length.square()).median().item(),
+        f"{name}_median_error": middle,
+        f"{name}_p99_error": high,
+    }
+
+
+def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"]]:
+    """The hit pixels of each band of angles, as indices into the image in one row."""
+    cosine = -(reference.normals * camera.rays().directions).sum(-1)
+    bands = {}
+    for band, (low, high) in BANDS.items():
+        within = (cosine <= cos(radians(low))) & (cosine > cos(radians(high)))
+        bands[band] = (within & reference.hit).flatten().nonzero().squeeze(-1)
+    return bands
+
+
+def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, "some"]:
+    """Pixels that have both hits and misses among themselves and their neighbours."""
+    around = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
+    return (around.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
+
+
+def _draw(pixels: Int[Tensor, "some"], count: int, generator: torch.Generator) -> Int[Tensor, "few"]:
+    return pixels[torch.randperm(len(pixels), generator=generator)[:count]].sort().values

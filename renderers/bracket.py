@@ -1,0 +1,87 @@
+"""Roots between two samples of a field on a ray: the first change from free to occupied, and how to close in on it.
+
+Everything here runs without a graph; `gradients.implicit` attaches the gradient afterwards.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Rays
+from renderers.field import Field
+
+REFINEMENTS = ("secant", "bisection")
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """Distances along n rays between which the field falls from positive to at most zero, and its values there."""
+
+    near: Float[Tensor, "n"]
+    far: Float[Tensor, "n"]
+    near_value: Float[Tensor, "n"]
+    far_value: Float[Tensor, "n"]
+
+
+def first_crossing(
+    distance: Float[Tensor, "n samples"], value: Float[Tensor, "n samples"]
+) -> tuple[Bool[Tensor, "n"], Bracket]:
+    """The first interval between neighbouring samples over which the field falls from free to occupied (DVR, Eq. 10).
+
+    Args:
+        distance: of the samples, rising along each ray.
+        value: of the field there, positive in free space.
+
+    Returns:
+        which rays have such an interval, and the intervals of those rays.
+    """
+    falls = (value[:, :-1] > 0) & (value[:, 1:] <= 0)
+    found = falls.any(dim=1)
+    before = falls[found].to(torch.int8).argmax(dim=1, keepdim=True)
+    pick = [table[found].gather(1, index).squeeze(1) for table in (distance, value) for index in (before, before + 1)]
+    return found, Bracket(pick[0], pick[1], pick[2], pick[3])
+
+
+def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: int) -> Bracket:
+    """Brackets closer about the root, by one value of the field a step and ray.
+
+    Args:
+        field: where it has no finite value it counts as occupied.
+        rays: n rays, as many as the bracket has.
+        method: "secant", where the line through both ends meets zero, or "bisection", the middle.
+        steps: how often.
+    """
+    near, far, near_value, far_value = bracket.near, bracket.far, bracket.near_value, bracket.far_value
+    for _ in range(steps):
+        middle = _GUESSES[method](Bracket(near, far, near_value, far_value))
+        value = field(rays.at(middle))
+        value = torch.where(value.isfinite(), value, far_value)
+        free = value > 0
+        near, near_value = torch.where(free, middle, near), torch.where(free, value, near_value)
+        far, far_value = torch.where(free, far, middle), torch.where(free, far_value, value)
+    return Bracket(near, far, near_value, far_value)
+
+
+def refine(
+    field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: int
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """The root in a bracket: the last estimate after `narrow`, and the field's value at the better end."""
+    closer = narrow(field, rays, bracket, method=method, steps=steps)
+    better = closer.near_value.abs() < closer.far_value.abs()
+    return _GUESSES[method](closer), torch.where(better, closer.near_value, closer.far_value)
+
+
+def _secant(bracket: Bracket) -> Tensor:
+    # The values differ in sign, so the share lies between 0 and 1.
+    share = bracket.near_value / (bracket.near_value - bracket.far_value)
+    return bracket.near + share * (bracket.far - bracket.near)
+
+
+def _middle(bracket: Bracket) -> Tensor:
+    return (bracket.near + bracket.far) / 2
+
+
+_GUESSES: dict[str, Callable[[Bracket], Tensor]] = {"secant": _secant, "bisection": _middle}

@@ -1,0 +1,98 @@
+"""DVR's network: occupancy and texture of points and a shape code, bound to one code before anything is rendered."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from renderers.checks import check_at_least
+from renderers.field import Flops
+
+BLOCKS = 5  # DVR, Sec. 3.5
+CHUNK = 2048  # points a pass: bounds memory, and changes nothing
+
+
+class OccupancyNetwork(nn.Module):
+    """Fully connected ResNet blocks with ReLU, then two heads of one layer each: occupancy, and texture.
+
+    Source: DVR (Niemeyer et al. 2020), Secs. 3.1 and 3.5: 5 blocks; one output for occupancy, three for texture; codes
+        of length 256 for single views.
+    Deviates: no image encoder; a code is given. The two sections leave open where the code enters, what a block looks
+        like, the width and the first weights. Here a linear map of the code is added before every block; a block is
+        x + B relu(A relu(x)); the width is an argument; the weights start as torch draws them.
+
+    Args:
+        width: neurons a layer.
+        code_length: numbers in a shape's code; 0 for a network of one shape.
+    """
+
+    def __init__(self, *, width: int, code_length: int) -> None:
+        super().__init__()
+        check_at_least("width", width, 1, "128 suits one shape, 512 many")
+        check_at_least("code_length", code_length, 0, "DVR has 256 for single views, 0 is for one shape")
+        self.width, self.code_length = width, code_length
+        self.first = nn.Linear(3, width)
+        takes_code = range(BLOCKS if code_length else 0)
+        self.shifts = nn.ModuleList(nn.Linear(code_length, width, bias=False) for _ in takes_code)
+        self.blocks = nn.ModuleList(_Block(width) for _ in range(BLOCKS))
+        self.occupancy_head = nn.Linear(width, 1)
+        self.texture_head = nn.Linear(width, 3)
+
+    def at(self, code: Float[Tensor, "*shapes code_length"]) -> "BoundOccupancy":
+        """Occupancy and texture of one code, or of a batch of codes; what a code adds to a block is worked out once."""
+        if code.shape[-1] != self.code_length:
+            raise ValueError(f"code must end in {self.code_length} numbers, not {code.shape[-1]}")
+        return BoundOccupancy(self, tuple(shift(code) for shift in self.shifts))
+
+
+@dataclass(frozen=True)
+class BoundOccupancy:
+    """An occupancy network at one code. It is no Field: `field.occupancy_field` makes one of its logits."""
+
+    network: OccupancyNetwork
+    shifts: tuple[Tensor, ...]
+
+    @property
+    def flops(self) -> Flops:
+        """Of a logit: a multiplication and an addition a weight; as much again towards points, twice with weights."""
+        network = self.network
+        layers = nn.ModuleList([network.first, network.blocks, network.occupancy_head])
+        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
+        frozen = not any(weight.requires_grad for weight in layers.parameters())
+        return Flops(value, value if frozen else 2 * value)
+
+    def logits(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Of the probability of being inside; for a batch of codes [*shapes, length], of points [*shapes, n, 3]."""
+        return self._outputs(points, self.network.occupancy_head).squeeze(-1)
+
+    def colours(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Red, green and blue from 0 to 1, at points as for `logits`."""
+        return self._outputs(points, self.network.texture_head).sigmoid()
+
+    def _outputs(self, points: Tensor, head: nn.Module) -> Tensor:
+        if self.shifts and self.shifts[0].dim() > 1:
+            return head(self._features(points))
+        chunks = [head(self._features(chunk)) for chunk in points.reshape(-1, 3).split(CHUNK)]
+        outputs = torch.cat(chunks)
+        return outputs.view(*points.shape[:-1], outputs.shape[-1])
+
+    def _features(self, points: Tensor) -> Tensor:
+        features = self.network.first(points)
+        for index, block in enumerate(self.network.blocks):
+            if self.shifts:
+                shift = self.shifts[index]
+                features = features + (shift if shift.dim() == 1 else shift[..., None, :])
+            features = block(features)
+        return torch.relu(features)
+
+
+class _Block(nn.Module):
+    """Two layers around which the input is led past."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return features + self.outer(torch.relu(self.inner(torch.relu(features))))

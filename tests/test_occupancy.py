@@ -1,0 +1,220 @@
+"""The occupancy network against the plain computation, in float64, and the adapter between occupancy and fields."""
+
+from math import log
+
+import pytest
+import torch
+from torch import Tensor
+
+from renderers.field import Field, Flops, Kind, Meter, occupancy_field, occupancy_logits
+from renderers.fields import occupancy
+from renderers.fields.analytic import Shape, sphere
+from renderers.fields.occupancy import OccupancyNetwork
+
+LEVEL = Shape(lambda p: p.square().sum(-1) - 0.25, Kind.LEVEL, None)
+BOUND = Shape(lambda p: 0.5 * (p.norm(dim=-1) - 0.5), Kind.BOUND, 0.5)
+
+
+def make(code_length: int = 4, width: int = 8) -> OccupancyNetwork:
+    torch.manual_seed(0)
+    return OccupancyNetwork(width=width, code_length=code_length).double()
+
+
+def draw(code_length: int, *shape: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    code = torch.randn(code_length, dtype=torch.float64, generator=generator, requires_grad=True)
+    return code, torch.randn(*shape, 3, dtype=torch.float64, generator=generator, requires_grad=True)
+
+
+def plain(network: OccupancyNetwork, code: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Logits and colours with nothing bound: every point has its copy of the code, and the layers are matrices."""
+    weights = dict(network.named_parameters())
+    codes = code.expand(*points.shape[:-1], -1)
+
+    def affine(features: Tensor, name: str) -> Tensor:
+        return features @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+    features = affine(points, "first")
+    for index in range(5):
+        if network.code_length:
+            features = features + codes @ weights[f"shifts.{index}.weight"].T
+        inner = affine(features.clamp_min(0), f"blocks.{index}.inner")
+        features = features + affine(inner.clamp_min(0), f"blocks.{index}.outer")
+    features = features.clamp_min(0)
+    return affine(features, "occupancy_head")[..., 0], 1 / (1 + torch.exp(-affine(features, "texture_head")))
+
+
+def both(network: OccupancyNetwork, code: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    bound = network.at(code)
+    return bound.logits(points), bound.colours(points)
+
+
+@pytest.mark.parametrize("code_length", [0, 4])
+@pytest.mark.parametrize("shape", [(5,), (), (0,), (2, 3), (2, 0)])
+def test_a_bound_code_gives_the_unbound_network_in_any_leading_shape(code_length, shape):
+    network, (code, points) = make(code_length), draw(code_length, *shape)
+    logits, colours = both(network, code, points)
+    assert (logits.shape, colours.shape) == (shape, (*shape, 3))
+    torch.testing.assert_close((logits, colours), plain(network, code, points), rtol=0, atol=1e-13)
+    assert ((colours > 0) & (colours < 1)).all()
+
+
+@pytest.mark.parametrize("batch", [(3,), (2, 3)])
+@pytest.mark.parametrize("code_length", [0, 4])
+def test_a_batch_of_codes_is_each_code_by_itself(code_length, batch):
+    network = make(code_length)
+    codes = torch.randn(*batch, code_length, dtype=torch.float64)
+    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
+    logits, colours = both(network, codes, points)
+    assert (logits.shape, colours.shape) == ((*batch, 5), (*batch, 5, 3))
+    for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
+        one = tuple(index)
+        alone = plain(network, codes[one], points[one])
+        torch.testing.assert_close((logits[one], colours[one]), alone, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("output", [0, 1], ids=["logits", "colours"])
+@pytest.mark.parametrize("code_length", [0, 4])
+def test_gradients_flow_to_weights_code_and_points_as_in_the_unbound_network(code_length, output):
+    network, (code, points) = make(code_length), draw(code_length, 6)
+    other = (network.texture_head, network.occupancy_head)[output]
+    unused = {id(parameter) for parameter in other.parameters()}
+    wanted = (points, *(p for p in network.parameters() if id(p) not in unused), *([code] if code_length else []))
+    bound = torch.autograd.grad(both(network, code, points)[output].square().sum(), wanted)
+    reference = torch.autograd.grad(plain(network, code, points)[output].square().sum(), wanted)
+    torch.testing.assert_close(bound, reference, rtol=1e-10, atol=1e-13)
+    assert all(gradient.abs().sum() > 0 for gradient in bound)
+
+
+@pytest.mark.parametrize("count", [0, 6, 7, 8, 20])
+def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
+    network, (code, points) = make(), draw(4, count)
+    whole = both(network, code, points)
+    sizes = []
+    network.first.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    monkeypatch.setattr(occupancy, "CHUNK", 7)
+    torch.testing.assert_close(both(network, code, points), whole, rtol=0, atol=1e-14)
+    assert sum(sizes) == 2 * count
+    assert max(sizes) <= 7
+
+
+def test_the_layers_are_those_of_the_paper():
+    network = OccupancyNetwork(width=32, code_length=256)
+    assert len(network.blocks) == len(network.shifts) == 5
+    shapes = [tuple(weight.shape) for name, weight in network.named_parameters() if weight.dim() > 1]
+    assert shapes == [(32, 3), *[(32, 256)] * 5, *[(32, 32)] * 10, (1, 32), (3, 32)]
+
+
+def test_flops_are_two_a_weight_without_the_code_and_twice_that_back_to_weights():
+    network = make()
+    value = 2 * (3 * 8 + 10 * 8 * 8 + 8)
+    assert network.at(torch.zeros(4, dtype=torch.float64)).flops == Flops(value, 2 * value)
+    network.requires_grad_(False)
+    assert network.at(torch.zeros(4, dtype=torch.float64)).flops == Flops(value, value)
+
+
+def test_a_tiny_network_learns_a_sphere():
+    torch.manual_seed(0)
+    network = OccupancyNetwork(width=32, code_length=0)
+    bound = network.at(torch.zeros(0))
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    truth = sphere(0.5)
+    for _ in range(200):
+        points = torch.rand(1000, 3) * 2 - 1
+        inside = (truth(points) < 0).float()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(bound.logits(points), inside)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    points = torch.rand(20000, 3) * 2 - 1
+    with torch.no_grad():
+        agree = (occupancy_field(bound.logits, 0.5)(points) < 0) == (truth(points) < 0)
+    assert agree.float().mean() > 0.98
+    assert truth(points)[~agree].abs().max() < 0.1  # the surface is nowhere far from the sphere
+
+
+def test_the_field_of_an_occupancy_is_negative_where_the_probability_exceeds_the_threshold():
+    logits = vector_of_logits(0.1, 0.3, 0.6)
+    low, half = occupancy_field(logits, 0.2), occupancy_field(logits, 0.5)
+    points = torch.zeros(3, 3, dtype=torch.float64)
+    assert (low(points) < 0).tolist() == [False, True, True]
+    assert (half(points) < 0).tolist() == [False, False, True]
+    # logit(0.2) = -log 4, logit(0.5) = 0; p = 0.6 is 3 to 2.
+    assert low(points)[2].item() == pytest.approx(-log(4) - log(1.5))
+    assert half(points)[2].item() == pytest.approx(-log(1.5))
+    at_threshold = occupancy_field(vector_of_logits(0.2), 0.2)(points[:1])
+    assert at_threshold.item() == pytest.approx(0, abs=1e-12)
+
+
+def vector_of_logits(*probabilities: float):
+    """An occupancy that takes no notice of the points' places."""
+    return lambda points: torch.tensor(probabilities, dtype=points.dtype).logit()
+
+
+def test_the_field_of_an_occupancy_is_a_level_set_that_a_meter_can_wrap():
+    flops = Flops(10, 20)
+    field = occupancy_field(make(0).at(torch.zeros(0, dtype=torch.float64)).logits, 0.3, flops=flops)
+    assert isinstance(field, Field)
+    assert (field.kind, field.lipschitz, field.flops) == (Kind.LEVEL, None, flops)
+    assert occupancy_field(vector_of_logits(0.5), 0.5).flops is None
+    meter = Meter(field)
+    meter(torch.randn(7, 3, dtype=torch.float64)).sum().backward()
+    assert meter.counts.flops(meter) == 7 * 10 + 7 * 20
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.9])
+def test_logits_to_field_and_back_are_the_logits_less_the_threshold(dtype, threshold):
+    bound = make(0).to(dtype).at(torch.zeros(0, dtype=dtype))
+    points = torch.randn(2, 5, 3, dtype=dtype)
+    field = occupancy_field(bound.logits, threshold)
+    values = field(points)
+    assert values.dtype == dtype
+    back = occupancy_logits(field, values, width=0.1)
+    level = log(threshold / (1 - threshold))
+    torch.testing.assert_close(back, bound.logits(points) - level, rtol=0, atol=1e-6)
+    torch.testing.assert_close(occupancy_field(lambda _: back, 0.5)(points), values, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("field", "factor"), [(sphere(0.5), 4.0), (BOUND, 4.0), (LEVEL, 1.0)], ids=["distance", "bound", "level"]
+)
+def test_logits_of_a_fields_values_are_positive_inside_and_scaled_by_the_width_of_a_length(field, factor):
+    points = torch.tensor([[0.0, 0, 0], [0.25, 0, 0], [2, 0, 0]], dtype=torch.float64, requires_grad=True)
+    values = field(points)
+    logits = occupancy_logits(field, values, width=0.25)
+    assert (logits > 0).tolist() == [True, True, False]
+    torch.testing.assert_close(logits, -factor * values, rtol=0, atol=1e-14)
+    (gradient,) = torch.autograd.grad(logits.sum(), values)
+    assert gradient.tolist() == [-factor] * 3
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.0, -0.5, 2.0, float("nan")])
+def test_a_threshold_that_is_no_probability_is_refused(threshold):
+    with pytest.raises(ValueError, match=f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5"):
+        occupancy_field(vector_of_logits(0.5), threshold)
+
+
+@pytest.mark.parametrize("field", [sphere(), LEVEL], ids=["distance", "level"])
+@pytest.mark.parametrize("width", [0.0, -0.1, float("inf"), float("nan")])
+def test_a_width_that_is_no_length_is_refused(field, width):
+    with pytest.raises(ValueError, match=rf"width must be positive, not {width}: 0\.02 suits"):
+        occupancy_logits(field, torch.zeros(3), width=width)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "width must be at least 1, not 0: 128 suits"),
+        ({"code_length": -1}, "code_length must be at least 0, not -1: .* 0 is for one shape"),
+    ],
+)
+def test_impossible_networks_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        OccupancyNetwork(**({"width": 8, "code_length": 4} | change))
+
+
+@pytest.mark.parametrize("length", [3, 5, 0])
+def test_a_code_of_the_wrong_length_is_refused(length):
+    with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
+        make().at(torch.zeros(length, dtype=torch.float64))
