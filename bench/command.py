@@ -81,6 +81,8 @@ def _explain(error: Exception) -> str:
     message = " ".join(str(error).split())
     if isinstance(error, ConfigCompositionException):
         if found := re.search(r"Could not override '([^']+)'", message):
+            if (CONF / found[1]).is_dir():
+                return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
             return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
             return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))

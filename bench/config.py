@@ -132,7 +132,8 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     if not path.is_file():
         known = [file.stem for file in (CONF / group).glob("*.yaml")]
         raise ValueError(f"unknown {group} {name!r}{nearest(name, known)}")
-    return build(OmegaConf.merge(OmegaConf.load(path), arguments), group)  # type: ignore[arg-type]
+    package = {"_package_": arguments.get("_target_", "").split(".")[0]}  # who names a class in Python trusts it
+    return build(OmegaConf.merge(OmegaConf.load(path), arguments, package), group)  # type: ignore[arg-type]
 
 
 def nearest(word: str, known: list[str]) -> str:

@@ -5,7 +5,8 @@ import os
 import platform
 import subprocess
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -73,21 +74,40 @@ class MemoryPeak:
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
+        self.earlier = 0  # growth before the last pause
+        able = self._forget()
         if device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(device)
             self.start: int | None = torch.cuda.memory_allocated(device)
         else:
-            _give_back_free_memory()
-            self.start = _resident("VmRSS") if _reset_high_water() else None
+            self.start = _resident("VmRSS") if able else None
 
     def growth(self) -> int | None:
         """Bytes above the start, at most, so far."""
         if self.start is None:
             return None
         if self.device.type == "cuda":
-            return torch.cuda.max_memory_allocated(self.device) - self.start
-        peak = _resident("VmHWM")
-        return None if peak is None else max(peak - self.start, 0)
+            peak: int | None = torch.cuda.max_memory_allocated(self.device)
+        else:
+            peak = _resident("VmHWM")
+        return None if peak is None else max(peak - self.start, self.earlier)
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """What happens within does not count."""
+        before = self.growth()
+        yield
+        after = self.growth()
+        if before is not None and after is not None and after > before:
+            self.earlier = before
+            self._forget()
+
+    def _forget(self) -> bool:
+        """Begins the high-water mark anew, where that can be done."""
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+            return True
+        _give_back_free_memory()
+        return _reset_high_water()
 
 
 def _give_back_free_memory() -> None:

@@ -51,7 +51,10 @@ def differences(
         shifts = STEP * torch.cat([directions.T, -directions.T])
         moved, found = _roots(decoder.at(code + shifts), rays, distance)
         by_code = ((moved[: len(shifts) // 2] - moved[len(shifts) // 2 :]) / (2 * STEP)).T
-        valid = found.all(dim=0) & _clear(decoder.at(code), rays, distance, margin=4 * STEP * by_code.abs().max())
+        hits = rays.at(distance)
+        change = decoder.at(code + shifts)(hits.expand(len(shifts), -1, -1)) - decoder.at(code)(hits)
+        margin = 4 * change.abs().max()  # of the field, not of the distance, which moves far near grazing
+        valid = found.all(dim=0) & _clear(decoder.at(code), rays, distance, margin=margin)
         columns = []
         for twist in STEP * torch.eye(6, dtype=torch.float64):
             (ahead, ok), (behind, ok_too) = (

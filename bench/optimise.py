@@ -43,7 +43,7 @@ def optimise(
         device: what to wait for when the clock is read.
         course: an empty one, filled as the loop goes, so that it is there for a loop that is cut short. A loss that
             becomes NaN or diverges ends the loop, and stands there as its status.
-        on_step: called off the clock with each line of the curve, to which it may add.
+        on_step: called with each line of the curve, to which it may add; off the clock, and its memory is not counted.
     """
     optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
     course.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
@@ -65,8 +65,9 @@ def optimise(
             **{name: term.item() for name, term in terms.items()},
         }
         course.curve.append(line)
-        on_step(line)
         course.peak_memory_bytes = memory.growth()
+        with memory.pause():
+            on_step(line)
         if _failed(course, problem):
             break
 

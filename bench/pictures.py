@@ -159,7 +159,7 @@ def _show_silhouette(truth: Looks) -> Any:
         found, true = look.front.mask.numpy(), truth.front.mask.numpy()
         cases = [(found & true)[..., None], (true & ~found)[..., None], (found & ~true)[..., None]]
         image = np.select(cases, [BOTH, LOST, FALSE], PAPER)
-        lost, false = 100 * (true & ~found).sum() / true.sum(), 100 * (found & ~true).sum() / true.sum()
+        lost, false = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
         window = _window([other.front.mask.numpy() for other in (*looks, truth)])
         _bare(axis).imshow(image[window], interpolation="nearest")
         label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}

@@ -1,6 +1,7 @@
 """Where priors are kept: some are shipped, others are trained on first use and cached by what they were made from."""
 
 import json
+import os
 import sys
 import time
 from dataclasses import asdict
@@ -68,7 +69,7 @@ def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: 
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{dataset.name}-{record['key']}.safetensors"
-    scratch = path.with_suffix(".partial")
+    scratch = path.with_suffix(f".{os.getpid()}.partial")  # of this process alone: cells may run side by side
     save_file({**prior.decoder.state_dict(), "codes": prior.codes}, scratch)
     write_text(path.with_suffix(".json"), to_json(record))
     scratch.replace(path)

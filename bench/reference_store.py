@@ -1,12 +1,14 @@
 """Float64 renderings of a network in a view, made once and kept by what they were made from."""
 
 import hashlib
+import os
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -36,15 +38,22 @@ def in_float64(prior: Prior) -> Prior:
 
 
 def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
-    """The reference of a prior's first shape in a view, from `folder`, or made and kept there."""
+    """The reference of a prior's first shape in a view, from `folder`, or made and kept there.
+
+    Raises:
+        ValueError: where the kept one cannot be read.
+    """
     path = folder / f"reference-{_key(prior, camera)}.safetensors"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         twin = in_float64(prior)
-        scratch = path.with_suffix(".partial")
+        scratch = path.with_suffix(f".{os.getpid()}.partial")  # of this process alone: cells may run side by side
         save_file(vars(make_reference(twin.decoder.at(twin.codes[0]), camera)), scratch)
         scratch.replace(path)
-    return Reference(**load_file(path))
+    try:
+        return Reference(**load_file(path))
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"the reference {path} cannot be read ({error}): delete it, and it is made again") from error
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:

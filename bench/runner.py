@@ -16,7 +16,7 @@ from bench.config import build, check_top_level
 from bench.progress import Report, live_progress
 from bench.records import Record, RunStatus, claim_folder, digest, write_text
 from bench.stage import Cell, set_up
-from bench.tasks.problem import Unsupported
+from bench.tasks.problem import Task, Unsupported
 
 NEUTRAL = ("results_dir", "priors_dir", "verbose")  # keys that change no result, left out of a configuration's hash
 
@@ -64,6 +64,8 @@ def run(config: DictConfig) -> tuple[Path, Record]:
 def _execute(config: DictConfig, folder: Path, record: Record, progress: Report) -> None:
     check_top_level(config)
     task = build(config.task, "task", list(config.packages))
+    if not isinstance(task, Task):
+        raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
     stage = set_up(config, progress)
     record.scene, record.notes = stage.scene.name, list(stage.scene.mesh.repairs)
     record.environment = environment.describe(stage.device)

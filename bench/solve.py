@@ -65,7 +65,9 @@ def _optimise(problem: Problem, settings: OptimiserSettings, cell: Cell, course:
 
         def on_step(line: dict[str, Any]) -> None:
             if every is not None and (line["iteration"] % every == 0 or line["iteration"] + 1 == settings.iterations):
+                clock = time.perf_counter()
                 line["chamfer_l2"] = judge(problem.field(), cell.stage).metrics["chamfer_l2"]
+                cell.record.seconds["evaluation"] += time.perf_counter() - clock
             curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
             cell.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
 

@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig
 
 from bench.autodecoder import Prior, PriorSettings
-from bench.config import EvaluationSettings, build, check_top_level
+from bench.config import EvaluationSettings, build
 from bench.environment import pick_device
 from bench.prior_store import prior_for
 from bench.progress import Report
@@ -31,6 +31,17 @@ class Stage:
     seed: int
     device: torch.device
     cache: Path  # where what is slow to make is kept
+    trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
+
+    def fitted(self) -> Prior:
+        """The prior with the code of the scene's shape alone.
+
+        Raises:
+            ValueError: where the prior was not trained on that shape.
+        """
+        if self.trained is None:
+            raise ValueError("this task renders a network at a shape that it was fitted to: set split=train index=0")
+        return Prior(self.prior.decoder, self.prior.codes[self.trained : self.trained + 1])
 
 
 @dataclass(frozen=True)
@@ -49,8 +60,6 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     Raises:
         ValueError: for anything in it that cannot be.
     """
-    check_top_level(config)
-    torch.manual_seed(config.seed)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     device = pick_device(config.device)
@@ -65,7 +74,9 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     settings = prior_settings(config)
     scene = make_scene(dataset, views, split=Split(config.split), index=config.index)
     prior = prior_for(dataset, settings, Path(config.priors_dir), device, progress)
-    return Stage(renderer, scene, views, prior, evaluation, config.seed, device, Path(config.priors_dir))
+    torch.manual_seed(config.seed)  # here, since a prior that is trained first must change nothing of what follows
+    trained = config.index if config.split == Split.TRAIN and config.index < settings.shapes else None
+    return Stage(renderer, scene, views, prior, evaluation, config.seed, device, Path(config.priors_dir), trained)
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

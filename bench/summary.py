@@ -24,9 +24,7 @@ ROWS = (  # metric, what it is called, factor, better when
 def show(folder: Path, record: Record, index: Path) -> None:
     """Prints what a run came to; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    table = Table(
-        box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}")
-    )
+    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}"))
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
     for name, label, factor, better in ROWS:

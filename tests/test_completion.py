@@ -1,6 +1,6 @@
 """Shape completion's loss against values worked out by hand, with a renderer whose answer is known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import sqrt
 
 import numpy as np
@@ -10,8 +10,9 @@ from omegaconf import OmegaConf
 
 from bench.autodecoder import Prior
 from bench.config import CONF, build
+from bench.optimise import Course, optimise
 from bench.tasks.completion import Completion
-from bench.tasks.problem import Unsupported, check_kind
+from bench.tasks.problem import OptimiserSettings, Unsupported, check_kind
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from renderers.camera import Camera
@@ -160,10 +161,48 @@ def test_evaluations_are_counted_and_judging_is_not(problem_of):
     problem = problem_of()
     assert problem.rays_per_iteration == 4
     problem.loss(0)["total"].backward()
-    assert (problem.counts.value, problem.counts.gradient) == (4, 4)
+    assert (problem.counts.value, problem.counts.gradient) == (4, 2)  # two pixels are compared
     field = problem.field()
     assert not field(torch.zeros(5, 3)).requires_grad
     assert problem.counts.value == 4
+
+
+@dataclass
+class Scheduled(Fake):
+    """A renderer with a schedule: what was asked of it, and at which iteration."""
+
+    at: int | None = None
+    log: list = field(default_factory=list)
+
+    def at_iteration(self, iteration):
+        return replace(self, at=iteration)
+
+    def render(self, field, rays):
+        self.log.append(("render", self.at))
+        return super().render(field, rays)
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        self.log.append(("silhouette", self.at))
+        return super().silhouette_loss(field, rays, rendering, mask)
+
+
+def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
+    renderer = Scheduled()
+    problem = problem_of(renderer)
+    problem.loss(7)
+    assert renderer.log == [("render", 7), ("silhouette", 7)]
+    renderer.log.clear()
+    optimise(problem, OptimiserSettings(3, 0.01), CPU, course=Course(), on_step=lambda line: None)
+    assert [at for what, at in renderer.log if what == "render"] == [0, 0, 1, 2]  # the first is the warm-up
+
+
+def test_judging_sees_a_renderer_with_a_schedule_at_its_end(problem_of):
+    """What is measured and drawn is by the renderer as configured, whatever the iteration."""
+    renderer = Scheduled()
+    problem = problem_of(renderer)
+    problem.loss(0)
+    assert renderer.at is None
+    assert problem.renderer is renderer
 
 
 def test_it_starts_from_code_zero_whatever_the_seed(problem_of):

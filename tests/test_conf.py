@@ -1,5 +1,7 @@
 """Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
 
+from dataclasses import replace
+
 import pytest
 import trimesh
 from omegaconf import DictConfig, OmegaConf
@@ -7,15 +9,25 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import CONF, build, load
 from bench.tasks.problem import Task
 from datasets.dataset import Dataset
-from renderers import DIST
+from renderers import DIST, DVR, Naive
 from renderers.rendering import Renderer
 
+IDR_ARGUMENTS = {"steps": 7, "epsilon": 1e-4, "least_slope": 1e-3, "mask_sharpness": 50.0, "sphere_radius": 1.0}
+SWEPT = "hydra.sweeper.params"
 YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
 GROUPS = [(group, name) for group, name in YAMLS if group != "experiment"]
 EXPERIMENTS = [name for group, name in YAMLS if group == "experiment"]
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset}
 TARGETS = {"prior": "bench.autodecoder.PriorSettings"}  # nodes whose class the code knows
 PARTS = ("task", "renderer", "dataset", "prior")
+# What a choice needs on the command line.
+NEEDS = {"custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))}
+SWEEPS = [
+    (name, f"{key}={value}")
+    for name in EXPERIMENTS
+    for key, values in (OmegaConf.select(OmegaConf.load(CONF / f"experiment/{name}.yaml"), SWEPT) or {}).items()
+    for value in str(values).split(",")
+]
 
 
 @pytest.fixture
@@ -34,7 +46,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
         path.relative_to(CONF) for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"))
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    assert {group for group, _ in YAMLS} == {"task", "renderer", "dataset", "prior", "scale", "experiment"}
+    assert {group for group, _ in YAMLS} == {"task", "renderer", "dataset", "prior", "scale", "experiment", "strategy"}
 
 
 def test_the_default_configuration_builds(compose_config):
@@ -47,8 +59,9 @@ def test_the_default_configuration_builds(compose_config):
 
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
-    extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else []
-    config = compose_config(f"{group}={name}", *extra)
+    extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
+    new = "+" if group == "strategy" else ""  # it is not chosen by default
+    config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     for part in PARTS:  # a scale is read by the others
         build_part(config, part)
@@ -58,11 +71,110 @@ def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes_and_builds(compose_config, name):
-    config = compose_config(f"+experiment={name}")
+def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
+    for extra in ([], ["scale=paper", "dataset=mesh", f"dataset.path={mesh_path}"]):
+        config = compose_config(f"+experiment={name}", *extra)
+        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        for part in PARTS:
+            build_part(config, part)
+        assert config.experiment == (None if name == "completion_paper" else name)
+
+
+@pytest.mark.parametrize(("name", "swept"), SWEEPS)
+def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
+    config = compose_config(f"+experiment={name}", swept)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     for part in PARTS:
         build_part(config, part)
+    assert config.experiment == name
+    key, _, value = swept.removeprefix("+").partition("=")
+    if key in ("strategy", "renderer"):
+        alone = compose_config(swept)
+        assert config.label == alone.label
+        assert build_part(config, "renderer") == build_part(alone, "renderer")
+    else:
+        found = OmegaConf.select(config, key)
+        assert found == type(found)(value)
+
+
+def test_every_sweep_is_of_more_than_one_cell_and_repeats_none():
+    assert {name for name, _ in SWEEPS} == {*EXPERIMENTS} - {"completion_paper"}
+    assert len(set(SWEEPS)) == len(SWEEPS)
+
+
+PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2) and nothing of ours
+    steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=True,
+    careful_split=False, samples=1, sphere_radius=1.0, silhouette_signed=False, silhouette_average="all",
+)  # fmt: skip
+FIRST = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
+    steps=50, epsilon=5e-5, gradient="unrolled", samples=1, serial=True, sphere_radius=1.0, silhouette_signed=False,
+    silhouette_average="all",
+)  # fmt: skip
+TABLE1 = {  # each row of the paper adds one thing to the row before
+    "naive": ("Naive sphere tracing", FIRST),
+    "practical_gradient": ("+ practical grad.", replace(FIRST, gradient="practical")),
+    "parallel": ("+ parallel", replace(FIRST, gradient="practical", serial=False)),
+    "dynamic": ("+ dynamic", replace(PAPER, alpha=1.0, coarse_to_fine=False)),
+    "aggressive": ("+ aggressive", replace(PAPER, coarse_to_fine=False)),
+    "coarse_to_fine": ("+ coarse-to-fine", PAPER),
+    "coarse_to_fine_100": ("+ coarse-to-fine, 100 steps", replace(PAPER, steps=100)),
+}
+
+
+@pytest.mark.parametrize("name", TABLE1)
+def test_a_strategy_of_table_1_is_that_of_the_paper(compose_config, name):
+    config = compose_config(f"+strategy={name}")
+    assert (config.label, build_part(config, "renderer")) == TABLE1[name]
+
+
+def test_table_1_begins_with_the_rows_of_the_paper():
+    assert [swept for name, swept in SWEEPS if name == "table1"][:7] == [f"+strategy={name}" for name in TABLE1]
+
+
+def test_strategies_of_our_own_are_what_they_are_called(compose_config):
+    def strategy(name):
+        config = compose_config(f"+strategy={name}")
+        return config.label, build_part(config, "renderer")
+
+    default = {name: build_part(compose_config(f"renderer={name}"), "renderer") for name in ("dist", "idr", "dvr")}
+    assert strategy("unrolled_parallel") == ("Naive, all rays at once", replace(FIRST, serial=False))
+    assert strategy("official_clamp") == ("DIST, official clamp", replace(PAPER, step_clamp=0.1))
+    assert strategy("dist") == ("DIST, our default", default["dist"])
+    assert strategy("idr") == ("IDR", default["idr"])
+    assert strategy("dvr") == ("DVR, n = 64", replace(default["dvr"], samples=64))
+    assert isinstance(default["dvr"], DVR)
+
+
+def test_no_two_strategies_share_a_label(compose_config):
+    labels = [compose_config(f"+strategy={name}").label for group, name in YAMLS if group == "strategy"]
+    assert len(set(labels)) == len(labels) >= 12
+
+
+def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_to(compose_config):
+    for name in ("table1", "fig4", "fig7", "gradients"):
+        for scale, size in (("smoke", 64), ("desk", 256), ("paper", 512)):
+            config = compose_config(f"+experiment={name}", f"scale={scale}")
+            prior = build_part(config, "prior")
+            assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
+            network = prior.network
+            assert (network.layers, network.width, network.code_length, network.skip) == (8, 512, 256, 4)  # DIST, B.1
+
+
+def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
+    config = compose_config("+experiment=fig7", "renderer.epsilon=5e-3")
+    assert build_part(config, "renderer") == replace(PAPER, epsilon=5e-3)
+    assert config.label == "epsilon 0.005"
+
+
+def test_figure_5_looks_at_the_chamfer_distance_on_the_way(compose_config):
+    config = compose_config("+experiment=fig5", "+strategy=idr")
+    assert (config.evaluation.every, config.task.points) == (10, "dense")
+    assert compose_config().evaluation.every is None
+
+
+def test_a_label_may_be_given(compose_config):
+    assert compose_config("label=my row").label == "my row"
+    assert (compose_config().label, compose_config().experiment) == (None, None)
 
 
 def test_the_paper_experiment_has_the_papers_settings(compose_config):
@@ -82,9 +194,33 @@ def test_the_samples_of_a_renderer_are_those_of_the_task_unless_set(compose_conf
 
 @pytest.mark.parametrize("name", [name for group, name in GROUPS if group == "renderer"])
 def test_a_renderer_loads_as_a_library_with_its_arguments_changed(compose_config, name):
-    assert load("renderer", name, steps=7) == build_part(
-        compose_config(f"renderer={name}", "renderer.steps=7"), "renderer"
+    number = "samples" if name == "dvr" else "steps"
+    given = {"_target_": "renderers.IDR", **IDR_ARGUMENTS} if name == "custom" else {number: 7}
+    extra = NEEDS.get(name, [f"renderer.{number}=7"])
+    found = load("renderer", name, **given)
+    assert found == build_part(compose_config(f"renderer={name}", *extra), "renderer")
+    assert getattr(found, number) == 7
+
+
+def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, monkeypatch):
+    (tmp_path / "mypkg_of_mine.py").write_text(
+        "class Mine:\n    def __init__(self, size=1):\n        self.size = size\n"
     )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"renderer\._target_ must be given: set renderer\._target_=PACKAGE\.CLASS"):
+        build_part(compose_config("renderer=custom"), "renderer")
+    with pytest.raises(ValueError, match=r"renderer\._target_ must be given"):
+        load("renderer", "custom")
+    with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
+        build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
+    config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
+    made, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
+    assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
+    with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': add its package"):
+        other = compose_config(  # leave for the renderer is not leave for all
+            "renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "dataset._target_=mypkg_of_mine.Mine"
+        )
+        build_part(other, "dataset")
 
 
 def test_loading_tells_of_mistakes():

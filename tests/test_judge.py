@@ -24,7 +24,7 @@ RADIUS = 0.6
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def stage(tmp_path_factory) -> Stage:
     """A sphere as the truth, judged with 3,000 samples."""
     made = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     mesh = Mesh(np.array(made.vertices), np.array(made.faces))
@@ -38,6 +38,7 @@ def stage() -> Stage:
         evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16, every=None),
         seed=0,
         device=torch.device("cpu"),
+        cache=tmp_path_factory.mktemp("cache"),
     )
 
 

@@ -88,6 +88,13 @@ def test_what_on_step_does_is_off_the_clock():
     assert course.seconds["forward"] + course.seconds["backward"] < 0.4
 
 
+def test_memory_that_on_step_takes_is_not_that_of_the_loop():
+    course = go(Toy(), 3, on_step=lambda line: torch.ones(2**26))  # 256 MiB
+    if course.peak_memory_bytes is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    assert course.peak_memory_bytes < 2**27
+
+
 def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
     course = go(Toy(spoil={4: float("nan")}))
     assert course.status is RunStatus.NAN

@@ -114,6 +114,36 @@ def test_a_prior_is_kept_with_its_record(kept):
     assert prior.codes.shape == (3, 4)
 
 
+@dataclass(frozen=True)
+class OneBox(Boxes):
+    """A box; to ask for an unseen one is a mistake."""
+
+    def mesh(self, split, index):
+        assert split is Split.TRAIN
+        return super().mesh(split, index)
+
+
+def test_a_prior_of_one_shape_is_judged_on_its_own_shape_at_its_own_code(tmp_path, monkeypatch):
+    monkeypatch.setattr(prior_store, "fit_error", never)
+    settings = replace(SETTINGS, shapes=1, shapes_per_step=1)
+    path = make_prior(OneBox(), settings, tmp_path, CPU, silent)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert set(record["surface_error"]) == {"training"}
+    prior = prior_for(OneBox(), settings, tmp_path, CPU, silent)
+    assert prior.codes.shape == (1, 4)
+    samples = distance_samples(OneBox(), Split.TRAIN, settings, 1, silent)
+    near = samples.distances[0].abs() < 0.02
+    with torch.no_grad():
+        error = (prior.decoder.at(prior.codes[0])(samples.points[0]) - samples.distances[0]).abs()
+    assert record["surface_error"]["training"] == pytest.approx(error[near].mean().item(), rel=1e-4)
+    assert record["surface_error"]["training"] < 0.02
+    assert record["settings"]["shapes"] == 1
+
+
+def test_a_prior_of_one_shape_has_another_key():
+    assert prior_key(Boxes(), SETTINGS) != prior_key(Boxes(), replace(SETTINGS, shapes=1))
+
+
 def test_a_kept_prior_is_loaded_and_not_trained_again(kept, monkeypatch):
     folder, prior = kept
     monkeypatch.setattr(prior_store, "train", never)

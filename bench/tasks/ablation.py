@@ -7,9 +7,10 @@ from statistics import median
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from bench.environment import synchronise
+from bench.environment import gemm_peak, synchronise
 from bench.limits import LimitReached, Limits
 from bench.pictures import draw_against
 from bench.records import RunStatus
@@ -22,7 +23,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.rendering import Rendering
 
-SMALLER = 4  # times: the side of an image that takes too much, over that of the next one tried
+SMALLER = 8  # times: the side of an image that takes too much, over that of the next one tried
 WARM_UP = 8  # pixels a side of the image that is rendered before the clock
 
 DEFINITIONS = {
@@ -33,10 +34,15 @@ DEFINITIONS = {
     "forward_seconds": "rendering without gradient; median of `repeats`, least (_low) and largest (_high) beside it",
     "step_seconds": "a step of an optimisation: rendering with gradient, losses, backward",
     "backward_seconds": "the backward pass of a step",
+    "repeats": "how often a step was timed",
+    "evaluations.value, evaluations.gradient": "as step_queries and step_gradients",
+    "evaluations.per_ray": "queries divided by rays",
+    "seconds.total": "the whole run, with shape, network and reference made or loaded",
     "forward_gemm, step_gemm": "floating-point operations over the median time, divided by the machine's best rate of "
     "a float32 matrix product",
     "peak_memory_bytes": "highest rise of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
     "lost, false": "pixels that the float64 reference hits and the renderer does not, and the other way round",
+    "rays, hits": "pixels of that image; those that the reference hits",
     "wrong": "pixels that both hit at depths further apart than `task.wrong`",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
@@ -44,10 +50,10 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Ablation:
-    """Renders the first shape of a prior, forward and back, and compares it with the reference.
+    """Renders a shape that the prior was trained on, forward and back, and compares it with the reference.
 
     Where a limit is reached at the asked resolution, the run's status says so, and the numbers are those of an image of
-    a quarter of the side, or a quarter of that again.
+    an eighth of the side, and so on.
 
     Args:
         repeats: of the clock; fewer where they come to a quarter of the limit together.
@@ -71,18 +77,22 @@ class Ablation:
         stage, record = cell.stage, cell.record
         record.definitions = DEFINITIONS
         asked = stage.scene.view.camera
-        camera, failure, measured = asked, None, None
-        while measured is None and camera.height >= self.smallest:
+        camera, measured = asked, None
+        failure: tuple[RunStatus, str] | None = None
+        while measured is None:
             try:
                 measured = self._measure(stage, camera)
             except LimitReached as limit:
-                failure = failure or limit
-                camera = camera.resized(camera.height // SMALLER, camera.width // SMALLER)
+                failure = failure or (limit.status, str(limit))  # not itself: it holds on to all that was computed
+                smaller = camera.height // SMALLER, camera.width // SMALLER
+                if min(smaller) < self.smallest:
+                    break
+                camera = camera.resized(*smaller)
         record.status, record.reason = RunStatus.OK, ""
         if failure is not None:
             end = "at no smaller size" if measured is None else f"at {camera.height} x {camera.width}"
-            record.status = failure.status
-            record.reason = f"{failure} at {asked.height} x {asked.width}; it finishes {end}"
+            record.status = failure[0]
+            record.reason = f"{failure[1]} at {asked.height} x {asked.width}; it finishes {end}"
         if measured is not None:
             self._note(cell, measured)
 
@@ -92,13 +102,14 @@ class Ablation:
         Raises:
             LimitReached: where a rendering or a step takes more than it may.
         """
-        bench = Workbench(stage, camera, reference_for(stage.prior, camera, stage.cache), self.limits)
+        bench = Workbench(stage, camera, reference_for(stage.fitted(), camera, stage.cache), self.limits)
         step = bench.steps(self.repeats)  # first, since it takes more, and where it takes too much the rest is in vain
         return Measured(bench, bench.forward(self.repeats), step)
 
     def _note(self, cell: Cell, measured: "Measured") -> None:
         record, bench = cell.record, measured.bench
-        peak = record.environment["gemm_peak_flops"]
+        peak = max(record.environment["gemm_peak_flops"], gemm_peak(bench.device))  # beside what is compared with it
+        record.environment["gemm_peak_flops"] = peak
         record.metrics = {"size": bench.camera.height, **measured.costs(peak), **bench.errors(self.wrong)}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
         record.evaluations = {"value": measured.step.counts.value, "gradient": measured.step.counts.gradient}
@@ -106,14 +117,20 @@ class Ablation:
         record.peak_memory_bytes = measured.step.memory
         found, true = bench.views()
         arrays = {
-            "normals": found.normals.half(),
-            "reference_normals": true.normals.half(),
+            "normals": picture_normals(found).half(),
+            "reference_normals": picture_normals(true).half(),
             "hit": found.mask,
             "reference_hit": true.mask,
             "depth_error": torch.where(found.mask & true.mask, (found.depth - true.depth).abs(), torch.nan),
         }
         np.savez_compressed(cell.folder / "images.npz", **{name: array.numpy() for name, array in arrays.items()})
         draw_against(cell.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
+
+
+def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
+    """Normals with axes to the right, up and towards the camera, as pictures show them."""
+    rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
+    return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
 
 
 @dataclass(frozen=True)
@@ -159,7 +176,7 @@ class Workbench:
     """A renderer before one view of a network, with the limits and the clock about it."""
 
     def __init__(self, stage: Stage, camera: Camera, reference: Reference, limits: Limits) -> None:
-        prior, self.device = stage.prior, stage.device
+        prior, self.device = stage.fitted(), stage.device
         self.decoder = prior.decoder.to(self.device).requires_grad_(False)
         self.code = prior.codes[0].detach().clone().to(self.device).requires_grad_(True)
         self.renderer, self.camera, self.reference, self.limits = stage.renderer, camera, reference, limits
@@ -226,7 +243,7 @@ class Workbench:
         return time.perf_counter() - start
 
     def _clock(self, work: Callable[[Field], float], repeats: int) -> Clocked:
-        """Does the same work until it was done often enough, or the limit of one is spent on all."""
+        """Does the same work until it was done often enough, or a quarter of the limit of one is spent on all."""
         seconds: list[float] = []
         second: list[float] = []
         counts, memory = Counts(), None

@@ -32,7 +32,8 @@ DEFINITIONS = {
     "code_pooled_cosine, camera_pooled_cosine": "cosine between the gradients of all pixels of the band, one after the "
     "other, and the truth: a scale that differs between pixels lowers it",
     "code_scale, camera_scale": "length of the gradient along the truth over that of the truth, median over pixels",
-    "code_median_error, code_p99_error": "length of the difference over that of the truth, over pixels",
+    "code_median_error, code_p99_error, camera_median_error, camera_p99_error": "length of the difference over that of "
+    "the truth: median and 99th percentile over pixels",
     "image_cosine, image_scale": "pooled cosine and scale of the image of distances, with the sphere's far side as "
     "background, towards the code, against differences of a supersampled image, in which visibility changes",
 }
@@ -40,7 +41,7 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Gradients:
-    """Compares the gradients of distance with central differences, on the first shape of a prior, all in float64.
+    """Compares gradients of distance with central differences, at a shape that the prior was trained on, in float64.
 
     Args:
         pixels: drawn in each band of angles.
@@ -67,8 +68,8 @@ class Gradients:
         """Judges, and fills the record."""
         stage, record = cell.stage, cell.record
         record.definitions = DEFINITIONS
-        twin = in_float64(stage.prior)
-        reference = reference_for(stage.prior, stage.scene.view.camera, stage.cache)
+        twin = in_float64(stage.fitted())
+        reference = reference_for(stage.fitted(), stage.scene.view.camera, stage.cache)
         subject = Subject(
             stage.renderer,
             twin.decoder.requires_grad_(False),
@@ -119,6 +120,8 @@ class Gradients:
         self, subject: "Subject", pixels: Int[Tensor, "m"], directions: Float[Tensor, "code_length directions"]
     ) -> dict[str, float]:
         """The numbers across the silhouette."""
+        if not pixels.numel():
+            return {"pixels": 0}
         lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
         truth = image_differences(
             lambda shift: subject.decoder.at(subject.code + shift),
@@ -186,7 +189,7 @@ def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str)
 
 def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"]]:
     """The hit pixels of each band of angles, as indices into the image in one row."""
-    cosine = -(reference.normals * camera.rays().directions).sum(-1)
+    cosine = -(reference.normals * camera.rays().directions).sum(-1).clamp(min=-1)  # rounding leads beyond
     bands = {}
     for band, (low, high) in BANDS.items():
         within = (cosine <= cos(radians(low))) & (cosine > cos(radians(high)))

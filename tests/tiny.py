@@ -1,0 +1,81 @@
+"""Networks whose field is known, and all that a task needs about them; nothing is trained."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.autodecoder import Prior
+from bench.config import EvaluationSettings
+from bench.records import Record
+from bench.stage import Cell, Stage
+from datasets.mesh import Mesh
+from datasets.scene import Scene, View
+from datasets.views import ViewSampler
+from renderers.camera import Camera
+from renderers.fields.mlp import Decoder
+
+CPU = torch.device("cpu")
+PEAK = 1e10  # operations a second that the machine of a cell is said to do
+
+
+def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:
+    """No progress is shown."""
+
+
+def plane_decoder(normal: Any, code_weights: Any, offset: float) -> Decoder:
+    """The field normal . x + code_weights . code - offset, exactly, in float64: two neurons, one for each sign."""
+    row = torch.tensor([*code_weights, *normal], dtype=torch.float64)
+    decoder = Decoder(layers=1, width=2, code_length=len(code_weights), skip=0, narrow=False).double()
+    with torch.no_grad():
+        decoder.hidden[0].weight.copy_(torch.stack([row, -row]))
+        decoder.hidden[0].bias.copy_(torch.tensor([-offset, offset]))
+        decoder.last.weight.copy_(torch.tensor([[1.0, -1.0]]))
+        decoder.last.bias.zero_()
+    return decoder.requires_grad_(False)
+
+
+def ball_prior(radius: float = 0.5, scale: float = 1.0, width: int = 128) -> Prior:
+    """A polyhedron near a ball about the first three numbers of a code; the fourth one swells it. It has two codes.
+
+    Its field is `scale` times a distance, nearly: max(normal . x, 0) has the mean |x| / 4 over all directions.
+    """
+    heights = 1 - (2 * torch.arange(width) + 1) / width
+    turns = torch.pi * (1 + 5**0.5) * torch.arange(width)
+    across = (1 - heights.square()).sqrt()
+    normals = torch.stack([across * turns.cos(), across * turns.sin(), heights], dim=1)
+    decoder = Decoder(layers=1, width=width, code_length=4, skip=0, narrow=False).requires_grad_(False)
+    decoder.hidden[0].weight.copy_(torch.cat([-normals, torch.full((width, 1), -0.5), normals], dim=1))
+    decoder.hidden[0].bias.zero_()
+    decoder.last.weight.fill_(4 * scale / width)
+    decoder.last.bias.fill_(-radius * scale)
+    return Prior(decoder, torch.tensor([[0.05, -0.1, 0.1, 0.05], [-0.1, 0.0, 0.0, 0.0]]))
+
+
+def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, float] = (0.0, 0.0)) -> Camera:
+    """A camera 2.5 from the origin, at which it looks, y up: at z = 2.5, or at these angles in degrees."""
+    return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
+
+
+def cell_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed: Any) -> Cell:
+    """A run under way in a folder; its scene has no image of its own, since tasks that measure need none."""
+    blank = torch.zeros(camera.height, camera.width)
+    view = View(camera, blank, blank[..., None].expand(-1, -1, 3), blank.bool())
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    scene = Scene("a scene", Mesh(corners, np.array([[0, 2, 1]])), view)
+    stage = Stage(
+        renderer=renderer,
+        scene=scene,
+        views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
+        prior=prior,
+        evaluation=EvaluationSettings(grid=16, points=50, fscore_threshold=0.02, picture=8, every=None),
+        seed=0,
+        device=CPU,
+        cache=folder / "cache",
+        trained=0,
+    )
+    record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
+    record.environment = {"gemm_peak_flops": PEAK}
+    return Cell(replace(stage, **changed), folder, record, silent)
