@@ -14,7 +14,7 @@ from bench.report.tables import Result
 
 TITLE = "What each strategy does to the picture."
 CAPTION = (
-    "Above, normals in world coordinates (x, y, z as red, green, blue); below, the angle to the reference's normals. "
+    "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's normals. "
     "Shown is the part of the picture that holds every hit. A row that did not finish at the asked size is shown at "
     "the largest at which it did."
 )

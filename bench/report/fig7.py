@@ -15,10 +15,10 @@ from bench.report.tables import Result
 
 TITLE = "How the convergence threshold erodes or dilates what is seen."
 CAPTION = (
-    "Pictures from the largest epsilon to the least: normals in world coordinates (x, y, z as red, green, blue), below "
-    "them the angle to the reference's. Erosion is the share of the reference's hit pixels that are lost; dilation the "
-    "number of false pixels as a share of the same. The depth error is over pixels that both hit. Epsilon is in scene "
-    "units."
+    "Pictures from the largest epsilon to the least: normals (right, up, towards the camera as red, green, blue), and "
+    "below them the angle to the reference's. Erosion is the share of the reference's hit pixels that are lost; "
+    "dilation the number of false pixels as a share of the same. The depth error is over pixels that both hit. Epsilon "
+    "is in scene units."
 )
 MOST_COLUMNS = 8
 # Lines of the chart: column, colour, fill of the marker, label.

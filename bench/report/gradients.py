@@ -20,8 +20,8 @@ UNSHOWN = ("code_pooled_cosine", "camera_pooled_cosine")  # in the CSV only: a t
 TITLE = "How right the gradients are."
 CAPTION = (
     "Cosine and scale compare a renderer's gradient with the true one: both are 1 where it is right. Errors are "
-    "relative to the length of the true gradient. Pixels are frontal, oblique or grazing by the angle between ray and surface; "
-    "the silhouette is judged as one image. "
+    "relative to the length of the true gradient. Pixels are frontal, oblique or grazing by the angle between ray and "
+    "surface; the silhouette is judged as one image. "
     "A renderer without ray gradients has no camera numbers."
 )
 TITLES = ("gradient for the code", "gradient for the camera", "silhouette")  # of the figure's columns

@@ -19,7 +19,7 @@ NAMES = ("normals", "reference_normals", "hit", "reference_hit")
 
 @dataclass(frozen=True)
 class Images:
-    """The pictures of one row; normals [size, size, 3] in world coordinates, hits [size, size]."""
+    """The pictures of one row; normals [size, size, 3] to the right, up, to the camera, hits [size, size]."""
 
     normals: np.ndarray
     reference_normals: np.ndarray

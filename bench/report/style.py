@@ -47,7 +47,7 @@ class Look:
     line: Any = "-"
 
 
-KNOWN = {
+KNOWN = {  # a strategy that is but a renderer looks as that renderer
     "Naive sphere tracing": Look("#111111", "o"),
     "+ practical grad.": Look("#8a8a8a", "s", "--"),
     "+ parallel": Look("#e69f00", "^"),
@@ -60,6 +60,11 @@ KNOWN = {
     "dvr": Look("#d1495b", "^"),
     "idr": Look("#6a3d9a", "D"),
     "narrowband": Look("#9a6a1f", "v"),
+    "DIST, our default": Look("#0072b2", "s"),
+    "DIST, official clamp": Look("#2f9e9e", "<", "-."),
+    "DVR, n = 64": Look("#d1495b", "^"),
+    "IDR": Look("#6a3d9a", "D"),
+    "Naive, all rays at once": Look("#5b4a3f", "p", "--"),
 }
 _COLOURS = (
     "#1b9e77",

@@ -20,9 +20,22 @@ PUBLISHED = {
     "+ coarse-to-fine": (50, "887K", "0.99s"),
     "+ coarse-to-fine, 100 steps": (100, "898K", "1.24s"),
 }
-COUNTS = ("steps", "queries", "step_queries", "step_gradients")
+COUNTS = ("queries", "step_queries", "step_gradients")
+COSTS = ("repeats", "forward_gemm", "step_gemm", "peak_memory_bytes", "rays")
 TIMES = ("forward", "backward", "step")
 QUALITY = ("hits", "lost", "false", "wrong", "depth_error_median", "depth_error_p99", "depth_error_max")
+FINISHED = (
+    "size",
+    "queries",
+    "forward_s",
+    "backward_s",
+    "step_s",
+    "peak_memory_bytes",
+    "hits",
+    "lost",
+    "false",
+    "wrong",
+)
 DEFINED = {
     "queries": "Queries",
     "forward_seconds": "Forward",
@@ -70,18 +83,19 @@ def make(experiment: Experiment) -> Result:
 
 
 def _raw(record: dict[str, Any]) -> dict[str, Any]:
-    row = identity(record) | {"asked_size": _asked(record)}
-    row |= {name: measured(record, name) for name in ("size", *COUNTS)}
+    """The measured columns are those of the asked size; what was measured at another stands as `finished_`."""
+    asked, size = _asked(record), measured(record, "size")
+    numbers = {name: measured(record, name) for name in COUNTS}
     for name in TIMES:
-        row |= {f"{name}_s{end}": measured(record, f"{name}_seconds{end}") for end in ("", "_low", "_high")}
-    row |= {
-        name: measured(record, name)
-        for name in ("repeats", "forward_gemm", "step_gemm", "peak_memory_bytes", "rays", *QUALITY)
-    }
+        numbers |= {f"{name}_s{end}": measured(record, f"{name}_seconds{end}") for end in ("", "_low", "_high")}
+    numbers |= {name: measured(record, name) for name in (*COSTS, *QUALITY)}
+    finished = size is not None and size == asked
+    row = identity(record) | {"size": asked, "steps": setting(record["config"], "renderer", "steps")}
+    row |= numbers if finished else dict.fromkeys(numbers)
     published = (PUBLISHED_SIZE, *PUBLISHED[row["row"]]) if row["row"] in PUBLISHED else (None,) * 4
-    return row | dict(
-        zip([f"published_{name}" for name in ("size", "steps", "queries", "time")], published, strict=True)
-    )
+    row |= dict(zip([f"published_{name}" for name in ("size", "steps", "queries", "time")], published, strict=True))
+    smaller = {"size": size, **numbers}
+    return row | {f"finished_{name}": None if finished else smaller[name] for name in FINISHED}
 
 
 def _readable(name: str, record: dict[str, Any]) -> dict[str, str]:
@@ -89,7 +103,7 @@ def _readable(name: str, record: dict[str, Any]) -> dict[str, str]:
     return {
         "Strategy": name,
         "Size": _size(record),
-        "Steps": _whole(record, "steps"),
+        "Steps": str(setting(record["config"], "renderer", "steps") or format.MISSING),
         "Queries": format.count(measured(record, "queries")),
         "Forward": format.seconds(measured(record, "forward_seconds")),
         "Backward": format.seconds(measured(record, "backward_seconds")),
