@@ -282,3 +282,65 @@ def test_gradients_of_spans_and_distances_are_exact_and_finite():
     edge = torch.stack([vector((1, 0, -2)), vector((0, 0, -2)), vector((0, 0, 0))]).requires_grad_(True)
     total = sum(part.sum() for part in spans(edge, directions))
     assert torch.autograd.grad(total, edge)[0].isfinite().all()
+
+
+def test_moved_by_nothing_is_the_same_camera():
+    camera = moving()
+    same = camera.moved(torch.zeros(6, dtype=torch.float64))
+    torch.testing.assert_close(same.world_to_camera, camera.world_to_camera)
+
+
+@pytest.mark.parametrize(
+    ("twist", "seen"),
+    [
+        ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
+        ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it
+        ((0, 0, 0, 0, torch.pi / 2, 0), (2, 0, 0)),  # a quarter turn about y, down: from ahead to the right
+        ((0, 0, 0, torch.pi / 2, 0, 0), (0, -2, 0)),
+        ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # about the line of sight
+    ],
+)
+def test_a_twist_moves_the_world_in_the_cameras_axes(twist, seen):
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[2, 3] = 2.0  # the origin lies 2 ahead
+    moved = Camera(torch.eye(3, dtype=torch.float64), motion, 4, 4).moved(torch.tensor(twist, dtype=torch.float64))
+    torch.testing.assert_close(
+        moved.world_to_camera[:3, 3], torch.tensor(seen, dtype=torch.float64), rtol=0, atol=1e-12
+    )
+
+
+def test_gradients_flow_to_the_twist():
+    camera, step = moving(), 1e-6
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(2, 5, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def weighed(twist: torch.Tensor) -> torch.Tensor:
+        rays = camera.moved(twist).rays()
+        return (weight * torch.stack([rays.origins, rays.directions])).sum()
+
+    (found,) = torch.autograd.grad(weighed(twist), twist)
+    for axis, offset in enumerate(step * torch.eye(6, dtype=torch.float64)):
+        assert found[axis].item() == pytest.approx(((weighed(offset) - weighed(-offset)) / (2 * step)).item(), abs=1e-8)
+
+
+def test_resized_sees_the_same_in_other_pixels():
+    camera = moving()
+    fine = camera.resized(15, 12)  # three times each way: the middle of a block is its pixel
+    torch.testing.assert_close(fine.rays().directions[1::3, 1::3], camera.rays().directions)
+    torch.testing.assert_close(fine.center, camera.center)
+    assert (camera.height, camera.width) == (5, 4)
+
+
+def test_double_is_the_same_in_float64():
+    camera = Camera(torch.eye(3), torch.eye(4), 2, 2)
+    assert camera.double().rays().origins.dtype is torch.float64
+    torch.testing.assert_close(camera.double().rays().directions.float(), camera.rays().directions)
+
+
+def moving() -> Camera:
+    """A camera off every axis, in float64."""
+    intrinsics = torch.tensor([[3.0, 0, 2], [0, 3.5, 2.4], [0, 0, 1]], dtype=torch.float64)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    motion[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
+    return Camera(intrinsics, motion, height=5, width=4)

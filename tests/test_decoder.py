@@ -136,3 +136,75 @@ def test_impossible_networks_are_refused(change, message):
 def test_a_code_of_the_wrong_length_is_refused(length):
     with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
         make("skip").at(torch.zeros(length, dtype=torch.float64))
+
+
+def pair(dtype: torch.dtype) -> tuple[Decoder, Decoder]:
+    """A decoder whose weights are fixed, and the same one whose weights are not."""
+    torch.manual_seed(3)
+    frozen = Decoder(layers=4, width=24, code_length=5, skip=2, narrow=True).to(dtype)
+    free = Decoder(layers=4, width=24, code_length=5, skip=2, narrow=True).to(dtype)
+    free.load_state_dict(frozen.state_dict())
+    return frozen.requires_grad_(False), free
+
+
+def through(decoder: Decoder, upstream: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Values, and the gradients towards points and code."""
+    generator = torch.Generator().manual_seed(4)
+    points = torch.randn(len(upstream), 3, generator=generator).to(dtype).requires_grad_(True)
+    code = torch.randn(5, generator=generator).to(dtype).requires_grad_(True)
+    values = decoder.at(code)(points)
+    return values.detach(), *torch.autograd.grad(values, (points, code), upstream)
+
+
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float32, 1e-5), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("chunk", [7, 50, 2048])
+def test_fixed_weights_change_nothing_but_the_cost(monkeypatch, dtype, close, chunk):
+    monkeypatch.setattr(mlp, "CHUNK", chunk)
+    upstream = torch.linspace(-1, 2, 50, dtype=dtype) * (torch.arange(50) % 3 > 0)  # a third are zero
+    for one, other in zip(*(through(decoder, upstream, dtype) for decoder in pair(dtype)), strict=True):
+        torch.testing.assert_close(one, other, rtol=close, atol=close)
+
+
+def test_no_gradient_at_all_is_zero_and_not_missing():
+    _, points, code = through(pair(torch.float64)[0], torch.zeros(9, dtype=torch.float64), torch.float64)
+    assert not points.any()
+    assert not code.any()
+
+
+def test_a_network_of_fixed_weights_keeps_a_byte_a_neuron():
+    kept = []
+    for decoder in pair(torch.float32):
+        size = [0]
+
+        def count(tensor: Tensor, size=size) -> Tensor:
+            size[0] += tensor.numel() * tensor.element_size()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+            decoder.at(torch.zeros(5, requires_grad=True))(torch.zeros(1000, 3))
+        kept.append(size[0])
+    neurons = 24 * 3 + 24 - 8
+    assert kept[0] <= 1000 * neurons + 20_000  # and what the code's fold keeps
+    assert kept[1] > 3 * kept[0]
+
+
+def test_the_slope_of_a_network_of_fixed_weights_has_a_gradient_of_zero():
+    # Piecewise linear: the slope does not change within a piece. A smoothness loss may still ask.
+    decoder, _ = pair(torch.float64)
+    code = torch.ones(5, dtype=torch.float64, requires_grad=True)
+    points = torch.full((6, 3), 0.3, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(decoder.at(code)(points).sum(), points, create_graph=True)
+    assert slope.abs().sum() > 0
+    loss = slope.square().sum() + code.square().sum()
+    (found,) = torch.autograd.grad(loss, code)
+    torch.testing.assert_close(found, 2 * code.detach())
+
+
+def test_weights_that_are_free_have_their_gradient():
+    _, free = pair(torch.float64)
+    free.at(torch.ones(5, dtype=torch.float64))(torch.ones(3, 3, dtype=torch.float64)).sum().backward()
+    assert all(parameter.grad is not None for parameter in free.parameters())
+    assert (
+        free.at(torch.ones(5, dtype=torch.float64)).flops.gradient
+        == 2 * free.at(torch.ones(5, dtype=torch.float64)).flops.value
+    )
