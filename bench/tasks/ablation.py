@@ -31,7 +31,7 @@ DEFINITIONS = {
     "queries": "points whose field value was computed while rendering forward, without gradient; counted at the field",
     "step_queries, step_gradients": "points whose value was computed, and through whose value a gradient other than "
     "zero was propagated back, in a step",
-    "forward_seconds": "rendering without gradient; median of `repeats`, least (_low) and largest (_high) beside it",
+    "forward_seconds": "rendering without gradient; median of the repeats, least (_low) and largest (_high) beside it",
     "step_seconds": "a step of an optimisation: rendering with gradient, losses, backward",
     "backward_seconds": "the backward pass of a step",
     "repeats": "how often a step was timed",
@@ -43,7 +43,7 @@ DEFINITIONS = {
     "peak_memory_bytes": "highest rise of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
     "lost, false": "pixels that the float64 reference hits and the renderer does not, and the other way round",
     "rays, hits": "pixels of that image; those that the reference hits",
-    "wrong": "pixels that both hit at depths further apart than `task.wrong`",
+    "wrong": "pixels that both hit at depths further apart than task.wrong",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
 
@@ -56,7 +56,7 @@ class Ablation:
     an eighth of the side, and so on.
 
     Args:
-        repeats: of the clock; fewer where they come to a quarter of the limit together.
+        repeats: of the clock; fewer where they come to a quarter of the limit together, one at a smaller size.
         limits: on each rendering and each step.
         smallest: pixels a side below which no more is tried.
         wrong: difference of depth, in scene units, from which on a pixel is wrong.
@@ -81,7 +81,7 @@ class Ablation:
         failure: tuple[RunStatus, str] | None = None
         while measured is None:
             try:
-                measured = self._measure(stage, camera)
+                measured = self._measure(stage, camera, repeats=1 if failure else self.repeats)
             except LimitReached as limit:
                 failure = failure or (limit.status, str(limit))  # not itself: it holds on to all that was computed
                 smaller = camera.height // SMALLER, camera.width // SMALLER
@@ -96,15 +96,15 @@ class Ablation:
         if measured is not None:
             self._note(cell, measured)
 
-    def _measure(self, stage: Stage, camera: Camera) -> "Measured":
+    def _measure(self, stage: Stage, camera: Camera, *, repeats: int) -> "Measured":
         """All numbers of one resolution.
 
         Raises:
             LimitReached: where a rendering or a step takes more than it may.
         """
         bench = Workbench(stage, camera, reference_for(stage.fitted(), camera, stage.cache), self.limits)
-        step = bench.steps(self.repeats)  # first, since it takes more, and where it takes too much the rest is in vain
-        return Measured(bench, bench.forward(self.repeats), step)
+        step = bench.steps(repeats)  # first, since it takes more, and where it takes too much the rest is in vain
+        return Measured(bench, bench.forward(repeats), step)
 
     def _note(self, cell: Cell, measured: "Measured") -> None:
         record, bench = cell.record, measured.bench

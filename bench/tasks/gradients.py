@@ -28,7 +28,7 @@ DEFINITIONS = {
     "pixels, excluded": "pixels judged; pixels drawn but not judged, since visibility changes there, the root is not "
     "found again, or the renderer does not hit that surface",
     "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and its truth, median over pixels; "
-    "code: along `task.directions` orthogonal directions, camera: six rigid motions (scene units, radians)",
+    "code: along task.directions orthogonal directions, camera: six rigid motions (scene units, radians)",
     "code_pooled_cosine, camera_pooled_cosine": "cosine between the gradients of all pixels of the band, one after the "
     "other, and the truth: a scale that differs between pixels lowers it",
     "code_scale, camera_scale": "length of the gradient along the truth over that of the truth, median over pixels",
