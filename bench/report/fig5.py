@@ -18,8 +18,10 @@ QUANTITIES = {"total": "weighted loss", "chamfer_l2": "Chamfer × 1000 (scene un
 SCALE = {"total": 1.0, "chamfer_l2": 1000.0}
 CAPTION = (
     "Chamfer distance (chamfer_l2, squared scene units) times 1000; the truth is only watched, it steers nothing. "
-    "Seconds are those of the optimisation loop. ρ is Spearman's rank correlation between loss and Chamfer over the n "
-    "iterations of a row's runs that have both; points of one run follow each other, so it is no test of significance."
+    "Each row's loss holds its own silhouette loss (the paper's in the rows with a plus), so that losses of different "
+    "rows do not compare; Chamfer does. Seconds are those of the optimisation loop. ρ is Spearman's rank correlation "
+    "between loss and Chamfer over the n iterations of a row's runs that have both; points of one run follow each "
+    "other, so it is no test of significance."
 )
 
 
