@@ -59,17 +59,24 @@ def solve(task: InverseTask, cell: Cell) -> None:
 
 
 def _optimise(problem: Problem, settings: OptimiserSettings, cell: Cell, course: Course) -> None:
-    """The loop, with each line of its curve written as it comes."""
+    """The loop, with each line of its curve written as it comes.
+
+    A line has the loss before its step; the Chamfer distance that stands beside it is of the same parameters.
+    """
     every = cell.stage.evaluation.every
+    known: dict[int, float] = {} if every is None else {0: cell.record.metrics_start["chamfer_l2"]}
     with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
         def on_step(line: dict[str, Any]) -> None:
-            if every is not None and (line["iteration"] % every == 0 or line["iteration"] + 1 == settings.iterations):
+            if line["iteration"] in known:
+                line["chamfer_l2"] = known[line["iteration"]]
+            coming, last = line["iteration"] + 1, settings.iterations - 1
+            if every is not None and coming <= last and (coming % every == 0 or coming == last):
                 clock = time.perf_counter()
-                line["chamfer_l2"] = judge(problem.field(), cell.stage).metrics["chamfer_l2"]
+                known[coming] = judge(problem.field(), cell.stage).metrics["chamfer_l2"]
                 cell.record.seconds["evaluation"] += time.perf_counter() - clock
             curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
-            cell.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
+            cell.progress("optimising", coming, settings.iterations, line["total"])
 
         optimise(problem, settings, cell.stage.device, course=course, on_step=on_step)
 

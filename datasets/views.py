@@ -40,8 +40,8 @@ class ViewSampler:
             raise ValueError(f"elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
 
     def draw(self, seed: int) -> Camera:
-        """Camera number `seed`."""
-        generator = np.random.default_rng(seed)
+        """Camera number `seed`; its draws are not those of the shape of the same number."""
+        generator = np.random.default_rng([seed, 1])
         return self.camera(generator.uniform(*self.azimuth), generator.uniform(*self.elevation))
 
     def camera(self, azimuth: float, elevation: float) -> Camera:

@@ -25,10 +25,11 @@ class DIST:
         right direction at each pixel and a wrong scale, alpha * samples * cos(angle of incidence); see
         `gradients.approximate`. That of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
-    Deviates from the paper: `extra_step_cap`, `careful_split`, `silhouette_signed` and `silhouette_average` are ours,
-        `step_clamp` is the official code's; each is named, and off in the paper's setting. A ray that begins at
-        negative values stops at once and says so. Coarse to fine applies to rays that say that they are an image;
-        others march at full resolution.
+    Deviates from the paper: `extra_step_cap` and `careful_split` are ours. `step_clamp`, `silhouette_signed` and the
+        average over violating pixels are as in the official code; Eq. 11 states neither sign nor average. Each is
+        named, and off in the setting that takes the paper at its word. A ray that begins at negative values stops at
+        once and says so. Coarse to fine applies to rays that say that they are an image; others march at full
+        resolution.
 
     Args:
         steps: most marching steps a ray.

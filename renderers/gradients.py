@@ -35,7 +35,8 @@ def approximate(
         sample_distance, sample_value: the samples of least magnitude, in rising order; value infinite where missing.
 
     Returns:
-        the distances with their gradient, and the field's value at each ray's first sample.
+        the distances with their gradient, and the field's value at each ray's first sample; without a graph that is
+        the value of the march, which coarse to fine may have asked on a neighbour's ray.
     """
     if not torch.is_grad_enabled():
         return distance, sample_value[:, 0]

@@ -27,7 +27,7 @@ class Stepping:
         epsilon: a ray has converged where the field's magnitude is below this, in scene units (DIST, Sec. 3.2).
         alpha: the step is alpha times the value; 1 is sphere tracing, more is aggressive marching.
         extra_step_cap: bound on (alpha - 1) times the value, the part of a step that may pass a surface; None for none.
-        step_clamp: bound on the magnitude of a whole step; None for none.
+        step_clamp: bound on the magnitude of the value, before alpha, as in the official code; None for none.
         active_only: ask the field only for rays that have not finished; else for every ray that meets the sphere.
         careful_split: a ray goes on not from where its coarse ray is, but from where that came closest to the surface,
             if it came about as close as the two rays lie apart there. Else rays beside an edge begin behind it.
@@ -42,11 +42,12 @@ class Stepping:
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """The signed step along the ray after the field gave `value`."""
+        if self.step_clamp is not None:
+            value = value.clamp(-self.step_clamp, self.step_clamp)
         extra = (self.alpha - 1) * value
         if self.extra_step_cap is not None:
             extra = extra.clamp(-self.extra_step_cap, self.extra_step_cap)
-        step = value + extra
-        return step if self.step_clamp is None else step.clamp(-self.step_clamp, self.step_clamp)
+        return value + extra
 
 
 @dataclass
@@ -102,6 +103,7 @@ class Front:
         gone = child.meets & inherits & (child.distance >= child.leave)
         child.active &= ~gone
         child.status[gone] = Status.MISS
+        child.value[gone] = self.value[parent[gone]]
         keeps = child.meets & inherits & (self.status[parent] != Status.HIT)
         child.sample_distance[keeps] = self.sample_distance[parent[keeps]]
         child.sample_value[keeps] = self.sample_value[parent[keeps]]

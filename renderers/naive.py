@@ -25,7 +25,8 @@ class Naive:
 
     Source: DIST, Algorithm 1, begun on the bounding sphere (Sec. 3.2), since a network means nothing outside it.
     Differentiable in: field parameters and rays. Unrolled, exact in the limit of many steps; short of it by a
-        factor 1 - (1 - cos(angle of incidence))^steps, which shows near grazing. Practical, as DIST at alpha = 1.
+        factor 1 - (1 - cos(angle of incidence))^steps, which shows near grazing. Its `closest` has next to no
+        gradient at a hit, since the sample follows the surface. Practical, as DIST at alpha = 1.
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: a ray that begins at negative values stops at once and says so.
 

@@ -141,7 +141,7 @@ def test_strategies_of_our_own_are_what_they_are_called(compose_config):
     assert strategy("official_clamp") == ("DIST, official clamp", replace(PAPER, step_clamp=0.1))
     assert strategy("dist") == ("DIST, our default", default["dist"])
     assert strategy("idr") == ("IDR", default["idr"])
-    assert strategy("dvr") == ("DVR, n = 64", replace(default["dvr"], samples=64))
+    assert strategy("dvr") == ("DVR, n = 64", replace(default["dvr"], samples=64, doublings=(10, 30)))
     assert isinstance(default["dvr"], DVR)
 
 
@@ -168,7 +168,7 @@ def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
 
 def test_figure_5_looks_at_the_chamfer_distance_on_the_way(compose_config):
     config = compose_config("+experiment=fig5", "+strategy=idr")
-    assert (config.evaluation.every, config.task.points) == (10, "dense")
+    assert (config.evaluation.every, config.task.points) == (20, "dense")
     assert compose_config().evaluation.every is None
 
 

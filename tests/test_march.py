@@ -96,7 +96,7 @@ def test_the_extra_step_is_capped():
     assert trace(WALL, HEAD_ON, replace(AGGRESSIVE, extra_step_cap=0.1))[1] == 13
 
 
-def test_the_step_is_clamped():
+def test_the_value_that_makes_a_step_is_clamped():
     # From z = -1 to 0 by quarters, and once at 0.
     front, count = trace(WALL, HEAD_ON, replace(PLAIN, step_clamp=0.25))
     assert count == 5
@@ -109,8 +109,8 @@ def test_the_step_is_clamped():
         (1.0, None, None, [1, 0.1, 0, -0.1, -1]),
         (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
         (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
-        (1.5, None, 0.125, [0.125, 0.125, 0, -0.125, -0.125]),
-        (1.5, 0.25, 1.2, [1.2, 0.15, 0, -0.15, -1.2]),
+        (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
+        (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
     ],
 )
 def test_a_step_by_cap_and_clamp(alpha, cap, clamp, expected):
