@@ -46,7 +46,8 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
         path.relative_to(CONF) for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"))
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    assert {group for group, _ in YAMLS} == {"task", "renderer", "dataset", "prior", "scale", "experiment", "strategy"}
+    chosen = {"task", "renderer", "dataset", "prior", "scale"}
+    assert {group for group, _ in YAMLS} == {*chosen, "experiment", "strategy", "common"}
 
 
 def test_the_default_configuration_builds(compose_config):
@@ -60,7 +61,7 @@ def test_the_default_configuration_builds(compose_config):
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
     extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
-    new = "+" if group == "strategy" else ""  # it is not chosen by default
+    new = "+" if group in ("strategy", "common") else ""  # they are not chosen by default
     config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     for part in PARTS:  # a scale is read by the others
