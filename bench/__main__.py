@@ -4,25 +4,25 @@ import sys
 
 from omegaconf import DictConfig
 
-from bench.command import FAILED, command_line
+from bench.command import FAILED, INTERRUPTED, command_line
+from bench.plan import Sweep
 
 
 def main() -> int:
     """Runs the command line; 0 if every run ended ok."""
     statuses: list[str] = []
 
-    def one(config: DictConfig) -> None:
-        from bench.report.html import write_index  # torch and the rest wait until the command line is known to be sound
-        from bench.runner import run
-        from bench.summary import show
+    def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
+        from bench.cell import run_cell  # what it needs waits until the command line is known to be sound
 
-        folder, record = run(config)
-        show(folder, record, write_index(folder.parent.parent))
-        statuses.append(record.status)
-        if record.status == "killed":
-            raise KeyboardInterrupt(f"killed: {record.reason}")  # a sweep stops with its run
+        statuses.append(run_cell(config))
 
     code = command_line(one)
+    plan = Sweep.end()
+    if plan is not None and code != INTERRUPTED:
+        from bench.summary import show_sweep
+
+        statuses = show_sweep(plan)
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)
 
 

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, nearest, register
+from bench.plan import Refused
 
 USAGE = 2  # exit status of a command line that asks for what there is not
 FAILED = 1
@@ -40,7 +41,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     signal.signal(signal.SIGTERM, _stop)  # as Ctrl-C: the record says what happened
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
-        program()
+        _call(program)
         if unwritable:
             raise unwritable[0]
     except KeyboardInterrupt as error:
@@ -55,8 +56,16 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         return _tell(_explain(error), USAGE)
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        return _tell(f"{error.strerror or error}{where}: free space, or set results_dir to a folder you can write")
+        return _tell(f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space")
     return 0
+
+
+def _call(program: Callable[[], None]) -> None:
+    """Calls it; where a sweep was refused, raises why."""
+    try:
+        program()
+    except Refused as refused:
+        raise refused.why from None
 
 
 def _stop(number: int, frame: object) -> None:

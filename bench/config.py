@@ -35,6 +35,21 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+class Isolation(StrEnum):
+    """Where a run takes place: in a process of its own, or for debugging in that of the command, without limits."""
+
+    process = "process"
+    off = "off"
+
+
+class Rerun(StrEnum):
+    """Which finished runs are run again; one that was killed always is."""
+
+    none = "none"
+    failed = "failed"
+    all = "all"
+
+
 @dataclass
 class EvaluationSettings:
     """How a result is judged; see conf/config.yaml."""
@@ -55,6 +70,7 @@ class Config:
     dataset: Any = MISSING
     prior: Any = MISSING
     scale: Any = MISSING
+    tracker: Any = MISSING
     view: Any = MISSING
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     split: str = MISSING
@@ -67,6 +83,10 @@ class Config:
     results_dir: str = MISSING
     priors_dir: str = MISSING
     packages: list[str] = MISSING
+    isolation: Isolation = MISSING
+    time_limit: float | None = MISSING
+    memory_limit: float | None = MISSING
+    rerun: Rerun = MISSING
     verbose: bool = MISSING
 
 

@@ -15,14 +15,14 @@ def main() -> int:
         from bench.config import build
         from bench.environment import pick_device
         from bench.prior_store import find, make_prior
-        from bench.progress import live_progress
+        from bench.progress import run_progress
         from bench.stage import prior_settings
 
         dataset = build(config.dataset, "dataset", list(config.packages))
         settings = prior_settings(config)
         path = find(dataset, settings, Path(config.priors_dir))
         if path is None:
-            with live_progress() as progress:
+            with run_progress("prior") as progress:
                 path = make_prior(dataset, settings, Path(config.priors_dir), pick_device(config.device), progress)
         print(path)
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import sys
 import time
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -15,8 +14,8 @@ from safetensors.torch import load_file, save_file
 
 from bench.autodecoder import Prior, PriorSettings, distance_samples, fit_error, surface_error, train
 from bench.environment import describe
-from bench.progress import Report
-from bench.records import digest, to_json, write_text
+from bench.progress import Report, notice
+from bench.records import alone, digest, to_json, write_text
 from datasets.dataset import Dataset, Split
 from renderers.fields.mlp import Decoder
 
@@ -31,8 +30,11 @@ def prior_for(
     """The prior of a dataset: a shipped one, else one in `priors_dir`, else a new one, which is kept there."""
     path = find(dataset, settings, priors_dir)
     if path is None:
-        print(f"training a prior of {dataset.name}, once; it is kept in {priors_dir}", file=sys.stderr)
-        path = make_prior(dataset, settings, priors_dir, device, progress)
+        with alone(priors_dir, prior_key(dataset, settings)):
+            path = find(dataset, settings, priors_dir)  # another cell may have made it meanwhile
+            if path is None:
+                notice(f"training a prior of {dataset.name}, once; it is kept in {priors_dir}")
+                path = make_prior(dataset, settings, priors_dir, device, progress)
     return _load(path, settings)
 
 

@@ -1,11 +1,14 @@
-"""Live progress on a terminal: one bar with loss and time left; silent where there is no terminal."""
+"""Live progress on a terminal: a line for the run and one for the sweep; silent where there is no terminal."""
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may take minutes each
 
 
 @runtime_checkable
@@ -15,26 +18,74 @@ class Report(Protocol):
     def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None: ...
 
 
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+_tell: Callable[[str], None] = _print
+
+
+def notice(text: str) -> None:
+    """Tells the user something that should be seen also where there is no terminal."""
+    _tell(text)
+
+
+def notices_to(tell: Callable[[str], None]) -> None:
+    """Gives notices to `tell` from now on, such as to a parent process."""
+    global _tell
+    _tell = tell
+
+
+_shown: Progress | None = None  # the display of this process: a sweep's line, and that of the run within, share it
+
+
 @contextmanager
-def live_progress() -> Iterator[Report]:
-    """A bar on standard error, replaced when the phase changes."""
+def display() -> Iterator[Progress]:
+    """The live display of this process, on standard error."""
+    global _shown
+    if _shown is not None:
+        yield _shown
+        return
     columns = (
-        TextColumn("{task.description:<22}"),
+        TextColumn("{task.description:<28}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[loss]}"),
+        TextColumn("{task.fields[said]}", markup=False),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=5) as bars:
-        tasks: dict[str, int] = {}
+    with Progress(
+        *columns,
+        console=console,
+        disable=not console.is_terminal,
+        refresh_per_second=5,
+        speed_estimate_period=HOUR,
+        transient=True,
+    ) as _shown:
+        try:
+            yield _shown
+        finally:
+            _shown = None
+
+
+@contextmanager
+def run_progress(name: str) -> Iterator[Report]:
+    """One line for a run: its phase, how far it is, and its loss."""
+    with display() as shown:
+        line = shown.add_task(name, total=None, said="")
+        current = ""
 
         def report(phase: str, done: int, total: int, loss: float | None = None) -> None:
-            shown = "" if loss is None else f"loss {loss:.4g}"
-            if phase not in tasks:
-                tasks[phase] = bars.add_task(phase, total=total, loss=shown)
-            bars.update(tasks[phase], completed=done, loss=shown)
+            nonlocal current
+            said = "" if loss is None else f"loss {loss:.4g}"
+            if phase != current:  # another phase has another speed
+                current = phase
+                shown.reset(line, total=total, description=f"{name}: {phase}", said=said)
+            shown.update(line, completed=done, said=said)
 
-        yield report
+        try:
+            yield report
+        finally:
+            shown.remove_task(line)

@@ -3,12 +3,14 @@
 import hashlib
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock
 
 SCHEMA = 1
 
@@ -28,6 +30,11 @@ class RunStatus(StrEnum):
     UNSUPPORTED = "unsupported"
 
 
+def now() -> str:
+    """The time, to the second, in UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
 @dataclass
 class Record:
     """What `record.json` holds. A new record says killed, which is true until its run ends in another way."""
@@ -39,7 +46,7 @@ class Record:
     seed: int
     config: dict[str, Any]
     scene: str = ""
-    started: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+    started: str = field(default_factory=now)
     status: RunStatus = RunStatus.KILLED
     reason: str = "the run is under way, or was killed before it could say why"
     metrics: dict[str, float] = field(default_factory=dict)
@@ -53,33 +60,33 @@ class Record:
     environment: dict[str, Any] = field(default_factory=dict)
     reused: bool = False
     notes: list[str] = field(default_factory=list)
+    config_hash: str = ""
+    code: str = ""  # hash of the code that ran, and of the files that it read
+    asked: str = field(default_factory=now)  # when it was last asked for, which for a reused run is not when it ran
+    ended: str = ""  # empty while it is under way, and where it could not say
+    log: list[str] = field(default_factory=list)  # the end of log.txt, of a run that failed
 
     @property
     def name(self) -> str:
         """What tables call it: its label, or else its renderer."""
         return self.config.get("label") or self.renderer
 
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> "Record":
+        """The record of data that `bench.report.records.read_record` has checked; what it does not know is left out."""
+        known = {item.name: data[item.name] for item in fields(cls) if item.name in data}
+        return cls(**{**known, "status": RunStatus(data["status"])})
+
     def write(self, folder: Path) -> None:
         """Writes `record.json` so that a reader, or a crash, never meets half of one."""
         write_text(folder / "record.json", to_json({"schema": SCHEMA, **self.__dict__}))
 
 
-def claim_folder(results_dir: Path, name: str) -> Path:
-    """Makes a run folder of this name, with a number behind it where the name is taken.
-
-    Raises:
-        OSError: where the results folder cannot be written.
-    """
-    runs = results_dir / "runs"
-    runs.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while True:
-        folder = runs / (name if number == 1 else f"{name}-{number}")
-        try:
-            folder.mkdir()
-            return folder
-        except FileExistsError:
-            number += 1
+def alone(folder: Path, name: str) -> FileLock:
+    """A lock on a name in a folder: of all processes that take it, one goes on, the others wait."""
+    locks = folder / ".locks"
+    locks.mkdir(parents=True, exist_ok=True)
+    return FileLock(locks / name)
 
 
 def digest(data: Any) -> str:
@@ -90,11 +97,15 @@ def digest(data: Any) -> str:
 def write_text(path: Path, text: str) -> None:
     """Writes a file beside its place, flushes it to the disk and renames it there."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    with scratch.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    scratch.replace(path)
+    try:
+        with scratch.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
 
 
 def to_json(data: Any) -> str:

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from bench.autodecoder import Prior
-from bench.records import digest
+from bench.records import alone, digest
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
 from renderers.reference import steepest, trace
@@ -43,17 +43,23 @@ def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
     Raises:
         ValueError: where the kept one cannot be read.
     """
-    path = folder / f"reference-{_key(prior, camera)}.safetensors"
+    key = _key(prior, camera)
+    path = folder / f"reference-{key}.safetensors"
     if not path.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        twin = in_float64(prior)
-        scratch = path.with_suffix(f".{os.getpid()}.partial")  # of this process alone: cells may run side by side
-        save_file(vars(make_reference(twin.decoder.at(twin.codes[0]), camera)), scratch)
-        scratch.replace(path)
+        with alone(folder, key):
+            if not path.is_file():  # else another cell has made it meanwhile
+                _keep(prior, camera, path)
     try:
         return Reference(**load_file(path))
     except (SafetensorError, OSError) as error:
         raise ValueError(f"the reference {path} cannot be read ({error}): delete it, and it is made again") from error
+
+
+def _keep(prior: Prior, camera: Camera, path: Path) -> None:
+    twin = in_float64(prior)
+    scratch = path.with_suffix(f".{os.getpid()}.partial")
+    save_file(vars(make_reference(twin.decoder.at(twin.codes[0]), camera)), scratch)
+    scratch.replace(path)
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:

@@ -1,103 +1,123 @@
-"""Runs one cell of a plan and writes its record, whatever happens."""
+"""Runs one cell: claims its folder, runs it where it can be stopped, and writes its record whatever happens."""
 
-import logging
 import time
-import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from bench import environment
-from bench.config import build, check_top_level
-from bench.progress import Report, live_progress
-from bench.records import Record, RunStatus, claim_folder, digest, write_text
-from bench.stage import Cell, set_up
-from bench.tasks.problem import Task, Unsupported
+from bench.config import Isolation, build
+from bench.identity import Identity, identify
+from bench.isolation import RunLimits, run_isolated
+from bench.job import Job, Message, Said, Step
+from bench.progress import Report, notice, run_progress
+from bench.records import Record, RunStatus, now, write_text
+from bench.report.records import read_record
+from bench.run_folder import Claim, claimed, release
+from bench.trackers import Tracker
 
-NEUTRAL = ("results_dir", "priors_dir", "verbose")  # keys that change no result, left out of a configuration's hash
+LAST_LINES, LAST_BYTES = 40, 16_384  # of the log, at most, kept in the record of a run that failed
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM ended a run; its record says so already."""
+
+    def __init__(self, folder: Path, record: Record) -> None:
+        super().__init__(f"killed: {record.reason}")
+        self.folder, self.record = folder, record
 
 
 def run(config: DictConfig) -> tuple[Path, Record]:
-    """Makes a run folder, runs the configuration in it, and leaves its record there.
+    """Runs a configuration in the folder that is its own, or reuses what is there; leaves its record.
 
     Raises:
         OSError: where the results folder cannot be written.
+        Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
-    choices = _choices()
-    # As far as it can be resolved: a value that is missing is an error of the run, not of its record.
-    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    identity = {key: value for key, value in values.items() if key not in NEUTRAL}
-    folder = claim_folder(Path(config.results_dir), "-".join([*choices.values(), digest(identity)[:8]]))
-    record = Record(folder.name, **choices, seed=config.seed, config=values)
-    record.write(folder)
-    log = _open_log(folder)
-    started = time.perf_counter()
+    identity = identify(config, HydraConfig.get().runtime.choices)
+    with claimed(Path(config.results_dir), identity, config.rerun) as claim:
+        if claim.finished is not None:
+            record = Record.of(claim.finished)
+            record.reused, record.asked = True, now()
+            with suppress(OSError):  # it can be read, which is enough
+                record.write(claim.folder)
+            return claim.folder, record
+        record = _new_record(identity, claim)
+        record.write(claim.folder)
+        started, interrupted, tracker = time.perf_counter(), False, None
+        try:
+            limits = RunLimits(config.time_limit, config.memory_limit)
+            tracker = build(config.tracker, "tracker", list(config.packages))
+            write_text(claim.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+            with run_progress(record.name) as progress:
+                _carry_out(Job(config, claim.folder, record), limits, progress)
+        except KeyboardInterrupt as error:
+            who = str(error) or "stopped by Ctrl-C"
+            record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
+            interrupted = True
+        except Exception as error:  # noqa: BLE001 - of the harness: a full disk, a limit that cannot be
+            record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
+        finally:
+            record.seconds["total"] = time.perf_counter() - started
+            record.ended = now()
+            if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
+                record.log = _last_lines(claim.folder / "log.txt")
+            release(claim.folder)
+            record.write(claim.folder)
+    if tracker is not None:
+        _export(tracker, claim.folder, record)
+    if interrupted:
+        raise Interrupted(claim.folder, record)
+    return claim.folder, record
+
+
+def _carry_out(job: Job, limits: RunLimits, progress: Report) -> None:
+    """Does the job, in a child process or, for debugging, in this one; its record is filled as far as it came."""
+    if job.config.isolation == Isolation.off:
+        from bench.execute import execute  # it imports torch, which else only the child does
+
+        execute(job.config, job.folder, job.record, progress=progress, checkpoint=lambda r: r.write(job.folder))
+        return
+
+    def receive(message: Message) -> None:
+        if isinstance(message, Record):
+            vars(job.record).update(vars(message))
+            job.record.write(job.folder)
+        elif isinstance(message, Step):
+            progress(message.phase, message.done, message.total, message.loss)
+        elif isinstance(message, Said):
+            notice(message.text)
+
+    ending = run_isolated(job, limits, receive)
+    if ending is not None:
+        job.record.status, job.record.reason = ending.status, ending.reason
+
+
+def _export(tracker: Tracker, folder: Path, record: Record) -> None:
+    """Exports a finished run; that it fails is noted in the record, and costs nothing else."""
     try:
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-        with live_progress() as progress:
-            _execute(config, folder, record, progress)
-    except KeyboardInterrupt as error:
-        who = str(error) or "stopped by Ctrl-C"
-        record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
-    except Unsupported as error:
-        record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
-    except (MemoryError, torch.OutOfMemoryError) as error:
-        record.status, record.reason = RunStatus.OOM, _one_line(error)
-    except Exception as error:  # noqa: BLE001 - whatever a run does, its record says so
-        out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
-        record.status, record.reason = RunStatus.OOM if out_of_memory else RunStatus.CRASHED, _one_line(error)
-        log.error(traceback.format_exc())
-        if config.verbose:
-            traceback.print_exc()
-    finally:
-        record.seconds["total"] = time.perf_counter() - started
-        log.info("%s %s", record.status, record.reason)
-        _close_log(log)
+        tracker.export(folder, read_record(folder))
+    except Exception as error:  # noqa: BLE001 - of a server, a database, a library that is not ours
+        record.notes = [*record.notes, f"not exported to the tracker: {' '.join(str(error).split())}"]
         record.write(folder)
-    return folder, record
 
 
-def _execute(config: DictConfig, folder: Path, record: Record, progress: Report) -> None:
-    check_top_level(config)
-    task = build(config.task, "task", list(config.packages))
-    if not isinstance(task, Task):
-        raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
-    stage = set_up(config, progress)
-    record.scene, record.notes = stage.scene.name, list(stage.scene.mesh.repairs)
-    record.environment = environment.describe(stage.device)
-    task.execute(Cell(stage, folder, record, progress))
+def _new_record(identity: Identity, claim: Claim) -> Record:
+    return Record(
+        claim.folder.name,
+        **identity.choices,
+        seed=identity.config["seed"],
+        config=identity.config,
+        config_hash=identity.config_hash,
+        code=identity.code,
+    )
 
 
-def _choices() -> dict[str, str]:
-    """What was chosen for task, renderer and dataset, by the name of the chosen YAML."""
-    chosen = HydraConfig.get().runtime.choices
-    return {name: str(chosen[name]) for name in ("task", "renderer", "dataset")}
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-class _LogFile(logging.FileHandler):
-    """A log file that a full disk silences, but does not make a nuisance of."""
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        """The record of the run says what went wrong."""
-
-
-def _open_log(folder: Path) -> logging.Logger:
-    log = logging.Logger(folder.name, logging.INFO)  # not registered: Hydra disables registered ones between jobs
-    handler = _LogFile(folder / "log.txt", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    log.addHandler(handler)
-    return log
-
-
-def _close_log(log: logging.Logger) -> None:
-    for handler in log.handlers:
-        with suppress(OSError):
-            handler.close()
+def _last_lines(path: Path) -> list[str]:
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - LAST_BYTES, 0))
+            return file.read(LAST_BYTES).decode("utf-8", "replace").splitlines()[-LAST_LINES:]
+    except OSError:
+        return []

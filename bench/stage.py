@@ -40,7 +40,7 @@ class Stage:
             ValueError: where the prior was not trained on that shape.
         """
         if self.trained is None:
-            raise ValueError("task renders a network at a shape it was fitted to: set split=train index=0 prior=fit")
+            raise ValueError("task renders a network at a shape it was fitted to: add +common=fitted")
         return Prior(self.prior.decoder, self.prior.codes[self.trained : self.trained + 1])
 
 

@@ -1,5 +1,6 @@
 """The short table that a run ends with."""
 
+from collections import Counter
 from pathlib import Path
 
 from rich import box
@@ -7,8 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bench.records import Record
+from bench.plan import Plan
+from bench.records import Record, RunStatus
 from bench.report.format import count, number, seconds
+from bench.report.html import write_index
+from bench.report.planned import NOT_RUN
 
 ROWS = (  # metric, what it is called, factor, better when
     ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),
@@ -45,9 +49,38 @@ def show(folder: Path, record: Record, index: Path) -> None:
     for note in record.notes:
         print(f"note: {note}")
     print(f"report: {index}")
-    if record.status not in ("ok", "killed"):  # the program ends by telling of killed
+    if record.reused:
+        print(f"reused: the run of {record.started}; rerun=all runs it again")
+    if record.status != RunStatus.OK and not record.reason.startswith("stopped by"):  # the program tells of that
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"{record.status}: {record.reason}", markup=False)
     print(folder)
+
+
+def line(folder: Path, record: Record) -> str:
+    """What a cell of a sweep came to, in a line that ends with its folder."""
+    loop = sum(record.seconds.get(name, 0.0) for name in ("forward", "backward")) or record.seconds.get("total", 0.0)
+    parts = [
+        record.status + (" (reused)" if record.reused else ""),
+        f"{record.task}, {record.name}, {record.scene or record.dataset}",
+        seconds(loop),
+    ]
+    if "chamfer_l2" in record.metrics:
+        parts.append(f"Chamfer (x1000) {number(record.metrics['chamfer_l2'], 1000.0)}")
+    if record.reason:
+        parts.append(record.reason)
+    return "  ".join([*parts, str(folder)])
+
+
+def show_sweep(plan: Plan) -> list[str]:
+    """Prints what a sweep came to; its last line is the plan's folder. Gives the status of every planned cell."""
+    statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]
+    counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
+    print(f"{len(plan.cells)} planned: {counts}")
+    if set(statuses) - {"ok", "unsupported"}:
+        print("failed cells are tried again by the same command with rerun=failed, those that were not run by itself")
+    print(f"report: {write_index(plan.results_dir)}")
+    print(plan.folder)
+    return statuses
 
 
 def _measured(record: Record) -> Table:

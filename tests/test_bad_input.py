@@ -14,7 +14,7 @@ import torch
 import trimesh
 from hydra.core.global_hydra import GlobalHydra
 
-from bench import runner, stage
+from bench import run_folder, stage
 from bench.__main__ import main
 
 ROOT = Path(__file__).parent.parent
@@ -30,7 +30,9 @@ def bench(monkeypatch, capsys, tmp_path):
     def run(*arguments):
         GlobalHydra.instance().clear()
         given = any(argument.startswith("results_dir=") for argument in arguments)
-        monkeypatch.setattr(sys, "argv", ["bench", *arguments, *([] if given else [f"results_dir={tmp_path / 'r'}"])])
+        monkeypatch.setattr(
+            sys, "argv", ["bench", *arguments, "isolation=off", *([] if given else [f"results_dir={tmp_path / 'r'}"])]
+        )
         code = main()
         return code, *capsys.readouterr()
 
@@ -228,15 +230,11 @@ def test_a_disk_that_is_full_from_the_start_is_told(bench, monkeypatch):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_disk_that_fills_up_during_a_run_is_told(bench, monkeypatch):
-    claim = runner.claim_folder
-
-    def claim_full(*arguments):
-        folder = claim(*arguments)
+    def fill_up(folder):
         for name in ("curve.jsonl", "log.txt"):
             (folder / name).symlink_to("/dev/full")
-        return folder
 
-    monkeypatch.setattr(runner, "claim_folder", claim_full)
+    monkeypatch.setattr(run_folder, "_reserve", fill_up)
     code, out, err = bench(*TINY, "task.iterations=2")
     assert code == 1
     assert "Traceback" not in out + err

@@ -43,10 +43,11 @@ def build_part(config: DictConfig, part: str):
 
 def test_no_yaml_lies_where_it_is_not_looked_for():
     assert {path.relative_to(CONF) for path in CONF.rglob("*.yaml")} == {
-        path.relative_to(CONF) for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"))
+        path.relative_to(CONF)
+        for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"), *CONF.glob("hydra/launcher/*.yaml"))
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    chosen = {"task", "renderer", "dataset", "prior", "scale"}
+    chosen = {"task", "renderer", "dataset", "prior", "scale", "tracker"}
     assert {group for group, _ in YAMLS} == {*chosen, "experiment", "strategy", "common"}
 
 

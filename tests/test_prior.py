@@ -104,7 +104,7 @@ def test_training_follows_its_seed():
 def test_a_prior_is_kept_with_its_record(kept):
     folder, prior = kept
     key = prior_key(Boxes(), SETTINGS)
-    assert sorted(path.name for path in folder.iterdir()) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
+    assert sorted(path.name for path in folder.glob("[!.]*")) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
     record = json.loads((folder / f"boxes-{key}.json").read_text())
     assert record["key"] == key
     assert record["dataset"] == Boxes().identity()

@@ -11,44 +11,24 @@ from pathlib import Path
 
 import pytest
 
-from bench.records import Record, RunStatus, claim_folder, digest, to_json, write_text
+from bench.records import Record, RunStatus, digest, to_json, write_text
 from bench.report.records import read_records
 
 ODD_NAME = "two words ünïcode 50% #1?"
+
+
+def new_folder(results: Path) -> Path:
+    folder = results / "runs" / "run"
+    folder.mkdir(parents=True)
+    return folder
 
 
 def make_record(name: str = "completion-dist-sofa", **changed) -> Record:
     return Record(name, task="completion", renderer="dist", dataset="sofa", seed=0, config={"seed": 0}, **changed)
 
 
-def test_threads_never_claim_the_same_folder(tmp_path):
-    with ThreadPoolExecutor(16) as pool:
-        folders = list(pool.map(lambda _: claim_folder(tmp_path / ODD_NAME, "run"), range(48)))
-    assert len(set(folders)) == 48
-    assert all(folder.is_dir() and folder.parent == tmp_path / ODD_NAME / "runs" for folder in folders)
-    assert {folder.name for folder in folders} == {"run", *(f"run-{number}" for number in range(2, 49))}
-
-
-def test_processes_never_claim_the_same_folder(tmp_path):
-    code = (
-        "import sys, pathlib; from bench.records import claim_folder\n"
-        "for _ in range(20): print(claim_folder(pathlib.Path(sys.argv[1]), 'run'))"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    root = Path(__file__).parent.parent
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root) for _ in range(2)]
-    claimed = [line for process in both for line in process.communicate(timeout=30)[0].splitlines()]
-    assert len(claimed) == len(set(claimed)) == 40
-
-
-def test_a_results_folder_that_cannot_be_is_an_error_that_names_it(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="file"):
-        claim_folder(tmp_path / "file" / "results", "run")
-
-
 def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
-    folder = claim_folder(tmp_path, "run")
+    folder = new_folder(tmp_path)
     record = make_record()
     record.write(folder)
     (read,), problems = read_records(tmp_path)
@@ -63,7 +43,7 @@ def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
 def test_a_write_that_fails_leaves_the_old_record(tmp_path, monkeypatch, function):
-    folder = claim_folder(tmp_path, "run")
+    folder = new_folder(tmp_path)
     record = make_record()
     record.write(folder)
     before = (folder / "record.json").read_bytes()
@@ -96,7 +76,7 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
     odd = {"chamfer_l2": math.inf, "depth_mae": math.nan, "accuracy": -math.inf, "fscore": 0.5}
     record = make_record(metrics=odd, metrics_start=dict(odd), flops=None, gemm_fraction=math.nan)
     record.seconds = {"total": 1.5}
-    folder = claim_folder(tmp_path, "run")
+    folder = new_folder(tmp_path)
     record.write(folder)
     written = json.loads((folder / "record.json").read_text(), parse_constant=pytest.fail)
     assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "accuracy": "-inf", "fscore": 0.5}

@@ -41,7 +41,7 @@ def test_it_is_what_dense_sampling_finds():
 def test_it_is_kept_and_found_again(tmp_path, monkeypatch):
     folder = tmp_path / "a cache"
     first = reference_for(PRIOR, CAMERA, folder)
-    (path,) = folder.iterdir()
+    (path,) = folder.glob("[!.]*")
     assert re.fullmatch(r"reference-[0-9a-f]{12}\.safetensors", path.name)
     monkeypatch.setattr(reference_store, "make_reference", never)
     again = reference_for(PRIOR, CAMERA, folder)
@@ -82,14 +82,14 @@ def other_code(row: int) -> Prior:
 def test_what_it_was_made_from_decides_its_key(tmp_path, prior, camera, new):
     reference_for(PRIOR, CAMERA, tmp_path)
     reference_for(prior, camera, tmp_path)
-    assert len(list(tmp_path.iterdir())) == (2 if new else 1)
+    assert len(list(tmp_path.glob("[!.]*"))) == (2 if new else 1)
 
 
 def test_another_version_has_another_key(tmp_path, monkeypatch):
     reference_for(PRIOR, CAMERA, tmp_path)
     monkeypatch.setattr(reference_store, "VERSION", reference_store.VERSION + 1)
     reference_for(PRIOR, CAMERA, tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.glob("[!.]*"))) == 2
 
 
 def test_the_prior_stays_as_it_is(tmp_path):
@@ -132,7 +132,7 @@ def test_two_processes_that_make_the_same_one_do_not_meet(tmp_path, monkeypatch)
 @pytest.mark.parametrize("data", [b"", b"\xff" * 1000])
 def test_a_damaged_one_is_named_with_what_to_do(tmp_path, data):
     reference_for(PRIOR, CAMERA, tmp_path)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("[!.]*")
     path.write_bytes(data)
     with pytest.raises(ValueError, match=rf"the reference .*{path.name} cannot be read .*: delete it, and it is made"):
         reference_for(PRIOR, CAMERA, tmp_path)

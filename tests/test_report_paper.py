@@ -130,9 +130,8 @@ def test_newest_wins_and_a_row_keeps_its_place(tmp_path):
     [
         ({"settings": {"view": {"resolution": 32}}}, False),
         ({"settings": {"dataset": {"name": "sofa"}}}, False),
-        ({"environment": {**MACHINE, "threads": 4}}, False),
-        ({"environment": {**MACHINE, "cpu": "Other CPU"}}, False),
-        ({"environment": {**MACHINE, "device": "Some GPU"}}, False),
+        ({"environment": {**MACHINE, "threads": 4}}, True),
+        ({"environment": {**MACHINE, "cpu": "Other CPU"}}, True),
         ({"environment": {**MACHINE, "commit": "abc"}}, True),
         ({"environment": {}, "status": "crashed"}, True),
         ({"settings": {"results_dir": "elsewhere", "verbose": True, "packages": ["mine"], "priors_dir": "p"}}, True),
@@ -147,11 +146,31 @@ def test_only_what_may_be_compared_is_merged(tmp_path, changed, merged):
     assert ("Not shown: 1 run" in table1.make(made).caption) is not merged
 
 
-def test_newest_run_without_a_machine_joins_the_newest_machine(tmp_path):
-    write_run(tmp_path, "table1", NAIVE, environment={**MACHINE, "threads": 8})
-    write_run(tmp_path, "table1", DYNAMIC)
+@pytest.mark.parametrize("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}])
+def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path, other):
+    write_run(tmp_path, "table1", NAIVE, metrics=costs(), environment={**MACHINE, **other})
+    write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
     write_run(tmp_path, "table1", PARALLEL, environment={}, status="crashed")
-    assert chosen(tmp_path, "table1").names() == [DYNAMIC, PARALLEL]
+    made = chosen(tmp_path, "table1")
+    assert made.names() == [NAIVE, DYNAMIC, PARALLEL]  # no planned row is lost for it
+    caption = table1.make(made).caption
+    assert "Times do not compare between rows of different machines or threads" in caption
+    (value,) = other.values()
+    assert str(value) in caption
+    assert f"({NAIVE})" in caption
+    assert f"({DYNAMIC})" in caption
+
+
+def test_times_of_one_machine_are_compared_without_a_word(tmp_path):
+    for row in (NAIVE, DYNAMIC):
+        write_run(tmp_path, "table1", row, metrics=costs())
+    assert "do not compare" not in table1.make(chosen(tmp_path, "table1")).caption
+
+
+def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
+    write_run(tmp_path, "table1", NAIVE, metrics=costs(), notes=["loaded machine: threads waited 31% of their time"])
+    write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
+    assert f"Times in doubt, see the notes of the run: {NAIVE}." in table1.make(chosen(tmp_path, "table1")).caption
 
 
 def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):

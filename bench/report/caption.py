@@ -14,17 +14,14 @@ def setup(experiment: Experiment) -> str:
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in records))
     known = [scene for scene in scenes if scene] or [records[0]["dataset"]]
     resolution = setting(config, "view", "resolution")
-    environment = next((record["environment"] for record in records if record["environment"]), {})
-    machine = [str(environment.get(name) or "") for name in ("cpu", "device")]
-    threads = environment.get("threads")
+    machines = [_machine(*machine) for machine in experiment.machines()]
     parts = [
         f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",
         f"{resolution}×{resolution} pixels" if resolution else "",
         _network(setting(config, "prior", "network") or setting(config, "scale", "network")),
-        " + ".join(part for part in machine if part and part != "cpu"),
-        f"{threads} thread{'s' if threads != 1 else ''}" if threads else "",
+        machines[0] if len(machines) == 1 else "",
     ]
-    return "; ".join(part for part in parts if part) + "."
+    return joined("; ".join(part for part in parts if part) + ".", _compared(experiment), _loaded(experiment))
 
 
 def outcome(experiment: Experiment) -> str:
@@ -48,6 +45,28 @@ def omitted(experiment: Experiment) -> str:
 def joined(*sentences: str) -> str:
     """The sentences that are not empty, as one paragraph."""
     return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _compared(experiment: Experiment) -> str:
+    """A warning where the rows' times are of different machines or numbers of threads."""
+    machines = experiment.machines()
+    if len(machines) < 2:
+        return ""
+    told = [f"{_machine(*machine) or 'an unnamed one'} ({_listed(rows)})" for machine, rows in machines.items()]
+    return f"Times do not compare between rows of different machines or threads: {'; '.join(told)}."
+
+
+def _loaded(experiment: Experiment) -> str:
+    """A warning where other work, or a missing synchronisation, spoilt times."""
+    pairs = zip(experiment.names(), experiment.records, strict=True)
+    doubtful = ("loaded machine", "missing synchronisation")
+    names = [name for name, record in pairs if any(note.startswith(doubtful) for note in record["notes"])]
+    return f"Times in doubt, see the notes of the run: {_listed(names)}." if names else ""
+
+
+def _machine(cpu: Any, device: Any, threads: Any) -> str:
+    parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
+    return "; ".join([" + ".join(parts), *([f"{threads} thread{'s' if threads != 1 else ''}"] if threads else [])])
 
 
 def _failure(name: str, record: dict[str, Any]) -> str:

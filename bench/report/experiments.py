@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bench.report.records import started
+from bench.report.records import NEUTRAL_KEYS, asked, started
 
 TASKS = {"table1": "ablation", "fig4": "ablation", "fig5": "completion", "fig7": "ablation", "gradients": "gradients"}
 ROW_KEYS = {"renderer", "label", "seed", "index"}  # of a configuration: what the rows of one experiment may differ in
-NEUTRAL_KEYS = {"results_dir", "priors_dir", "verbose", "packages"}  # of a configuration: what changes no result
+NOT_SHARED = {*ROW_KEYS, *NEUTRAL_KEYS, "packages"}
 MACHINE = ("cpu", "device", "threads")
 
 
@@ -44,27 +44,33 @@ class Experiment:
             for record in self.records
         ]
 
+    def machines(self) -> dict[tuple[Any, ...], list[str]]:
+        """The names of the rows by what their times depend on: processor, accelerator, threads."""
+        found: dict[tuple[Any, ...], list[str]] = {}
+        for name, record in zip(self.names(), self.records, strict=True):
+            if record["environment"]:
+                found.setdefault(tuple(record["environment"].get(key) for key in MACHINE), []).append(name)
+        return found
+
     def of_newest_scene(self) -> "Experiment":
-        """The same, with only those rows that have the seed and the shape of the row that started last."""
-        newest = max(self.records, key=started)
+        """The same, with only those rows that have the seed and the shape of the row that was asked for last."""
+        newest = max(self.records, key=asked)
         kept = [r for r in self.records if (_seed(r), _index(r)) == (_seed(newest), _index(newest))]
         return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
 
 
 def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Experiment | None:
-    """The experiment's newest record and those that share all but the row's own with it; None without a record.
+    """The record that was asked for last and those that share all but the row's own with it; None without a record.
 
-    What must be shared: the configuration but for `ROW_KEYS` and `NEUTRAL_KEYS`, and the machine with its threads. A
-    run that failed before it could name its machine counts as of any. Rows stand in the order in which they first
-    started; a row that was run more than once is its newest record.
+    What must be shared is the configuration but for `NOT_SHARED`. Rows stand in the order in which they started; a row
+    that was run more than once is its newest record. The rows may be of different machines: captions say so.
     """
     found = [r for r in records if r["config"].get("experiment") == name and r["task"] == TASKS[name]]
     if not found:
         return None
     found.sort(key=started)
-    same = [r for r in found if _shared(r) == _shared(found[-1])]
-    machines = [machine for r in same if (machine := _machine(r))]
-    same = [r for r in same if _machine(r) in (machines[-1], None)] if machines else same
+    last = _shared(max(found, key=asked))
+    same = [r for r in found if _shared(r) == last]
     rows: dict[Hashable, dict[str, Any]] = {}
     for record in same:
         rows[_key(record, name)] = record  # takes the place of the first, with the content of the newest
@@ -134,9 +140,4 @@ def _index(record: dict[str, Any]) -> Any:
 
 
 def _shared(record: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in record["config"].items() if key not in ROW_KEYS | NEUTRAL_KEYS}
-
-
-def _machine(record: dict[str, Any]) -> tuple[Any, ...] | None:
-    environment = record["environment"]
-    return tuple(environment.get(name) for name in MACHINE) if environment else None
+    return {key: value for key, value in record["config"].items() if key not in NOT_SHARED}

@@ -6,7 +6,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from bench.report.planned import read_planned
+
 SCHEMA = 1
+# Keys of a configuration that change no result, and are left out of its hash.
+NEUTRAL_KEYS = frozenset(
+    ("results_dir", "priors_dir", "verbose", "isolation", "time_limit", "memory_limit", "rerun", "tracker")
+)
 _NUMBER = (int, float, type(None))
 _FIELDS: dict[str, type | tuple[type, ...]] = {
     "id": str,
@@ -47,7 +53,8 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """The records of `results_dir/runs/*/record.json`, newest first, and one line for each that was not read.
 
     A record is as written, with non-finite numbers as floats, `notes` always there, and the name of its folder
-    under `folder`. A line gives the folder's name and why it was not read. Hidden folders are passed over.
+    under `folder`. A line gives the folder's name and why it was not read. Hidden folders are passed over. Cells that
+    a sweep planned and that have no folder stand among the records, with the status `not_run`.
 
     Raises:
         ValueError: if `results_dir` is not a folder.
@@ -55,20 +62,26 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     if not results_dir.is_dir():
         raise ValueError(f"results_dir must be an existing folder, found {results_dir}; make a run there first.")
     records, problems = [], []
-    for folder in sorted((results_dir / "runs").glob("*")):
-        if not folder.is_dir() or folder.name.startswith("."):
-            continue
+    folders = [f for f in sorted((results_dir / "runs").glob("*")) if f.is_dir() and not f.name.startswith(".")]
+    for folder in folders:
         try:
-            records.append(_read(folder))
+            records.append(read_record(folder))
         except FileNotFoundError:
             problems.append(f"{folder.name}: no record.json; the run has not finished, or its record was removed")
         except (OSError, ValueError, RecursionError) as error:
             problems.append(f"{folder.name}: {error}")
+    planned, unread = read_planned(results_dir, {record["folder"] for record in records})
+    records, problems = records + planned, problems + unread
     records.sort(key=started, reverse=True)
     return records, problems
 
 
-def _read(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path) -> dict[str, Any]:
+    """The record of one run folder, as `read_records` gives it.
+
+    Raises:
+        OSError, ValueError, RecursionError: where it cannot be read; the message says why.
+    """
     try:
         record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
     except ValueError as error:
@@ -78,13 +91,14 @@ def _read(folder: Path) -> dict[str, Any]:
     if record.get("schema") != SCHEMA:
         raise ValueError(f"record.json must have schema {SCHEMA}, found {record.get('schema')!r}")
     record.setdefault("notes", [])
+    record.setdefault("asked", record.get("started"))
     record |= {name: decoded(record[name]) for name in _NUMERIC if name in record}
     for name, kind in _FIELDS.items():
         if name not in record:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], kind):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
-    started(record)  # a time that cannot be read is found here, not in the sort
+    started(record), asked(record)  # a time that cannot be read is found here, not in the sort
     return record | {"folder": folder.name}
 
 
@@ -95,7 +109,16 @@ def decoded(value: Any) -> Any:
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value
 
 
+def asked(record: dict[str, Any]) -> datetime:
+    """When the run was last asked for, which for a reused one is not when it ran."""
+    return _time(record["asked"])
+
+
 def started(record: dict[str, Any]) -> datetime:
     """When the run started; a time without an offset is UTC."""
-    time = datetime.fromisoformat(record["started"])
+    return _time(record["started"])
+
+
+def _time(text: str) -> datetime:
+    time = datetime.fromisoformat(text)
     return time if time.tzinfo else time.replace(tzinfo=UTC)

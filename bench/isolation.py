@@ -1,0 +1,150 @@
+"""Runs a job in a child process that can be stopped at any moment, and says how it ended."""
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import psutil
+
+from bench.job import Ended, Job, Message, Started
+from bench.records import RunStatus
+
+LOOK = 0.05  # seconds between two looks at clock and memory
+GRACE = 0.5  # seconds that a child which is asked to stop has to hand over what it knows
+BOOT = 120.0  # seconds in which a child must be there; a cold disk is slow
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class RunLimits:
+    """What a run may take.
+
+    Args:
+        seconds: of wall-clock time, from when its process is ready; None for no limit.
+        memory: of the process's resident set, in GiB; None for nine tenths of the machine's.
+    """
+
+    seconds: float | None
+    memory: float | None
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"time_limit must be positive, not {self.seconds}: 600 is ten minutes, null no limit")
+        if self.memory is not None and not self.memory > 0:
+            raise ValueError(f"memory_limit must be positive, not {self.memory}: 8 is 8 GiB, null all but a tenth")
+
+    @property
+    def bytes(self) -> float:
+        return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a child ended that could not say so itself."""
+
+    status: RunStatus
+    reason: str
+
+
+def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> Ending | None:
+    """Runs a job in a child process, and gives every message of the child's to `receive` as it comes.
+
+    Returns:
+        None where the child came to its end by itself and said how; else how it ended.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["bench.child"])  # so that a child has torch from its first moment
+    channel, childs = context.Pipe()
+    alive, ours = context.Pipe(
+        duplex=False
+    )  # the child watches its end: it closes with this process, however that ends
+    process = context.Process(target=_enter, args=(job, childs, alive))
+    with channel, ours:
+        process.start()
+        childs.close()
+        alive.close()
+        try:
+            ending = _watch(process, channel, limits, receive)
+            process.join(GRACE if ending is None else 0.0)
+            return ending
+        finally:
+            _end(process, channel, receive)
+
+
+def _enter(job: Job, channel: Connection, parent: Connection) -> None:
+    from bench.child import main
+
+    main(job, channel, parent)
+
+
+def _watch(
+    process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
+) -> Ending | None:
+    begun, ready, most = time.perf_counter(), False, limits.bytes
+    with suppress(psutil.NoSuchProcess):
+        memory = psutil.Process(process.pid)
+    while True:
+        wait([channel, process.sentinel], timeout=LOOK)
+        while channel.poll():
+            try:
+                message = channel.recv()
+            except (EOFError, OSError):
+                return _died(process)
+            if isinstance(message, Ended):
+                return None
+            if isinstance(message, Started):
+                begun, ready = time.perf_counter(), True
+            receive(message)
+        if not process.is_alive():
+            return _died(process)
+        spent = time.perf_counter() - begun
+        if ready and limits.seconds is not None and spent > limits.seconds:
+            return Ending(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s")
+        if not ready and spent > BOOT:
+            return Ending(RunStatus.CRASHED, f"its process was not ready within {BOOT:g} s")
+        with suppress(psutil.NoSuchProcess):
+            if memory.memory_info().rss > most:
+                process.kill()  # at once: what is left of the memory is others'
+                return Ending(RunStatus.OOM, f"more than {most / GIB:.3g} GiB of memory (memory_limit)")
+
+
+def _end(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
+    """Asks the child to stop, takes what it has to say, and ends it."""
+    if process.is_alive():
+        process.terminate()
+    latest = time.perf_counter() + GRACE
+    with suppress(EOFError, OSError):
+        while (left := latest - time.perf_counter()) > 0 and channel.poll(left):
+            receive(channel.recv())
+    process.join(max(latest - time.perf_counter(), 0.0))
+    if process.is_alive():
+        process.kill()
+    process.join()
+    process.close()
+
+
+def _died(process: BaseProcess) -> Ending:
+    process.join()
+    code = process.exitcode or 0
+    if code >= 0:
+        return Ending(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
+    name = signal.Signals(-code).name
+    if -code in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT):
+        hint = "; where memory ran out, the system does that" if -code == signal.SIGKILL else ""
+        return Ending(RunStatus.KILLED, f"its process was ended by {name}{hint}")
+    return Ending(RunStatus.CRASHED, f"its process died of {name} in native code")
+
+
+def machine_memory() -> int:
+    """Bytes of memory that processes here may use together: the machine's, or a container's limit below it."""
+    total = psutil.virtual_memory().total
+    for path in (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")):
+        with suppress(OSError, ValueError):
+            total = min(total, int(path.read_text()))
+    return total

@@ -1,0 +1,82 @@
+"""A renderer that fails on request, in each of the ways in which runs end badly."""
+
+import ctypes
+import os
+import re
+import signal
+import time
+
+import torch
+
+from renderers import IDR, Capabilities, Kind
+from renderers.rendering import Rendering
+
+
+class Failing:
+    """IDR, until it is asked for its third rendering with a gradient; then it fails as `how` says."""
+
+    capabilities = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
+
+    def __init__(self, how: str = "not", pause: float = 0.0):
+        self.how, self.pause, self.renderings = how, pause, 0
+        self.tracer = IDR(steps=10, epsilon=1e-3, least_slope=1e-3, mask_sharpness=50.0, sphere_radius=1.0)
+
+    def render(self, field, rays):
+        time.sleep(self.pause)
+        rendering = self.tracer.render(field, rays)
+        self.renderings += torch.is_grad_enabled()
+        return FAILURES[self.how](rendering) if self.renderings == 3 else rendering
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        return self.tracer.silhouette_loss(field, rays, rendering, mask)
+
+
+def _raise(rendering: Rendering) -> Rendering:
+    raise RuntimeError("it failed on request")
+
+
+def _not_a_number(rendering: Rendering) -> Rendering:
+    return Rendering(**{**vars(rendering), "distance": rendering.distance * float("nan")})
+
+
+def _loop(rendering: Rendering) -> Rendering:
+    while True:
+        pass
+
+
+def _native_loop(rendering: Rendering) -> Rendering:
+    re.match("(a+)+$", "a" * 60 + "b")  # for years, without letting another thread run
+    return rendering
+
+
+def _leave(rendering: Rendering) -> Rendering:
+    os._exit(0)
+
+
+def _kill(rendering: Rendering) -> Rendering:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return rendering
+
+
+def _segfault(rendering: Rendering) -> Rendering:
+    ctypes.string_at(0)
+    return rendering
+
+
+def _hog(rendering: Rendering) -> Rendering:
+    kept = []
+    while True:
+        kept.append(torch.ones(2**24))  # 64 MiB, written to
+
+
+FAILURES = {
+    "not": lambda rendering: rendering,
+    "raise": _raise,
+    "not_a_number": _not_a_number,
+    "loop": _loop,
+    "native_loop": _native_loop,
+    "leave": _leave,
+    "kill": _kill,
+    "segfault": _segfault,
+    "hog": _hog,
+}

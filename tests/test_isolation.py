@@ -1,0 +1,139 @@
+"""A run that ends badly in any way leaves a record that says how; it is stopped on time, and costs no other run."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from bench.__main__ import main
+
+ROOT = Path(__file__).parent.parent
+FAILING = (
+    "renderer=custom", "renderer._target_=tests.failing.Failing", "scale=smoke", "task.iterations=4",
+    "view.resolution=12", "task.points=20", "evaluation.grid=16", "evaluation.points=100", "evaluation.picture=8",
+    "threads=1",
+)  # fmt: skip
+LIMIT = 1.5  # seconds
+# How it fails, with which limits; the status that must come of it, and words of the reason.
+CASES = {
+    "raise": ((), "crashed", "it failed on request"),
+    "not_a_number": ((), "nan", "not a number"),
+    "loop": ((f"time_limit={LIMIT}",), "timeout", f"more than time_limit={LIMIT:g} s"),
+    "native_loop": ((f"time_limit={LIMIT}",), "timeout", f"more than time_limit={LIMIT:g} s"),
+    "leave": ((), "crashed", "ended by itself, with exit status 0"),
+    "kill": ((), "killed", "ended by SIGKILL"),
+    "segfault": ((), "crashed", "died of SIGSEGV in native code"),
+    "hog": (("memory_limit=1.5",), "oom", "more than 1.5 GiB"),
+}
+
+
+@pytest.fixture
+def bench(monkeypatch, capsys, tmp_path):
+    """A command line in this process, whose runs have their own: its exit status and its outputs."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+
+    def run(*arguments):
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", ["bench", *arguments, f"results_dir={tmp_path / 'r'}"])
+        code = main()
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def record_of(out: str) -> dict:
+    return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+
+
+@pytest.mark.parametrize("how", CASES)
+def test_a_run_that_ends_badly_says_how(bench, how):
+    more, status, words = CASES[how]
+    code, out, err = bench(*FAILING, f"+renderer.how={how}", *more)
+    record = record_of(out)
+    assert code == 1
+    assert (record["status"], words in record["reason"]) == (status, True), record["reason"]
+    assert record["ended"]
+    assert record["scene"] == "sofa test 0"  # what was known before it failed is kept
+    assert record["environment"]["threads"] == 1
+    assert record["metrics_start"] == {} or "chamfer_l2" in record["metrics_start"]
+    assert "Traceback" not in err
+    assert record["reason"] in " ".join(err.split())
+
+
+@pytest.mark.parametrize("how", ["loop", "native_loop"])
+def test_a_run_is_stopped_within_a_second_of_its_limit(bench, how):
+    bench(*FAILING, f"+renderer.how={how}", "time_limit=0.3")  # so that the server of processes is there
+    started = time.perf_counter()
+    _, out, _ = bench(*FAILING, f"+renderer.how={how}", f"time_limit={LIMIT}", "rerun=all")
+    assert time.perf_counter() - started < LIMIT + 2.0  # with composing, claiming, and the page
+    record = record_of(out)
+    assert LIMIT < record["seconds"]["total"] < LIMIT + 1.0
+
+
+def test_a_crash_leaves_the_end_of_its_log_in_the_record(bench):
+    _, out, _ = bench(*FAILING, "+renderer.how=raise")
+    log = "\n".join(record_of(out)["log"])
+    assert "Traceback" in log
+    assert "RuntimeError: it failed on request" in log
+
+
+def test_without_isolation_it_runs_in_this_process(bench):
+    code, out, _ = bench(*FAILING, "+renderer.how=raise", "isolation=off")
+    assert code == 1
+    assert record_of(out)["reason"] == "it failed on request"
+
+
+@pytest.mark.parametrize(("argument", "words"), [
+    ("time_limit=0", "time_limit must be positive"),
+    ("memory_limit=-1", "memory_limit must be positive"),
+    ("isolation=maybe", "isolation"),
+    ("rerun=sometimes", "rerun"),
+])  # fmt: skip
+def test_a_limit_that_cannot_be_is_told(bench, argument, words):
+    code, _, err = bench(*FAILING, argument)
+    assert code != 0
+    assert words in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
+    command = [sys.executable, "-m", "bench", *FAILING, "+renderer.how=native_loop", f"results_dir={tmp_path}"]
+    driver = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    latest = time.perf_counter() + 60
+    while not (busy := _children_at_work(tmp_path)) and time.perf_counter() < latest:
+        time.sleep(0.1)
+    assert busy
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    latest = time.perf_counter() + 5
+    while any(_alive(pid) for pid in busy) and time.perf_counter() < latest:
+        time.sleep(0.05)
+    assert not any(_alive(pid) for pid in busy)
+
+
+def _children_at_work(results: Path) -> list[int]:
+    """Processes that hold a log of a run open, once it has begun its optimisation."""
+    if not list(results.glob("runs/*/curve.jsonl")):
+        return []
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            links = [str(link.readlink()) for link in (process / "fd").iterdir()]
+        except OSError:
+            continue
+        if any(link.startswith(str(results)) and link.endswith("log.txt") for link in links):
+            found.append(int(process.name))
+    return found
+
+
+def _alive(pid: int) -> bool:
+    try:
+        state = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
