@@ -15,10 +15,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, nearest, register
-from bench.plan import Refused
+from bench.plan import Refused, Sweep
 
 USAGE = 2  # exit status of a command line that asks for what there is not
 FAILED = 1
+EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
@@ -57,6 +58,10 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         return _tell(f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space")
+    except Exception as error:  # of a launcher: a cluster that is not there, a worker that is lost
+        if Sweep.plan is None:
+            raise
+        return _tell(f"the launcher stopped: {' '.join(str(error).split())}; the same command goes on")
     return 0
 
 
@@ -85,6 +90,8 @@ def _explain(error: Exception) -> str:
     for cause in chain:
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
             group, _, name = str(cause.missing_cfg_file).rpartition("/")
+            if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
+                return f"hydra/launcher={name} needs a plugin: pip install -e '.[{extra}]'"
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
             return what + nearest(name, list(cause.options or []))
     message = " ".join(str(error).split())

@@ -58,6 +58,8 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     Returns:
         None where the child came to its end by itself and said how; else how it ended.
     """
+    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
+        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers name one that no child can find
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["bench.child"])  # so that a child has torch from its first moment
     channel, childs = context.Pipe()

@@ -1,7 +1,6 @@
 """The plan of a sweep: all its cells, written before the first one starts, so that none can be lost."""
 
 import threading
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -17,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.identity import identify
 from bench.progress import display
 from bench.records import digest, now, to_json, write_text
+from bench.report.format import number, seconds
 from bench.report.records import read_record
 
 SCHEMA = 1
@@ -137,23 +137,26 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 @contextmanager
 def followed(plan: Plan) -> Iterator[None]:
-    """Shows, on a terminal, how many of the plan's cells have ended, how many of them failed, and the time left."""
+    """Prints a line for each of the plan's cells as it ends, whatever process it runs in.
+
+    On a terminal it shows, too, how many have ended, how many of them failed, and the time left.
+    """
     with display() as shown:
-        if shown.disable:
-            yield
-            return
-        line = shown.add_task("sweep", total=len(plan.cells), said="")
-        stop = threading.Event()
+        progress = shown.add_task("sweep", total=len(plan.cells), said="")
+        pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
+
+        def look() -> None:
+            nonlocal failed
+            for cell in list(pending.values()):
+                if record := plan.record(cell):
+                    del pending[cell.id]
+                    failed += record["status"] != "ok"
+                    print(line(plan.results_dir / "runs" / cell.id, record), flush=True)
+            shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
 
         def follow() -> None:
-            pending, statuses = {cell.id: cell for cell in plan.cells}, Counter()
             while not stop.wait(max(LOOK, 1e-3 * len(pending))):
-                for cell in list(pending.values()):
-                    if record := plan.record(cell):
-                        statuses[record["status"]] += 1
-                        del pending[cell.id]
-                failed = statuses.total() - statuses["ok"]
-                shown.update(line, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
+                look()
 
         thread = threading.Thread(target=follow, daemon=True)
         thread.start()
@@ -162,4 +165,19 @@ def followed(plan: Plan) -> Iterator[None]:
         finally:
             stop.set()
             thread.join()
-            shown.remove_task(line)
+            look()
+            shown.remove_task(progress)
+
+
+def line(folder: Path, record: dict[str, Any]) -> str:
+    """What a cell came to, in a line that ends with its folder."""
+    name, spent = record["config"].get("label") or record["renderer"], record["seconds"]
+    loop = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
+    parts = [
+        record["status"] + (" (reused)" if record["reused"] else ""),
+        ", ".join((record["task"], name, record["scene"] or record["dataset"])),
+        seconds(loop),
+    ]
+    if "chamfer_l2" in record["metrics"]:
+        parts.append(f"Chamfer (x1000) {number(record['metrics']['chamfer_l2'], 1000.0)}")
+    return "  ".join([*parts, *([record["reason"]] if record["reason"] else []), str(folder)])

@@ -56,21 +56,6 @@ def show(folder: Path, record: Record, index: Path) -> None:
     print(folder)
 
 
-def line(folder: Path, record: Record) -> str:
-    """What a cell of a sweep came to, in a line that ends with its folder."""
-    loop = sum(record.seconds.get(name, 0.0) for name in ("forward", "backward")) or record.seconds.get("total", 0.0)
-    parts = [
-        record.status + (" (reused)" if record.reused else ""),
-        f"{record.task}, {record.name}, {record.scene or record.dataset}",
-        seconds(loop),
-    ]
-    if "chamfer_l2" in record.metrics:
-        parts.append(f"Chamfer (x1000) {number(record.metrics['chamfer_l2'], 1000.0)}")
-    if record.reason:
-        parts.append(record.reason)
-    return "  ".join([*parts, str(folder)])
-
-
 def show_sweep(plan: Plan) -> list[str]:
     """Prints what a sweep came to; its last line is the plan's folder. Gives the status of every planned cell."""
     statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]

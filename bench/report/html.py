@@ -13,7 +13,7 @@ from bench.report.paper import find_paper
 from bench.report.records import read_records
 
 # How a status is coloured; a status of no kind listed here is shown as bad.
-TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute"}
+TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute", "not_run": "mute"}
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
 # Metrics with a column of their own, and those that say nothing new beside `chamfer_l2`: kept to the details.
 COLUMNS = ("accuracy", "completeness", "fscore", "normal_consistency", "depth_mae", "mask_iou")
