@@ -1,6 +1,7 @@
 """What a run ran on: commit, versions, hardware, threads, load, and the machine's own speed limit."""
 
 import ctypes
+import hashlib
 import os
 import platform
 import subprocess
@@ -34,6 +35,7 @@ def describe(device: torch.device) -> dict[str, Any]:
     return {
         "commit": _git("rev-parse", "HEAD"),
         "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD")) else "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
         "platform": platform.platform(),

@@ -3,6 +3,7 @@
 import bench  # noqa: F401, before all else: it sets the OpenMP variables, which torch reads once
 
 # isort: split
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -48,3 +49,21 @@ def compose_config() -> Callable:
             return compose("config", overrides=list(overrides))
 
     return composed
+
+
+@pytest.fixture
+def isolated(monkeypatch, capsys, tmp_path) -> Callable:
+    """A command line in this process, whose runs have processes of their own: gives its exit status and outputs."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    from bench.__main__ import main
+
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # so that it is put back
+
+    def run(*arguments: str):
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", ["bench", *arguments, f"results_dir={tmp_path / 'r'}"])
+        code = main()
+        return code, *capsys.readouterr()
+
+    return run

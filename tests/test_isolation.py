@@ -1,6 +1,7 @@
 """A run that ends badly in any way leaves a record that says how; it is stopped on time, and costs no other run."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -8,9 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
-
-from bench.__main__ import main
 
 ROOT = Path(__file__).parent.parent
 FAILING = (
@@ -32,28 +30,14 @@ CASES = {
 }
 
 
-@pytest.fixture
-def bench(monkeypatch, capsys, tmp_path):
-    """A command line in this process, whose runs have their own: its exit status and its outputs."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-
-    def run(*arguments):
-        GlobalHydra.instance().clear()
-        monkeypatch.setattr(sys, "argv", ["bench", *arguments, f"results_dir={tmp_path / 'r'}"])
-        code = main()
-        return code, *capsys.readouterr()
-
-    return run
-
-
 def record_of(out: str) -> dict:
     return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
 
 
 @pytest.mark.parametrize("how", CASES)
-def test_a_run_that_ends_badly_says_how(bench, how):
+def test_a_run_that_ends_badly_says_how(isolated, how):
     more, status, words = CASES[how]
-    code, out, err = bench(*FAILING, f"+renderer.how={how}", *more)
+    code, out, err = isolated(*FAILING, f"+renderer.how={how}", *more)
     record = record_of(out)
     assert code == 1
     assert (record["status"], words in record["reason"]) == (status, True), record["reason"]
@@ -66,24 +50,24 @@ def test_a_run_that_ends_badly_says_how(bench, how):
 
 
 @pytest.mark.parametrize("how", ["loop", "native_loop"])
-def test_a_run_is_stopped_within_a_second_of_its_limit(bench, how):
-    bench(*FAILING, f"+renderer.how={how}", "time_limit=0.3")  # so that the server of processes is there
+def test_a_run_is_stopped_within_a_second_of_its_limit(isolated, how):
+    isolated(*FAILING, f"+renderer.how={how}", "time_limit=0.3")  # so that the server of processes is there
     started = time.perf_counter()
-    _, out, _ = bench(*FAILING, f"+renderer.how={how}", f"time_limit={LIMIT}", "rerun=all")
+    _, out, _ = isolated(*FAILING, f"+renderer.how={how}", f"time_limit={LIMIT}", "rerun=all")
     assert time.perf_counter() - started < LIMIT + 2.0  # with composing, claiming, and the page
     record = record_of(out)
     assert LIMIT < record["seconds"]["total"] < LIMIT + 1.0
 
 
-def test_a_crash_leaves_the_end_of_its_log_in_the_record(bench):
-    _, out, _ = bench(*FAILING, "+renderer.how=raise")
+def test_a_crash_leaves_the_end_of_its_log_in_the_record(isolated):
+    _, out, _ = isolated(*FAILING, "+renderer.how=raise")
     log = "\n".join(record_of(out)["log"])
     assert "Traceback" in log
     assert "RuntimeError: it failed on request" in log
 
 
-def test_without_isolation_it_runs_in_this_process(bench):
-    code, out, _ = bench(*FAILING, "+renderer.how=raise", "isolation=off")
+def test_without_isolation_it_runs_in_this_process(isolated):
+    code, out, _ = isolated(*FAILING, "+renderer.how=raise", "isolation=off")
     assert code == 1
     assert record_of(out)["reason"] == "it failed on request"
 
@@ -94,8 +78,8 @@ def test_without_isolation_it_runs_in_this_process(bench):
     ("isolation=maybe", "isolation"),
     ("rerun=sometimes", "rerun"),
 ])  # fmt: skip
-def test_a_limit_that_cannot_be_is_told(bench, argument, words):
-    code, _, err = bench(*FAILING, argument)
+def test_a_limit_that_cannot_be_is_told(isolated, argument, words):
+    code, _, err = isolated(*FAILING, argument)
     assert code != 0
     assert words in err
     assert len(err.strip().splitlines()) == 1
@@ -137,3 +121,36 @@ def _alive(pid: int) -> bool:
     except OSError:
         return False
     return state != "Z"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 160 KiB, which the pictures of a run fill."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", str(place)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("a small disk cannot be mounted here; it takes a right that this user lacks")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_a_disk_that_fills_up_leaves_a_record_that_says_so(small_disk):
+    arguments = (*FAILING, "+renderer.how=not", "evaluation.picture=256", f"results_dir={small_disk}")
+    done = subprocess.run([sys.executable, "-m", "bench", *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (path,) = small_disk.glob("runs/*/record.json")
+    record = json.loads(path.read_text())
+    assert record["status"] == "crashed"
+    assert "No space left on device" in record["reason"]
+    assert record["metrics"]["chamfer_l2"] > 0  # what was measured before is kept
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_cannot_be_written_is_told(isolated, tmp_path):
+    (tmp_path / "r" / "runs").mkdir(parents=True)
+    (tmp_path / "r" / "runs").chmod(0o500)
+    code, _, err = isolated(*FAILING, "+renderer.how=not")
+    assert code == 1
+    assert "set results_dir to a folder you can write" in err
