@@ -5,6 +5,7 @@ import sys
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from bench.command import unwritten
 from bench.config import register
 from bench.report.html import write_index
 from bench.runner import Interrupted, run
@@ -28,9 +29,7 @@ def run_cell(config: DictConfig) -> str:
             show(error.folder, error.record, write_index(error.folder.parent.parent))
         raise
     except OSError as error:
-        where = f" ({error.filename})" if error.filename else ""
-        remedy = "set results_dir to a folder you can write, or free space"
-        print(f"error: {error.strerror or error}{where}: {remedy}", file=sys.stderr, flush=True)
+        print(f"error: {unwritten(error)}", file=sys.stderr, flush=True)
         return LOST
     if alone:
         show(folder, record, write_index(folder.parent.parent))

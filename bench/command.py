@@ -31,9 +31,11 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     """
     register()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
+    begun: list[DictConfig] = []
     unwritable: list[OSError] = []
 
     def guarded(config: DictConfig) -> None:
+        begun.append(config)
         try:
             job(config)
         except OSError as error:  # Hydra would print a line of its own about it
@@ -56,13 +58,21 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         return _tell(_explain(error), USAGE)
     except OSError as error:
-        where = f" ({error.filename})" if error.filename else ""
-        return _tell(f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space")
-    except Exception as error:  # of a launcher: a cluster that is not there, a worker that is lost
-        if Sweep.plan is None:
+        return _tell(unwritten(error))
+    except Exception as error:
+        what = " ".join(str(error).split())
+        if Sweep.plan is not None:  # a cluster that is not there, a worker that is lost
+            return _tell(f"the launcher stopped: {what}; the same command goes on")
+        if begun:
             raise
-        return _tell(f"the launcher stopped: {' '.join(str(error).split())}; the same command goes on")
+        return _tell(f"cannot compose {' '.join(sys.argv[1:])!r}: {what}", USAGE)  # Hydra, at a value of an odd type
     return 0
+
+
+def unwritten(error: OSError) -> str:
+    """One line on what could not be written, and what to do."""
+    where = f" ({error.filename})" if error.filename else ""
+    return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
 
 
 def _call(program: Callable[[], None]) -> None:

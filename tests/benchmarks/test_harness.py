@@ -1,0 +1,74 @@
+"""What the harness costs: beside a run, per cell, for a large results folder, for a mistake on the command line."""
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bench.records import Record, RunStatus
+from bench.report.html import write_index
+from tests.test_isolation import FAILING, ROOT
+
+CELL = ("renderer=custom", "renderer._target_=tests.failing.Failing", "+renderer.how=not")
+RECORDS = 10_000
+
+
+def seconds_of(results: Path) -> list[dict[str, float]]:
+    return [json.loads(path.read_text())["seconds"] for path in results.glob("runs/*/record.json")]
+
+
+def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
+    """Cells that take 10 s by themselves, in a sweep: what the sweep takes beyond them, a cell."""
+    cells, pause = 4, 1.0
+    arguments = (*FAILING, *CELL[2:], "task.iterations=8", f"+renderer.pause={pause}", "seed=0,1,2,3", "isolation=off")
+    walls = {}
+    for isolation in ("off", "process"):
+        command = [sys.executable, "-m", "bench", "-m", *arguments[:-1], f"isolation={isolation}"]
+        results = tmp_path / isolation
+        started = time.perf_counter()
+        subprocess.run([*command, f"results_dir={results}"], cwd=ROOT, check=False, capture_output=True)
+        walls[isolation] = time.perf_counter() - started, seconds_of(results)
+    inside = {name: sum(s["total"] for s in found) / cells for name, (_, found) in walls.items()}
+    outside = {name: (wall - sum(s["total"] for s in found)) / cells for name, (wall, found) in walls.items()}
+    with capsys.disabled():
+        print(f"\na cell: {inside['off']:.2f} s in the driver's process, {inside['process']:.2f} s in its own")
+        print(
+            f"beside its cells a sweep of {cells} takes, for each: {outside['process']:.2f} s ({outside['off']:.2f} s)"
+        )
+    assert inside["process"] - inside["off"] < 0.01 * inside["off"] + 0.5
+    assert outside["process"] < 0.01 * inside["off"] + 0.5 + 2.0 / cells  # 2 s to start the program
+
+
+def test_ten_thousand_records_index_in_ten_seconds(tmp_path, capsys):
+    config = {"task": {"iterations": 100}, "renderer": {"steps": 50}, "view": {"resolution": 64}, "seed": 0}
+    metrics = {name: 0.5 for name in ("chamfer_l2", "accuracy", "completeness", "fscore", "depth_mae", "mask_iou")}
+    for number in range(RECORDS):
+        folder = tmp_path / "runs" / f"completion-dist-sofa-{number:012x}"
+        folder.mkdir(parents=True)
+        record = Record(folder.name, "completion", "dist", "sofa", number, config, status=RunStatus.OK)
+        record.metrics, record.seconds, record.environment = metrics, {"total": 1.0}, {"cpu": "a", "threads": 2}
+        (folder / "record.json").write_text(json.dumps({"schema": 1, **vars(record)}))
+    started = time.perf_counter()
+    page = write_index(tmp_path)
+    took = time.perf_counter() - started
+    with capsys.disabled():
+        print(f"\n{RECORDS} records: {took:.1f} s, a page of {page.stat().st_size / 2**20:.0f} MiB")
+    assert took < 10
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["rendrer=dist"], ["renderer=dits"]])
+def test_help_and_a_typo_are_answered_within_two_seconds(arguments, capsys):
+    times = []
+    for _ in range(5):
+        started = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "bench", *arguments], cwd=ROOT, check=False, capture_output=True)
+        times.append(time.perf_counter() - started)
+    with capsys.disabled():
+        print(
+            f"\n{arguments[0]}: {statistics.median(times):.2f} s ({min(times):.2f}-{max(times):.2f}, n = {len(times)})"
+        )
+    assert statistics.median(times) < 2
