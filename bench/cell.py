@@ -31,6 +31,8 @@ def run_cell(config: DictConfig) -> str:
     except OSError as error:
         print(f"error: {unwritten(error)}", file=sys.stderr, flush=True)
         return LOST
+    if config.verbose:
+        print("\n".join(record.log), file=sys.stderr, flush=True)
     if alone:
         show(folder, record, write_index(folder.parent.parent))
     return record.status

@@ -53,8 +53,6 @@ def execute(
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
         record.status, record.reason = RunStatus.OOM if out_of_memory else RunStatus.CRASHED, _one_line(error)
         log.error(traceback.format_exc())
-        if config.verbose:
-            traceback.print_exc()
     finally:
         record.environment |= contention.measured()
         record.notes += contention.warnings(record)

@@ -17,7 +17,7 @@ from bench.report.records import read_record
 from bench.run_folder import Claim, claimed, release
 from bench.trackers import Tracker
 
-LAST_LINES, LAST_BYTES = 40, 16_384  # of the log, at most, kept in the record of a run that failed
+LAST_LINES, LAST_BYTES = 80, 16_384  # of the log, at most, kept in the record of a run that failed
 
 
 class Interrupted(KeyboardInterrupt):

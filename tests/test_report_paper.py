@@ -161,6 +161,12 @@ def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path
     assert f"({DYNAMIC})" in caption
 
 
+def test_a_run_with_other_settings_takes_no_row_from_one_that_has_its_label(tmp_path):
+    write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), settings={"renderer": {"steps": 50}})
+    write_run(tmp_path, "table1", DYNAMIC, settings={"renderer": {"steps": 1}}, status="crashed", reason="no luck")
+    assert chosen(tmp_path, "table1").names() == [f"{DYNAMIC} (steps 50)", f"{DYNAMIC} (steps 1)"]
+
+
 def test_times_of_one_machine_are_compared_without_a_word(tmp_path):
     for row in (NAIVE, DYNAMIC):
         write_run(tmp_path, "table1", row, metrics=costs())

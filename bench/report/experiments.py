@@ -35,14 +35,25 @@ class Experiment:
         return self.records[0]["config"]
 
     def names(self) -> list[str]:
-        """A readable name for each record: its row's, with seed and shape where the rows differ in these."""
+        """A readable name for each record: its row's, with seed and shape where the rows differ in these.
+
+        Rows of the same name whose renderers are set in different ways have those settings in their names.
+        """
         seeds, shapes = ({part(record) for record in self.records} for part in (_seed, _index))
         return [
             row_name(record)
+            + self._own_settings(record)
             + (f", seed {_seed(record)}" if len(seeds) > 1 else "")
             + (f", shape {_index(record)}" if len(shapes) > 1 else "")
             for record in self.records
         ]
+
+    def _own_settings(self, record: dict[str, Any]) -> str:
+        alike = [_renderer(other) for other in self.records if row_name(other) == row_name(record)]
+        mine = _renderer(record)
+        keys = [key for key in mine if any(other.get(key) != mine[key] for other in alike)]
+        told = [f"{key.strip('_')} {mine[key]}" for key in keys]
+        return f" ({', '.join(told)})" if told else ""
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
         """The names of the rows by what their times depend on: processor, accelerator, threads."""
@@ -63,7 +74,8 @@ def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Exper
     """The record that was asked for last and those that share all but the row's own with it; None without a record.
 
     What must be shared is the configuration but for `NOT_SHARED`. Rows stand in the order in which they started; a row
-    that was run more than once is its newest record. The rows may be of different machines: captions say so.
+    that was run more than once with the same renderer is its newest record. The rows may be of different machines:
+    captions say so.
     """
     found = [r for r in records if r["config"].get("experiment") == name and r["task"] == TASKS[name]]
     if not found:
@@ -73,7 +85,7 @@ def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Exper
     same = [r for r in found if _shared(r) == last]
     rows: dict[Hashable, dict[str, Any]] = {}
     for record in same:
-        rows[_key(record, name)] = record  # takes the place of the first, with the content of the newest
+        rows[_key(record)] = record  # takes the place of the first, with the content of the newest
     return Experiment(name, results_dir, list(rows.values()), len(found) - len(same))
 
 
@@ -126,9 +138,13 @@ def repeated(records: list[dict[str, Any]]) -> str:
     return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""
 
 
-def _key(record: dict[str, Any], name: str) -> Hashable:
-    epsilon = setting(record["config"], "renderer", "epsilon") if name == "fig7" else None
-    return (row_name(record), _seed(record), _index(record), str(epsilon))
+def _key(record: dict[str, Any]) -> Hashable:
+    return (row_name(record), _seed(record), _index(record), str(sorted(_renderer(record).items())))
+
+
+def _renderer(record: dict[str, Any]) -> dict[str, str]:
+    """The settings of the record's renderer, as words."""
+    return {str(key): str(value) for key, value in (record["config"].get("renderer") or {}).items()}
 
 
 def _seed(record: dict[str, Any]) -> Any:

@@ -13,6 +13,8 @@ from bench.records import Record, RunStatus
 from bench.report.html import write_index
 from tests.test_isolation import FAILING, ROOT
 
+pytestmark = pytest.mark.slow
+
 CELL = ("renderer=custom", "renderer._target_=tests.failing.Failing", "+renderer.how=not")
 RECORDS = 10_000
 
