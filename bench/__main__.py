@@ -4,7 +4,7 @@ import sys
 
 from omegaconf import DictConfig
 
-from bench.command import FAILED, INTERRUPTED, command_line
+from bench.command import FAILED, command_line
 from bench.plan import Sweep
 
 
@@ -19,7 +19,7 @@ def main() -> int:
 
     code = command_line(one)
     plan = Sweep.end()
-    if plan is not None and code != INTERRUPTED:
+    if plan is not None:  # also after Ctrl-C: what was run stands there
         from bench.summary import show_sweep
 
         statuses = show_sweep(plan)

@@ -1,6 +1,7 @@
 """What a command line does with each composed configuration: runs it, and says what became of it."""
 
 import sys
+from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -21,6 +22,7 @@ def run_cell(config: DictConfig) -> str:
         Interrupted: after Ctrl-C or SIGTERM.
     """
     register()  # again, for a worker of a launcher, which has not read the command line
+    _stay_in_place(config)
     alone = OmegaConf.is_missing(HydraConfig.get().job, "num")
     try:
         folder, record = run(config)
@@ -36,3 +38,10 @@ def run_cell(config: DictConfig) -> str:
     if alone:
         show(folder, record, write_index(folder.parent.parent))
     return record.status
+
+
+def _stay_in_place(config: DictConfig) -> None:
+    """A worker that was started elsewhere has another working directory: results go where the driver's are."""
+    driver = Path(HydraConfig.get().runtime.cwd)
+    if driver != Path.cwd():
+        config.results_dir = str(driver / config.results_dir)

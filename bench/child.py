@@ -42,9 +42,10 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     channel.send(Started())
     try:
         execute(job.config, job.folder, job.record, progress=_Telling(channel), checkpoint=channel.send)
-    except KeyboardInterrupt:  # the parent knows why; it still takes what there is
-        channel.send(job.record)
-        return
+    except KeyboardInterrupt:
+        channel.send(job.record)  # what there is; then it ends as one that was told to, whoever told it
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
     channel.send(job.record)
     channel.send(Ended())
 

@@ -73,18 +73,20 @@ def _package(name: str) -> str:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         return ""
-    if spec is None or spec.origin is None:
+    if spec is None:
         return ""
-    origin = Path(spec.origin)
-    files = sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
+    if spec.submodule_search_locations is not None:
+        files = [path for folder in spec.submodule_search_locations for path in sorted(Path(folder).rglob("*.py"))]
+    else:  # a module, with those beside it that it may import
+        files = sorted(Path(spec.origin or "").parent.glob("*.py"))
     return digest([_content(path) for path in files])
 
 
 def _content(path: Path) -> str:
     """Of a file's name and bytes, or of all files of a folder; empty where there is none."""
-    if path.is_dir():
-        return digest([_content(child) for child in sorted(path.iterdir()) if child.is_file()])
     try:
+        if path.is_dir():
+            return digest([_content(child) for child in sorted(path.iterdir()) if child.is_file()])
         return digest([path.name, hashlib.sha256(path.read_bytes()).hexdigest()])
     except OSError:
         return ""

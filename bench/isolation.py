@@ -19,6 +19,8 @@ LOOK = 0.05  # seconds between two looks at clock and memory
 GRACE = 0.5  # seconds that a child which is asked to stop has to hand over what it knows
 BOOT = 120.0  # seconds in which a child must be there; a cold disk is slow
 GIB = 2**30
+# Signals that somebody sends, such as a user, a batch system or the system where memory runs out.
+TOLD = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ def _watch(
         memory = psutil.Process(process.pid)
     while True:
         wait([channel, process.sentinel], timeout=LOOK)
+        alive = process.is_alive()  # before its last words are taken: else they could come in between
         while channel.poll():
             try:
                 message = channel.recv()
@@ -103,7 +106,7 @@ def _watch(
             if isinstance(message, Started):
                 begun, ready = time.perf_counter(), True
             receive(message)
-        if not process.is_alive():
+        if not alive:
             return _died(process)
         spent = time.perf_counter() - begun
         if ready and limits.seconds is not None and spent > limits.seconds:
@@ -137,7 +140,7 @@ def _died(process: BaseProcess) -> Ending:
     if code >= 0:
         return Ending(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
     name = signal.Signals(-code).name
-    if -code in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT):
+    if -code in TOLD:
         hint = "; where memory ran out, the system does that" if -code == signal.SIGKILL else ""
         return Ending(RunStatus.KILLED, f"its process was ended by {name}{hint}")
     return Ending(RunStatus.CRASHED, f"its process died of {name} in native code")

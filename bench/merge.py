@@ -14,8 +14,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.records import alone
+from bench.records import alone, write_text
 from bench.report.html import write_index
+from bench.report.records import read_record
 from bench.run_folder import content_of, put_into, set_aside
 
 UNFINISHED = ("killed", "crashed")  # these rank below every other status, and ok above
@@ -35,7 +36,10 @@ class Attempt:
     @cached_property
     def record(self) -> dict[str, Any]:
         """Its record; empty where it cannot be read."""
-        return _json(self.folder / "record.json")
+        try:
+            return read_record(self.folder)
+        except (OSError, ValueError, RecursionError):
+            return {}
 
     @property
     def rank(self) -> tuple[Any, ...]:
@@ -53,11 +57,15 @@ def merge(sources: list[Path], into: Path) -> list[str]:
     """Copies all runs and plans of the sources, and gives a line for each cell that has more than one run.
 
     Raises:
-        ValueError: for a source that is not a results folder.
+        ValueError: for a source that is not a results folder, or that holds the place where all should go.
     """
     for source in sources:
         if not (source / "runs").is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
+    sources, into = [source.resolve() for source in sources], into.resolve()
+    for source in sources:
+        if source in into.parents:
+            raise ValueError(f"{into} lies within {source}: give --into a folder outside of what it joins")
     (into / "runs").mkdir(parents=True, exist_ok=True)
     cells: dict[str, dict[str, Attempt]] = {}
     for results in dict.fromkeys([*sources, into]):
@@ -91,10 +99,11 @@ def _place(cell: str, attempts: list[Attempt], into: Path) -> str:
         if best.folder != place:
             kept = content_of(place) if place.exists() else ""
             if kept == best.content:  # the same run, but this one was asked for later
-                shutil.copyfile(best.folder / "record.json", place / "record.json")
+                write_text(place / "record.json", (best.folder / "record.json").read_text(encoding="utf-8"))
             else:
                 set_aside(place, into / "earlier")
                 put_into(place, best.folder)
+        shutil.rmtree(into / "earlier" / f"{cell}-{best.content}", ignore_errors=True)  # it has its place now
     if not others:
         return ""
     told = [f"{attempt.record.get('status', 'unreadable')} of {attempt.record.get('started')}" for attempt in attempts]
@@ -116,7 +125,7 @@ def _copy_plans(source: Path, into: Path) -> None:
 def _json(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return data if isinstance(data, dict) else {}
 

@@ -116,13 +116,15 @@ def make_plan(config: DictConfig) -> Plan:
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task]
     overrides = OverridesParser.create(config_loader=loader).parse_overrides(texts)
-    cells = []
+    cells: list[PlannedCell] = []
     for cell in BasicSweeper.split_arguments(overrides, None)[0]:
         composed = loader.load_sweep_config(config, cell)
         identity = identify(_without_hydra(composed), composed.hydra.runtime.choices)
         cells.append(
             PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
         )
+    if not cells:
+        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
     first = cells[0].config
     name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
     return Plan(name, Path(first["results_dir"]), cells)
@@ -145,13 +147,16 @@ def followed(plan: Plan) -> Iterator[None]:
         progress = shown.add_task("sweep", total=len(plan.cells), said="")
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
 
+        common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
+
         def look() -> None:
             nonlocal failed
             for cell in list(pending.values()):
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    print(line(plan.results_dir / "runs" / cell.id, record), flush=True)
+                    own = [override for override in cell.overrides if override not in common]
+                    print(line(plan.results_dir / "runs" / cell.id, record, " ".join(own)), flush=True)
             shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
 
         def follow() -> None:
@@ -169,15 +174,16 @@ def followed(plan: Plan) -> Iterator[None]:
             shown.remove_task(progress)
 
 
-def line(folder: Path, record: dict[str, Any]) -> str:
-    """What a cell came to, in a line that ends with its folder."""
+def line(folder: Path, record: dict[str, Any], own: str) -> str:
+    """What a cell came to, in a line that ends with its folder; `own` is what tells it from the others."""
     name, spent = record["config"].get("label") or record["renderer"], record["seconds"]
     loop = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
     parts = [
         record["status"] + (" (reused)" if record["reused"] else ""),
+        own,
         ", ".join((record["task"], name, record["scene"] or record["dataset"])),
         seconds(loop),
     ]
     if "chamfer_l2" in record["metrics"]:
         parts.append(f"Chamfer (x1000) {number(record['metrics']['chamfer_l2'], 1000.0)}")
-    return "  ".join([*parts, *([record["reason"]] if record["reason"] else []), str(folder)])
+    return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)

@@ -110,7 +110,7 @@ def write_text(path: Path, text: str) -> None:
 
 def to_json(data: Any) -> str:
     """JSON in which the floats that it lacks stand as the strings "inf", "-inf" and "nan"."""
-    return json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
 
 
 def plain(value: Any) -> Any:
@@ -119,6 +119,8 @@ def plain(value: Any) -> Any:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
+    if not isinstance(value, str | int | float | None) and hasattr(value, "item"):
+        value = value.item()  # a number of NumPy's or PyTorch's
     if isinstance(value, float) and not isfinite(value):
         return str(value)
     return value

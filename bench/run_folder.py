@@ -13,10 +13,11 @@ from typing import Any
 from bench.config import Rerun
 from bench.identity import Identity
 from bench.records import RunStatus, alone, to_json
-from bench.report.records import read_record
+from bench.report.records import NEUTRAL_KEYS, read_record
 
 RESERVE = 64 * 1024  # bytes that are kept, so that a record can be written to a disk that has become full
 RESERVED = ".reserve"
+DECIDING = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun"}  # whether a run that failed would fail again
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,17 @@ def reusable(folder: Path, identity: Identity, rerun: Rerun) -> dict[str, Any] |
         return None
     try:
         record = read_record(folder)
+        status = RunStatus(record["status"])
     except (OSError, ValueError, RecursionError):
         return None
     same = (record.get("config_hash"), record.get("code")) == (identity.config_hash, identity.code)
-    again = (RunStatus.KILLED,) if rerun == Rerun.none else tuple(set(RunStatus) - {RunStatus.OK})
-    return record if same and record["status"] not in again else None
+    if not same or not record.get("ended") or status == RunStatus.KILLED:
+        return None
+    if status != RunStatus.OK:
+        # What changes no result may well decide a failure, such as a limit.
+        limits = [{key: config.get(key) for key in DECIDING} for config in (record["config"], identity.config)]
+        return record if rerun == Rerun.none and limits[0] == limits[1] else None
+    return record
 
 
 def set_aside(folder: Path, earlier: Path) -> None:
@@ -98,7 +105,7 @@ def _without_asking(content: bytes) -> bytes:
     try:
         record = json.loads(content)
         return to_json({key: value for key, value in record.items() if key not in ("asked", "reused")}).encode()
-    except (ValueError, AttributeError):  # damaged: as it is
+    except (ValueError, AttributeError, RecursionError):  # damaged: as it is
         return content
 
 

@@ -65,8 +65,8 @@ def run(config: DictConfig) -> tuple[Path, Record]:
                 record.log = _last_lines(claim.folder / "log.txt")
             release(claim.folder)
             record.write(claim.folder)
-    if tracker is not None:
-        _export(tracker, claim.folder, record)
+        if tracker is not None:
+            _export(tracker, claim.folder, record)
     if interrupted:
         raise Interrupted(claim.folder, record)
     return claim.folder, record

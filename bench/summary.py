@@ -62,7 +62,7 @@ def show_sweep(plan: Plan) -> list[str]:
     counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
     print(f"{len(plan.cells)} planned: {counts}")
     if set(statuses) - {"ok", "unsupported"}:
-        print("failed cells are tried again by the same command with rerun=failed, those that were not run by itself")
+        print("the same command runs what was not run or was killed; with rerun=failed, also what failed")
     print(f"report: {write_index(plan.results_dir)}")
     print(plan.folder)
     return statuses

@@ -58,6 +58,12 @@ def _kill(rendering: Rendering) -> Rendering:
     return rendering
 
 
+def _terminate(rendering: Rendering) -> Rendering:
+    os.kill(os.getpid(), signal.SIGTERM)  # as a batch system does
+    time.sleep(10)
+    return rendering
+
+
 def _segfault(rendering: Rendering) -> Rendering:
     ctypes.string_at(0)
     return rendering
@@ -77,6 +83,7 @@ FAILURES = {
     "native_loop": _native_loop,
     "leave": _leave,
     "kill": _kill,
+    "terminate": _terminate,
     "segfault": _segfault,
     "hog": _hog,
 }

@@ -25,6 +25,7 @@ CASES = {
     "native_loop": ((f"time_limit={LIMIT}",), "timeout", f"more than time_limit={LIMIT:g} s"),
     "leave": ((), "crashed", "ended by itself, with exit status 0"),
     "kill": ((), "killed", "ended by SIGKILL"),
+    "terminate": ((), "killed", "ended by SIGTERM"),
     "segfault": ((), "crashed", "died of SIGSEGV in native code"),
     "hog": (("memory_limit=1.5",), "oom", "more than 1.5 GiB"),
 }

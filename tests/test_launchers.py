@@ -1,6 +1,7 @@
 """Sweeps are planned before they start, and have a row for every cell under every launcher."""
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -71,6 +72,21 @@ def test_every_planned_cell_is_a_row_whatever_becomes_of_it(tmp_path, launcher):
         assert threads == {1}
 
 
+@pytest.mark.parametrize("launcher", ["basic", "workers", "submitit_local"])
+def test_where_no_run_folder_can_be_made_every_planned_cell_is_still_a_row(tmp_path, launcher):
+    if not available(launcher):
+        pytest.skip(f"the plugin of {launcher} is not installed: pip install -e '.[joblib,submitit,ray]'")
+    (tmp_path / "runs").touch()  # where a folder should be
+    done = sweep(tmp_path, f"hydra/launcher={launcher}", "+renderer.how=not,raise")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "2 planned: 2 not_run" in done.stdout
+    if launcher != "submitit_local":  # whose jobs have a log of their own
+        assert done.stderr.count("set results_dir to a folder you can write") == 2
+    records, _ = read_records(tmp_path)
+    assert [record["status"] for record in records] == ["not_run"] * 2
+
+
 def test_limits_hold_in_a_sweep(tmp_path):
     done = sweep(tmp_path, "+renderer.how=loop,native_loop,not", "time_limit=1.5")
     statuses = {r["config"]["renderer"]["how"]: r["status"] for r in read_records(tmp_path)[0]}
@@ -103,3 +119,24 @@ def test_a_cell_that_cannot_be_composed_stops_the_sweep_before_it_starts(tmp_pat
     assert done.returncode == 2
     assert done.stderr.strip() == "error: unknown scale 'smok': did you mean smoke or desk?"
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_sweep_that_is_stopped_says_what_it_came_to(tmp_path):
+    command = [sys.executable, "-m", "bench", "-m", *FAILING, "+renderer.how=not", "+renderer.pause=1", "seed=0,1,2"]
+    driver = subprocess.Popen([*command, f"results_dir={tmp_path}"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    latest = time.perf_counter() + 60
+    while not list(tmp_path.glob("runs/*/record.json")) and time.perf_counter() < latest:
+        time.sleep(0.02)
+    driver.send_signal(signal.SIGINT)
+    out, _ = driver.communicate(timeout=30)
+    assert driver.returncode == 130
+    assert "3 planned: 2 not_run, 1 killed" in out
+    assert Path(out.splitlines()[-1]) == next(tmp_path.glob("sweeps/*/plan.json")).parent
+    assert (tmp_path / "index.html").is_file()
+
+
+def test_a_sweep_of_nothing_is_told(tmp_path):
+    done = sweep(tmp_path, "seed=range(0,0)")
+    assert done.returncode == 2
+    assert "error: the sweep has no cell" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

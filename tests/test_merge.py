@@ -130,3 +130,11 @@ def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path, damage)
 def test_what_is_no_results_folder_is_told(tmp_path, capsys):
     assert main([str(tmp_path), "--into", str(tmp_path / "d")]) == 1
     assert "is not a results folder" in capsys.readouterr().err
+
+
+def test_a_place_within_what_is_joined_is_refused(tmp_path, capsys):
+    write_run(tmp_path / "a", CELLS[0])
+    before = content(tmp_path / "a")
+    assert main([str(tmp_path / "a"), "--into", str(tmp_path / "a" / "runs" / "x")]) == 1
+    assert "lies within" in capsys.readouterr().err
+    assert content(tmp_path / "a") == before

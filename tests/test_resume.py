@@ -1,5 +1,6 @@
 """A sweep that is cut short goes on where it was; what is finished is reused, and nothing is lost or run twice."""
 
+import json
 import os
 import random
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.identity import _package
 from bench.report.records import read_records
 from tests.test_isolation import FAILING, ROOT
 from tests.test_launchers import UNHEARD, sweep
@@ -97,3 +99,48 @@ def test_two_launches_at_once_run_a_cell_once(tmp_path):
     assert len({output.splitlines()[-1] for output in outputs}) == 1
     assert sorted("reused: the run of" in output for output in outputs) == [False, True]
     assert len(read_records(tmp_path)[0]) == 1
+
+
+def test_what_had_not_quite_ended_is_not_reused(isolated, tmp_path):
+    """The driver may be killed after a run's last word, and before it wrote what that came to."""
+    isolated(*FAILING, "+renderer.how=not")
+    (path,) = (tmp_path / "r").glob("runs/*/record.json")
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"ended": ""}))
+    _, out, _ = isolated(*FAILING, "+renderer.how=not")
+    assert "reused" not in out
+    assert json.loads(path.read_text())["ended"]
+
+
+@pytest.mark.parametrize("damage", ["", "{", '{"schema": 99}', '{"schema": 1, "asked": null}', "[" * 100_000])
+def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path, damage):
+    isolated(*FAILING, "split=tst")  # fails at once
+    (path,) = (tmp_path / "r").glob("runs/*/record.json")
+    path.write_text(damage)
+    code, out, err = isolated(*FAILING, "split=tst")
+    assert code == 1
+    assert "Traceback" not in out + err
+    assert json.loads(path.read_text())["status"] == "crashed"
+    (aside,) = (tmp_path / "r" / "earlier").iterdir()
+    assert (aside / "record.json").read_text() == damage
+
+
+def test_a_run_that_failed_by_a_limit_is_run_again_under_another(isolated, tmp_path):
+    statuses = []
+    for limit in (0.2, 0.2, 60):
+        _, out, _ = isolated(*FAILING, "+renderer.how=not", "+renderer.pause=0.1", f"time_limit={limit}")
+        record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+        statuses.append((record["status"] == "timeout", record["reused"]))
+    assert statuses == [(True, False), (True, True), (False, False)]
+
+
+def test_code_that_a_package_without_an_init_holds_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "space" / "inner").mkdir(parents=True)
+    module = tmp_path / "space" / "inner" / "mine.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = set()
+    for text in ("a = 1", "a = 2"):
+        module.write_text(text)
+        _package.cache_clear()
+        found.add(_package("space"))
+    assert len(found - {""}) == 2

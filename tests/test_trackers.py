@@ -27,6 +27,7 @@ def finished(tmp_path) -> Path:
         "seconds": {"total": 12.5}, "peak_memory_bytes": None, "flops": 10, "gemm_fraction": 0.5,
     }  # fmt: skip
     (folder / "record.json").write_text(json.dumps(record))
+    (folder / "summary.png").write_bytes(b"a picture")
     lines = [{"iteration": 0, "seconds": 0.1, "total": 3.0}, {"iteration": 1, "seconds": 0.2, "total": "nan"}]
     (folder / "curve.jsonl").write_text("\n".join(map(json.dumps, [*lines, {"iteration": 2, "total": 1.0}])))
     return folder
@@ -50,7 +51,7 @@ def test_a_run_without_a_curve_has_none(tmp_path):
 def test_mlflow_has_the_run(finished, tmp_path):
     mlflow = pytest.importorskip("mlflow", reason="MLflow is not installed: pip install -e '.[mlflow]'")
     uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
-    MLflow(uri, "ours").export(finished, read_record(finished))
+    MLflow(uri, "ours", str(tmp_path / "pictures")).export(finished, read_record(finished))
     client = mlflow.MlflowClient(tracking_uri=uri)
     (run,) = client.search_runs([client.get_experiment_by_name("ours").experiment_id])
     assert run.info.run_name == finished.name
@@ -59,6 +60,8 @@ def test_mlflow_has_the_run(finished, tmp_path):
     assert run.data.tags["status"] == "ok"
     assert run.data.params["renderer.steps"] == "50"
     assert run.data.metrics["metrics.chamfer_l2"] == 0.002
+    assert [item.path for item in client.list_artifacts(run.info.run_id)] == ["summary.png"]
+    assert list((tmp_path / "pictures").rglob("summary.png"))
     history = client.get_metric_history(run.info.run_id, "curve.total")
     assert sorted((point.step, point.value) for point in history) == [(0, 3.0), (2, 1.0)]
 
@@ -78,7 +81,7 @@ def test_tensorboard_has_the_run(finished, tmp_path):
 def test_a_tracker_that_is_not_installed_is_told_before_the_run(monkeypatch, cls, package):
     monkeypatch.setattr(sys.modules[cls.__module__], "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=rf"pip install -e '\.\[{package}\]'"):
-        cls(*("sqlite:///x.db", "e") if cls is MLflow else ("folder",))
+        cls(*("sqlite:///x.db", "e", "a") if cls is MLflow else ("folder",))
 
 
 def test_a_tracker_that_fails_is_noted_and_costs_no_run(isolated, monkeypatch):

@@ -1,6 +1,7 @@
 """The cells of all plans that have no record: rows too, so that a sweep that was cut short shows what it lacks."""
 
 import json
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ def read_planned(results_dir: Path, known: set[str]) -> tuple[list[dict[str, Any
             plan = json.loads(path.read_text(encoding="utf-8"))
             if plan["schema"] != SCHEMA:
                 raise ValueError(f"schema must be {SCHEMA}, found {plan['schema']!r}")
+            datetime.fromisoformat(plan["asked"])
             missing |= {cell["id"]: _stand_in(cell, plan) for cell in plan["cells"] if cell["id"] not in known}
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             problems.append(f"sweeps/{path.parent.name}/plan.json: {error!r}")

@@ -23,6 +23,7 @@ _FIELDS: dict[str, type | tuple[type, ...]] = {
     "status": str,
     "reason": str,
     "started": str,
+    "asked": str,
     "config": dict,
     "metrics": dict,
     "metrics_start": dict,

@@ -20,10 +20,12 @@ class MLflow:
     Args:
         uri: such as sqlite:///results/mlflow.db, or a server's address.
         experiment: name of MLflow's experiment.
+        artifacts: folder for the pictures, used when the experiment is made.
     """
 
     uri: str
     experiment: str
+    artifacts: str
 
     def __post_init__(self) -> None:
         if find_spec("mlflow") is None:  # now, not after a night of runs
@@ -35,7 +37,10 @@ class MLflow:
 
         client = MlflowClient(tracking_uri=self.uri)
         known = client.get_experiment_by_name(self.experiment)
-        experiment = known.experiment_id if known else client.create_experiment(self.experiment)
+        place = Path(self.artifacts).resolve().as_uri()
+        experiment = (
+            known.experiment_id if known else client.create_experiment(self.experiment, artifact_location=place)
+        )
         begun = int(started(record).timestamp() * 1000)
         tags = {"mlflow.runName": record["id"], "status": record["status"], "reason": record["reason"]}
         run = client.create_run(experiment, start_time=begun, tags=tags).info.run_id
