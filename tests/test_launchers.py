@@ -72,6 +72,20 @@ def test_every_planned_cell_is_a_row_whatever_becomes_of_it(tmp_path, launcher):
         assert threads == {1}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
+    if not available(launcher):
+        pytest.skip(f"the plugin of {launcher} is not installed: pip install -e '.[joblib,submitit,ray]'")
+    limits = ("time_limit=10", "memory_limit=1.5")
+    sweep(tmp_path, f"hydra/launcher={launcher}", f"+renderer.how={','.join(CASES)}", *limits)
+    records, problems = read_records(tmp_path)
+    assert problems == []
+    found = {record["config"]["renderer"]["how"]: record["status"] for record in records}
+    assert found == {how: status for how, (_, status, _) in CASES.items()}
+    assert len(plan_of(tmp_path)["cells"]) == len(records) == len(CASES)
+
+
 @pytest.mark.parametrize("launcher", ["basic", "workers", "submitit_local"])
 def test_where_no_run_folder_can_be_made_every_planned_cell_is_still_a_row(tmp_path, launcher):
     if not available(launcher):
