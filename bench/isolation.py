@@ -65,9 +65,7 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["bench.child"])  # so that a child has torch from its first moment
     channel, childs = context.Pipe()
-    alive, ours = context.Pipe(
-        duplex=False
-    )  # the child watches its end: it closes with this process, however that ends
+    alive, ours = context.Pipe(duplex=False)  # the child watches: it closes with this process, however that ends
     process = context.Process(target=_enter, args=(job, childs, alive))
     with channel, ours:
         process.start()

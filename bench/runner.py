@@ -3,6 +3,7 @@
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -38,38 +39,48 @@ def run(config: DictConfig) -> tuple[Path, Record]:
     identity = identify(config, HydraConfig.get().runtime.choices)
     with claimed(Path(config.results_dir), identity, config.rerun) as claim:
         if claim.finished is not None:
-            record = Record.of(claim.finished)
-            record.reused, record.asked = True, now()
-            with suppress(OSError):  # it can be read, which is enough
-                record.write(claim.folder)
-            return claim.folder, record
+            return claim.folder, _reuse(claim.folder, claim.finished)
         record = _new_record(identity, claim)
-        record.write(claim.folder)
-        started, interrupted, tracker = time.perf_counter(), False, None
-        try:
-            limits = RunLimits(config.time_limit, config.memory_limit)
-            tracker = build(config.tracker, "tracker", list(config.packages))
-            write_text(claim.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-            with run_progress(record.name) as progress:
-                _carry_out(Job(config, claim.folder, record), limits, progress)
-        except KeyboardInterrupt as error:
-            who = str(error) or "stopped by Ctrl-C"
-            record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
-            interrupted = True
-        except Exception as error:  # noqa: BLE001 - of the harness: a full disk, a limit that cannot be
-            record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
-        finally:
-            record.seconds["total"] = time.perf_counter() - started
-            record.ended = now()
-            if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
-                record.log = _last_lines(claim.folder / "log.txt")
-            release(claim.folder)
-            record.write(claim.folder)
-        if tracker is not None:
-            _export(tracker, claim.folder, record)
+        return claim.folder, _run_anew(config, claim.folder, record)
+
+
+def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
+    """The record of a finished run, with its times, marked as reused."""
+    record = Record.of(finished)
+    record.reused, record.asked = True, now()
+    with suppress(OSError):  # it can be read, which is enough
+        record.write(folder)
+    return record
+
+
+def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
+    """Runs a configuration, whose record says under way until it says how the run ended."""
+    record.write(folder)
+    started, interrupted, tracker = time.perf_counter(), False, None
+    try:
+        limits = RunLimits(config.time_limit, config.memory_limit)
+        tracker = build(config.tracker, "tracker", list(config.packages))
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+        with run_progress(record.name) as progress:
+            _carry_out(Job(config, folder, record), limits, progress)
+    except KeyboardInterrupt as error:
+        who = str(error) or "stopped by Ctrl-C"
+        record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
+        interrupted = True
+    except Exception as error:  # noqa: BLE001 - of the harness: a full disk, a limit that cannot be
+        record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
+    finally:
+        record.seconds["total"] = time.perf_counter() - started
+        record.ended = now()
+        if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
+            record.log = _last_lines(folder / "log.txt")
+        release(folder)
+        record.write(folder)
+    if tracker is not None:
+        _export(tracker, folder, record)
     if interrupted:
-        raise Interrupted(claim.folder, record)
-    return claim.folder, record
+        raise Interrupted(folder, record)
+    return record
 
 
 def _carry_out(job: Job, limits: RunLimits, progress: Report) -> None:
