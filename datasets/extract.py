@@ -1,15 +1,25 @@
 """From a field to a mesh."""
 
+from collections.abc import Callable
+
+import numpy as np
 import torch
+from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 
 from datasets.mesh import Mesh
-from renderers.field import Field
+from renderers.field import Field, Kind
+
+BLOCK = 4  # samples a side of the blocks that are left out where the surface is far
+MARGIN = 2.0  # a field may overshoot the distance this many times before a part of its surface can be left out
+CHUNK = 65536  # points asked at once
 
 
 @torch.no_grad()
 def extract(field: Field, *, grid: int, reach: float, device: torch.device | str = "cpu") -> Mesh | None:
     """The zero set by marching cubes, wound outward; None where the samples have one sign.
+
+    A field of distances, or a bound of them, is asked only near its surface, see `_near_values`; another everywhere.
 
     Args:
         field: what to sample.
@@ -17,11 +27,56 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
         reach: half the side of the sampled cube about the origin. A surface that leaves it is left open.
         device: where the field's tensors are.
     """
-    axis = torch.linspace(-reach, reach, grid, device=device)
-    slabs = [field(torch.stack(torch.meshgrid(x[None], axis, axis, indexing="ij"), dim=-1)).cpu() for x in axis]
-    values = torch.cat(slabs).float().numpy()
+
+    def ask(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        places = torch.from_numpy(points.astype(np.float32)).to(device)
+        return torch.cat([field(chunk).float().cpu() for chunk in places.split(CHUNK)]).numpy()
+
+    axis = torch.linspace(-reach, reach, grid).numpy()
+    if field.kind is Kind.LEVEL or grid < 2 * BLOCK:
+        values = ask(_places(np.arange(grid**3), axis)).reshape(grid, grid, grid)
+    else:
+        values = _near_values(ask, axis)
     if not (values.min() < 0 < values.max()):
         return None
     spacing = 2 * reach / (grid - 1)
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
     return Mesh(vertices - reach, faces)
+
+
+def _near_values(
+    ask: Callable[[np.ndarray], np.ndarray], axis: Float[np.ndarray, " grid"]
+) -> Float[np.ndarray, "grid grid grid"]:
+    """Values that are right near the surface and have the right sign elsewhere.
+
+    A block whose middle is farther from the surface than its corners can be is not sampled: it takes the value of its
+    middle. Where signs then differ across a block's side, a surface has been followed to it, and it is sampled too.
+    """
+    grid, spacing = len(axis), axis[1] - axis[0]
+    block_of = np.arange(grid) // BLOCK
+    middles = np.array([axis[block_of == block].mean() for block in range(block_of[-1] + 1)], dtype=np.float32)
+    coarse = ask(_places(np.arange(len(middles) ** 3), middles)).reshape((len(middles),) * 3)
+    near = ~(np.abs(coarse) > MARGIN * np.sqrt(3) * (BLOCK + 1) / 2 * spacing)  # what is not a number is near, too
+    values = coarse[np.ix_(block_of, block_of, block_of)]
+    known = np.zeros(near.shape, dtype=bool)
+    while (near & ~known).any():
+        wanted = (near & ~known)[np.ix_(block_of, block_of, block_of)]
+        values[wanted] = ask(_places(np.flatnonzero(wanted), axis))
+        known |= near
+        for first, second in _crossings(values < 0):
+            near[tuple((first // BLOCK).T)] = near[tuple((second // BLOCK).T)] = True
+    return values
+
+
+def _crossings(inside: np.ndarray) -> list[tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]]:
+    """Pairs of neighbouring samples of different sign, along each axis."""
+    pairs = []
+    for step in np.eye(3, dtype=int):
+        first = np.argwhere(np.diff(inside, axis=int(step.argmax())))
+        pairs.append((first, first + step))
+    return pairs
+
+
+def _places(flat: Int[np.ndarray, " n"], axis: Float[np.ndarray, " grid"]) -> Float[np.ndarray, "n 3"]:
+    """The points of a cube's samples, given by their flat numbers."""
+    return np.stack([axis[i] for i in np.unravel_index(flat, (len(axis),) * 3)], axis=-1)

@@ -1,9 +1,11 @@
 """From fields with a known zero set to meshes."""
 
+import numpy as np
 import pytest
 import torch
 
 from datasets.extract import extract
+from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import Decoder
 
@@ -46,3 +48,22 @@ def test_a_network_is_sampled_without_a_graph():
     field = decoder.at(torch.zeros(0))
     middle = field(torch.zeros(1, 3)).item()
     assert extract(Shape(lambda p: field(p) - middle), grid=12, reach=1.0) is not None
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
+def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_lost(scale):
+    # a thin plate and a small ball apart from it; a field that grows three times too fast is followed from block to block
+    shape = box((0.8, 0.03, 0.6)) | sphere(0.1, (0.0, 0.7, 0.0))
+    counted = Meter(Shape(lambda p: scale * shape(p), Kind.BOUND))
+    near = extract(counted, grid=96, reach=1.05)
+    everywhere = extract(Shape(lambda p: scale * shape(p), Kind.LEVEL), grid=96, reach=1.05)
+    assert np.array_equal(near.vertices, everywhere.vertices) and np.array_equal(near.faces, everywhere.faces)
+    assert scale < 1 or counted.counts.value < 96**3 / 4
+
+
+def test_a_surface_that_leads_out_of_the_asked_blocks_is_followed():
+    # true near a ball about the origin alone, twenty times too large elsewhere: only following finds the rod's far end
+    rod = box((0.9, 0.08, 0.08))
+    steep = Shape(lambda p: rod(p) * torch.where(p.norm(dim=-1) < 0.4, 1.0, 20.0), Kind.BOUND)
+    mesh = extract(steep, grid=64, reach=1.05)
+    assert mesh.watertight and mesh.vertices[:, 0].max() == pytest.approx(0.9, abs=0.02)
