@@ -52,7 +52,7 @@ def test_a_network_is_sampled_without_a_graph():
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
 def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_lost(scale):
-    # a thin plate and a small ball apart from it; a field that grows three times too fast is followed from block to block
+    # a thin plate and a small ball apart from it; a field three times too steep is followed from block to block
     shape = box((0.8, 0.03, 0.6)) | sphere(0.1, (0.0, 0.7, 0.0))
     counted = Meter(Shape(lambda p: scale * shape(p), Kind.BOUND))
     near = extract(counted, grid=96, reach=1.05)
