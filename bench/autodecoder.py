@@ -100,12 +100,24 @@ def distance_samples(
     """
     points, distances = [], []
     for index in range(shapes):
-        mesh = dataset.mesh(split, index)
-        where = _sample_points(mesh, settings.samples, seed=settings.seed + index)
-        points.append(torch.from_numpy(where.astype(np.float32)))
-        distances.append(torch.from_numpy(Truth(mesh).signed_distance(where)))
+        where, distance = sample_distances(dataset.mesh(split, index), settings.samples, settings.seed + index)
+        points.append(where)
+        distances.append(distance)
         progress(f"{split} shapes", index + 1, shapes)
     return DistanceSamples(torch.stack(points), torch.stack(distances))
+
+
+def sample_distances(mesh: Mesh, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, " count"]]:
+    """Points mostly near a mesh's surface, and their signed distances, in scene units."""
+    where = _sample_points(mesh, count, seed)
+    return torch.from_numpy(where.astype(np.float32)), torch.from_numpy(Truth(mesh).signed_distance(where))
+
+
+def near_surface_first(
+    error: Float[Tensor, "*batch"], distance: Float[Tensor, "*batch"], width: float
+) -> Float[Tensor, "*batch"]:
+    """Errors weighted by width / (width + |distance|), so that the surface counts most."""
+    return error * width / (width + distance.abs())
 
 
 def train(samples: DistanceSamples, settings: PriorSettings, device: torch.device, progress: Report) -> Prior:
@@ -128,8 +140,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         picked = torch.randint(count, (rows, settings.points_per_step), device=device)
         points, distances = samples.points[chosen[:, None], picked], samples.distances[chosen[:, None], picked]
         error = (decoder.at(codes[chosen])(points) - distances).abs()
-        weight = settings.surface_width / (settings.surface_width + distances.abs())
-        loss = (weight * error).mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
+        weighted = near_surface_first(error, distances, settings.surface_width)
+        loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

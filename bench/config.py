@@ -23,6 +23,7 @@ LEAST = {
     "evaluation.picture": 4,
     "evaluation.every": 1,
 }
+DOUBLING = "doubling"
 RESERVED = ("_target_", "_package_")  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
 
@@ -58,7 +59,16 @@ class EvaluationSettings:
     points: int = MISSING
     fscore_threshold: float = MISSING
     picture: int = MISSING
-    every: int | None = MISSING
+    every: int | str | None = MISSING
+
+    def looks(self, iterations: int) -> set[int]:
+        """The iterations, counted from 0, whose Chamfer distance is looked at: with the first also the last."""
+        if self.every is None:
+            return set()
+        last = iterations - 1
+        if self.every == DOUBLING:
+            return {0, last} | {2**power for power in range(last.bit_length()) if 2**power < last}
+        return {*range(0, last, int(self.every)), last}
 
 
 @dataclass
@@ -102,9 +112,11 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError(f"split must be one of {', '.join(Split)}, not {config.split!r}")
     if not config.evaluation.fscore_threshold > 0:
         raise ValueError(f"evaluation.fscore_threshold must be positive, not {config.evaluation.fscore_threshold}")
+    if isinstance(config.evaluation.every, str) and config.evaluation.every != DOUBLING:
+        raise ValueError(f"evaluation.every must be {DOUBLING}, a number or null, not {config.evaluation.every!r}")
     for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
-        if value is not None and value < least:
+        if isinstance(value, int) and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
 
 

@@ -30,15 +30,32 @@ def judge(field: Field, stage: Stage) -> Judgement:
 
     A field means nothing outside the unit sphere, where no prior was trained: it is cut off there.
     """
-    settings, truth = stage.evaluation, stage.scene.view
-    inside = Shape(field, field.kind) & sphere(1.0)
-    mesh = extract(inside, grid=settings.grid, reach=REACH, device=stage.device)
-    true_surface = Surface(*sample_surface(stage.scene.mesh, settings.points, stage.seed))
-    found = None if mesh is None else Surface(*sample_surface(mesh, settings.points, stage.seed + 1))
+    truth = stage.scene.view
+    mesh, metrics = _compare(field, stage, stage.evaluation.grid)
     seen = look(field, truth.camera, stage)
-    metrics = surface_metrics(found, true_surface, threshold=settings.fscore_threshold)
     metrics |= image_metrics(seen.depth.numpy(), seen.mask.numpy(), truth.depth.numpy(), truth.mask.numpy())
     return Judgement(mesh, metrics)
+
+
+def glance(field: Field, stage: Stage) -> float:
+    """The field's `chamfer_l2` on a grid of half as many samples an axis: for looks on the way, ten times as fast.
+
+    On half of a grid of 128 it is 3 to 20 % larger for a field that is as near to the truth as a sampling can tell.
+    """
+    return _compare(field, stage, stage.evaluation.grid // 2)[1]["chamfer_l2"]
+
+
+def _compare(field: Field, stage: Stage, grid: int) -> tuple[Mesh | None, dict[str, float]]:
+    inside = Shape(field, field.kind) & sphere(1.0)
+    mesh = extract(inside, grid=grid, reach=REACH, device=stage.device)
+    found = None if mesh is None else Surface(*sample_surface(mesh, stage.evaluation.points, stage.seed + 1))
+    truth = true_surface(stage, stage.seed)
+    return mesh, surface_metrics(found, truth, threshold=stage.evaluation.fscore_threshold)
+
+
+def true_surface(stage: Stage, seed: int) -> Surface:
+    """Samples of the truth, as many as metrics take."""
+    return Surface(*sample_surface(stage.scene.mesh, stage.evaluation.points, seed))
 
 
 def look(field: Field, camera: Camera, stage: Stage) -> View:

@@ -50,6 +50,7 @@ def optimise(
     before = Counts(problem.counts.value, problem.counts.gradient)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
+        optimiser.param_groups[0]["lr"] = settings.rate(iteration)
         optimiser.zero_grad(set_to_none=True)
         terms: dict[str, torch.Tensor] = {}
         forward = _timed(device, lambda i=iteration, terms=terms: terms.update(problem.loss(i)))

@@ -5,12 +5,13 @@ import time
 from typing import Any
 
 from bench.gallery import draw_run
-from bench.judge import Judgement, judge
+from bench.judge import Judgement, glance, judge
 from bench.metrics import DEFINITIONS
 from bench.optimise import Course, optimise
 from bench.records import Record, RunStatus, plain
 from bench.stage import Cell
 from bench.tasks.problem import InverseTask, OptimiserSettings, Problem, check_kind
+from renderers.field import Field
 
 COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
@@ -27,8 +28,8 @@ COSTS = {
 }
 
 
-def solve(task: InverseTask, cell: Cell) -> None:
-    """Executes an inverse task.
+def solve(task: InverseTask, cell: Cell) -> Field:
+    """Executes an inverse task, and gives the field that it ended with.
 
     Raises:
         Unsupported: where the renderer cannot do what the task or its field needs.
@@ -56,6 +57,7 @@ def solve(task: InverseTask, cell: Cell) -> None:
     title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
     draw_run(cell.folder, stage, (first, last), problem.observed.cpu().numpy(), course.curve, title)
     record.seconds["evaluation"] += time.perf_counter() - clock
+    return last
 
 
 def _optimise(problem: Problem, settings: OptimiserSettings, cell: Cell, course: Course) -> None:
@@ -63,17 +65,17 @@ def _optimise(problem: Problem, settings: OptimiserSettings, cell: Cell, course:
 
     A line has the loss before its step; the Chamfer distance that stands beside it is of the same parameters.
     """
-    every = cell.stage.evaluation.every
-    known: dict[int, float] = {} if every is None else {0: cell.record.metrics_start["chamfer_l2"]}
+    looks = cell.stage.evaluation.looks(settings.iterations)
+    known: dict[int, float] = {0: cell.record.metrics_start["chamfer_l2"]} if looks else {}
     with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
         def on_step(line: dict[str, Any]) -> None:
             if line["iteration"] in known:
                 line["chamfer_l2"] = known[line["iteration"]]
-            coming, last = line["iteration"] + 1, settings.iterations - 1
-            if every is not None and coming <= last and (coming % every == 0 or coming == last):
+            coming = line["iteration"] + 1
+            if coming in looks:
                 clock = time.perf_counter()
-                known[coming] = judge(problem.field(), cell.stage).metrics["chamfer_l2"]
+                known[coming] = glance(problem.field(), cell.stage)
                 cell.record.seconds["evaluation"] += time.perf_counter() - clock
             curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
             cell.progress("optimising", coming, settings.iterations, line["total"])

@@ -96,10 +96,15 @@ class Meter:
 
 def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Unit gradients of the field by automatic differentiation; zero where the gradient vanishes."""
+    return torch.nn.functional.normalize(autograd_gradients(field, points), dim=-1)
+
+
+def autograd_gradients(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Gradients of the field by automatic differentiation, of any length; without a graph."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_(True)
         (gradient,) = torch.autograd.grad(field(leaf).sum(), leaf)
-    return torch.nn.functional.normalize(gradient, dim=-1)
+    return gradient
 
 
 def central_difference_normals(

@@ -171,7 +171,7 @@ def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
 def test_figure_5_looks_at_the_chamfer_distance_on_the_way(compose_config):
     config = compose_config("+experiment=fig5", "+strategy=idr")
     assert (config.evaluation.every, config.task.points) == (20, "dense")
-    assert compose_config().evaluation.every is None
+    assert compose_config().evaluation.every == "doubling"
 
 
 def test_a_label_may_be_given(compose_config):

@@ -46,7 +46,7 @@ class Toy:
 
 def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None) -> Course:
     course = Course()
-    optimise(problem, OptimiserSettings(iterations, rate), CPU, course=course, on_step=on_step)
+    optimise(problem, OptimiserSettings(iterations, rate, "constant"), CPU, course=course, on_step=on_step)
     return course
 
 
@@ -136,7 +136,7 @@ def test_the_course_is_there_when_the_loop_is_cut_short(error):
 
     course = Course()
     with pytest.raises(error):
-        optimise(Toy(), OptimiserSettings(10, 0.1), CPU, course=course, on_step=stop)
+        optimise(Toy(), OptimiserSettings(10, 0.1, "constant"), CPU, course=course, on_step=stop)
     assert [line["iteration"] for line in course.curve] == [0, 1, 2]
     assert course.counts.value == 3 * POINTS
     assert course.seconds["forward"] > 0

@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 from bench import execute, solve
 from bench import stage as stage_module
 from bench.__main__ import main
+from bench.config import EvaluationSettings
 from bench.judge import Judgement
 from bench.optimise import Course
 from bench.records import Record, RunStatus
@@ -303,9 +304,9 @@ def curve_after(tmp_path, monkeypatch):
                 seen.append((tmp_path / "curve.jsonl").read_text())
 
         monkeypatch.setattr(solve, "optimise", optimise)
-        stage = Mock(spec=Stage, device=None, evaluation=Mock(every=None))
+        stage = Mock(spec=Stage, device=None, evaluation=EvaluationSettings(every=None))
         cell = Cell(stage, tmp_path, Mock(spec=Record), lambda *_: None)
-        solve._optimise(Mock(), OptimiserSettings(len(totals), 0.1), cell, Course())
+        solve._optimise(Mock(), OptimiserSettings(len(totals), 0.1, "constant"), cell, Course())
         return seen
 
     return write
@@ -323,7 +324,16 @@ def test_the_curve_is_json_whatever_the_loss(curve_after):
 
 @pytest.mark.parametrize(
     ("every", "iterations", "looks"),
-    [(None, 5, []), (1, 3, [0, 1, 2]), (3, 6, [0, 3, 5]), (3, 7, [0, 3, 6]), (9, 4, [0, 3])],
+    [
+        (None, 5, []),
+        (1, 3, [0, 1, 2]),
+        (3, 6, [0, 3, 5]),
+        (3, 7, [0, 3, 6]),
+        (9, 4, [0, 3]),
+        ("doubling", 6, [0, 1, 2, 4, 5]),
+        ("doubling", 9, [0, 1, 2, 4, 8]),
+        ("doubling", 1, [0]),
+    ],
 )
 def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(
     tmp_path, monkeypatch, every, iterations, looks
@@ -331,17 +341,17 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(
     toy = Toy()
     radii = [toy.radius.item()]  # known before the loop
 
-    def judge(field, stage):
+    def glance(field, stage):
         time.sleep(0.05)
         radii.append(toy.radius.item())
         assert not field(torch.ones(1, 3)).requires_grad
-        return Judgement(None, {"chamfer_l2": radii[-1], "accuracy": 0.0})
+        return radii[-1]
 
-    monkeypatch.setattr(solve, "judge", judge)
-    stage = Mock(spec=Stage, device=torch.device("cpu"), evaluation=Mock(every=every))
+    monkeypatch.setattr(solve, "glance", glance)
+    stage = Mock(spec=Stage, device=torch.device("cpu"), evaluation=EvaluationSettings(every=every))
     record = Mock(spec=Record, seconds={"evaluation": 1.0}, metrics_start={"chamfer_l2": radii[0]})
     course = Course()
-    settings = OptimiserSettings(iterations, 0.05)
+    settings = OptimiserSettings(iterations, 0.05, "constant")
     solve._optimise(toy, settings, Cell(stage, tmp_path, record, lambda *_: None), course)
     curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in curve] == list(range(iterations))
@@ -357,7 +367,9 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(
 
 
 def test_a_run_that_looks_on_the_way_ends_as_one_that_does_not(bench):
-    folders = [bench("renderer=dist", *TINY, *more)[3] for more in ((), ("evaluation.every=4",))]
+    folders = [
+        bench("renderer=dist", *TINY, *more)[3] for more in (("evaluation.every=null",), ("evaluation.every=4",))
+    ]
     plain, looked = (json.loads((folder / "record.json").read_text()) for folder in folders)
     curve = [json.loads(line) for line in (folders[1] / "curve.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == [0, 4, 5]

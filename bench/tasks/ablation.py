@@ -5,12 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from bench.environment import gemm_peak, synchronise
+from bench.images import save_images
 from bench.limits import LimitReached, Limits
 from bench.pictures import draw_against
 from bench.records import RunStatus
@@ -116,21 +115,8 @@ class Ablation:
         record.evaluations["per_ray"] = measured.forward.counts.value / bench.rays.shape.numel()
         record.peak_memory_bytes = measured.step.memory
         found, true = bench.views()
-        arrays = {
-            "normals": picture_normals(found).half(),
-            "reference_normals": picture_normals(true).half(),
-            "hit": found.mask,
-            "reference_hit": true.mask,
-            "depth_error": torch.where(found.mask & true.mask, (found.depth - true.depth).abs(), torch.nan),
-        }
-        np.savez_compressed(cell.folder / "images.npz", **{name: array.numpy() for name, array in arrays.items()})
+        save_images(cell.folder, found, true)
         draw_against(cell.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
-
-
-def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
-    """Normals with axes to the right, up and towards the camera, as pictures show them."""
-    rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
-    return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
 
 
 @dataclass(frozen=True)

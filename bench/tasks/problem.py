@@ -1,6 +1,7 @@
 """What a task is to the runner, and what an inverse problem is to the one loop that solves it."""
 
 from dataclasses import dataclass
+from math import cos, pi
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from bench.autodecoder import Prior
 from bench.stage import Cell
 from datasets.scene import Scene
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer
 
@@ -20,10 +22,27 @@ class Unsupported(Exception):
 
 @dataclass(frozen=True)
 class OptimiserSettings:
-    """Adam, for a fixed number of iterations."""
+    """Adam, for a fixed number of iterations.
+
+    Args:
+        iterations: how many.
+        learning_rate: of Adam, at the start.
+        schedule: "constant", or "cosine": the rate falls to zero along half a cosine.
+    """
 
     iterations: int
     learning_rate: float
+    schedule: str
+
+    def __post_init__(self) -> None:
+        check_at_least("task.iterations", self.iterations, 1, "the paper uses 100")
+        check_positive("task.learning_rate", self.learning_rate, "the paper uses 1e-2")
+        check_choice("task.schedule", self.schedule, ("constant", "cosine"))
+
+    def rate(self, iteration: int) -> float:
+        """The learning rate of an iteration, counted from 0."""
+        fall = 1.0 if self.schedule == "constant" else 0.5 * (1 + cos(pi * iteration / self.iterations))
+        return self.learning_rate * fall
 
 
 @runtime_checkable
