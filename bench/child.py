@@ -14,7 +14,9 @@ import torch._dynamo  # noqa: F401, PyTorch's optimisers import it when they are
 
 import bench.tasks.ablation
 import bench.tasks.completion
-import bench.tasks.gradients  # noqa: F401
+import bench.tasks.deepsdf
+import bench.tasks.gradients
+import bench.tasks.prior_fit  # noqa: F401
 import datasets.families
 import datasets.local  # noqa: F401
 from bench.config import register

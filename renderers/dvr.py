@@ -39,6 +39,7 @@ class DVR:
         least_slope: see `gradients.implicit`.
         occupancy_width: length in scene units over which a distance turns from occupied to free in the mask losses;
             see `field.occupancy_logits`. Occupancy networks do not use it.
+        mask_weight: of both mask losses; 1 leaves them as the paper's equations have them.
         sphere_radius: of the volume of interest, a sphere about the origin.
     """
 
@@ -49,6 +50,7 @@ class DVR:
     early_stop: bool
     least_slope: float
     occupancy_width: float
+    mask_weight: float
     sphere_radius: float
 
     capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
@@ -59,6 +61,7 @@ class DVR:
         check_at_least("refinement_steps", self.refinement_steps, 0, "the official code uses 8")
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("occupancy_width", self.occupancy_width, "0.02 suits distances in the unit sphere")
+        check_at_least("mask_weight", self.mask_weight, 0, "1 leaves them as they are")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         if list(self.doublings) != sorted(set(self.doublings)) or min(self.doublings, default=0) < 0:
             raise ValueError(f"doublings must be rising iterations from 0, not {list(self.doublings)}: [10, 30, 50]")
@@ -92,7 +95,7 @@ class DVR:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """DVR, Eqs. 14 and 15, summed and divided by the number of rays.
+        """DVR, Eqs. 14 and 15, summed, divided by the number of rays, and weighted.
 
         On the background, the hit or else a point drawn on the ray should be free; on the foreground without a hit, a
         point drawn on the ray should be occupied. Points are drawn from PyTorch's own generator, evenly.
@@ -104,7 +107,8 @@ class DVR:
         judged = meets & ~(wanted & hit)
         values = field(flat[judged].at(distance[judged]))
         logits = occupancy_logits(field, values, width=self.occupancy_width)
-        return softplus(torch.where(wanted[judged], -logits, logits)).sum() / max(wanted.numel(), 1)
+        total = softplus(torch.where(wanted[judged], -logits, logits)).sum()
+        return self.mask_weight * total / max(wanted.numel(), 1)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""

@@ -32,6 +32,7 @@ class IDR:
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
         least_slope: see `gradients.implicit`.
         mask_sharpness: of the mask loss, for a length of one scene unit; the paper begins at 50 and doubles it.
+        mask_weight: of the mask loss, rho in the paper, which takes 100.
         sphere_radius: of the sphere about the origin that holds the shape.
     """
 
@@ -39,6 +40,7 @@ class IDR:
     epsilon: float
     least_slope: float
     mask_sharpness: float
+    mask_weight: float
     sphere_radius: float
 
     capabilities: ClassVar[Capabilities] = Capabilities(
@@ -50,6 +52,7 @@ class IDR:
         check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("mask_sharpness", self.mask_sharpness, "the paper begins at 50")
+        check_at_least("mask_weight", self.mask_weight, 0, "the paper uses 100")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     def render(self, field: Field, rays: Rays) -> Rendering:
@@ -75,7 +78,8 @@ class IDR:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value, over the rays that are not rightly hit (Sec. 3.3)."""
+        """Cross entropy of a sigmoid of the least field value, over the rays not rightly hit (Sec. 3.3), weighted."""
         logits = -self.mask_sharpness * rendering.closest
         entropy = softplus(torch.where(mask, -logits, logits))
-        return (entropy * ~(mask & rendering.hit)).sum() / (self.mask_sharpness * max(mask.numel(), 1))
+        total = (entropy * ~(mask & rendering.hit)).sum()
+        return self.mask_weight * total / (self.mask_sharpness * max(mask.numel(), 1))

@@ -19,7 +19,9 @@ class Failing:
 
     def __init__(self, how: str = "not", pause: float = 0.0):
         self.how, self.pause, self.renderings = how, pause, 0
-        self.tracer = IDR(steps=10, epsilon=1e-3, least_slope=1e-3, mask_sharpness=50.0, sphere_radius=1.0)
+        self.tracer = IDR(
+            steps=10, epsilon=1e-3, least_slope=1e-3, mask_sharpness=50.0, mask_weight=100.0, sphere_radius=1.0
+        )
 
     def render(self, field, rays):
         time.sleep(self.pause)

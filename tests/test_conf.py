@@ -12,7 +12,14 @@ from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
 from renderers.rendering import Renderer
 
-IDR_ARGUMENTS = {"steps": 7, "epsilon": 1e-4, "least_slope": 1e-3, "mask_sharpness": 50.0, "sphere_radius": 1.0}
+IDR_ARGUMENTS = {
+    "steps": 7,
+    "epsilon": 1e-4,
+    "least_slope": 1e-3,
+    "mask_sharpness": 50.0,
+    "mask_weight": 100.0,
+    "sphere_radius": 1.0,
+}
 SWEPT = "hydra.sweeper.params"
 YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
 GROUPS = [(group, name) for group, name in YAMLS if group != "experiment"]
@@ -22,11 +29,21 @@ TARGETS = {"prior": "bench.autodecoder.PriorSettings"}  # nodes whose class the 
 PARTS = ("task", "renderer", "dataset", "prior")
 # What a choice needs on the command line.
 NEEDS = {"custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))}
+ADDED = ("strategy", "common", "method", "setting", "trial")  # not chosen by default
+DESK = {"scale": OmegaConf.load(CONF / "scale/desk.yaml")}
+
+
+def swept(name: str) -> dict[str, str]:
+    """What an experiment sweeps over at desk scale."""
+    config = OmegaConf.merge(OmegaConf.load(CONF / f"experiment/{name}.yaml"), DESK)
+    return {key: str(values) for key, values in (OmegaConf.select(config, SWEPT) or {}).items()}
+
+
 SWEEPS = [
     (name, f"{key}={value}")
     for name in EXPERIMENTS
-    for key, values in (OmegaConf.select(OmegaConf.load(CONF / f"experiment/{name}.yaml"), SWEPT) or {}).items()
-    for value in str(values).split(",")
+    for key, values in swept(name).items()
+    for value in values.replace("\\", "").split(",")
 ]
 
 
@@ -48,7 +65,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
     chosen = {"task", "renderer", "dataset", "prior", "scale", "tracker"}
-    assert {group for group, _ in YAMLS} == {*chosen, "experiment", "strategy", "common"}
+    assert {group for group, _ in YAMLS} == {*chosen, "experiment", *ADDED}
 
 
 def test_the_default_configuration_builds(compose_config):
@@ -62,7 +79,7 @@ def test_the_default_configuration_builds(compose_config):
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
     extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
-    new = "+" if group in ("strategy", "common") else ""  # they are not chosen by default
+    new = "+" if group in ADDED else ""  # they are not chosen by default
     config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     for part in PARTS:  # a scale is read by the others
@@ -90,7 +107,9 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
         build_part(config, part)
     assert config.experiment == name
     key, _, value = swept.removeprefix("+").partition("=")
-    if key in ("strategy", "renderer"):
+    if key == "dataset":
+        assert config.dataset.name == value
+    elif key in ("strategy", "renderer", "method", "setting", "trial"):
         alone = compose_config(swept)
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")

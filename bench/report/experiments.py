@@ -2,15 +2,41 @@
 
 from collections import Counter
 from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from bench.report.records import NEUTRAL_KEYS, asked, started
 
-TASKS = {"table1": "ablation", "fig4": "ablation", "fig5": "completion", "fig7": "ablation", "gradients": "gradients"}
-ROW_KEYS = {"renderer", "label", "seed", "index"}  # of a configuration: what the rows of one experiment may differ in
+ROW_KEYS = {"renderer", "label", "seed", "index"}  # of a configuration: what the rows of every experiment may differ in
 NOT_SHARED = {*ROW_KEYS, *NEUTRAL_KEYS, "packages"}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What an experiment is made of.
+
+    Args:
+        tasks: of its runs.
+        varies: keys of the configuration, beside `ROW_KEYS`, in which its runs differ.
+        cell: settings of the task that tell apart runs of one row; where `varies` is empty, the renderer's do.
+    """
+
+    tasks: tuple[str, ...]
+    varies: tuple[str, ...] = ()
+    cell: tuple[str, ...] = ()
+
+
+KINDS = {
+    "priors": Kind(("prior_fit",), ("dataset",)),
+    "table1": Kind(("ablation",)),
+    "table2": Kind(("completion", "deepsdf"), ("dataset", "task"), ("points",)),
+    "fig4": Kind(("ablation",)),
+    "fig5": Kind(("completion",)),
+    "fig7": Kind(("ablation",)),
+    "gradients": Kind(("gradients",)),
+    "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split"), ("points",)),
+}
 MACHINE = ("cpu", "device", "threads")
 
 
@@ -25,6 +51,11 @@ class Experiment:
     results_dir: Path
     records: list[dict[str, Any]]
     left_out: int = 0
+    everything: list[dict[str, Any]] = field(default_factory=list, repr=False)
+
+    def beside(self, name: str) -> "Experiment | None":
+        """Another experiment of the same results folder."""
+        return choose(self.everything, name, self.results_dir)
 
     def folder(self, record: dict[str, Any]) -> Path:
         """The record's run folder."""
@@ -35,14 +66,19 @@ class Experiment:
         return self.records[0]["config"]
 
     def names(self) -> list[str]:
-        """A readable name for each record: its row's, with seed and shape where the rows differ in these.
+        """A readable name for each record: its row's, with family, seed and shape where the rows differ in these.
 
         Rows of the same name whose renderers are set in different ways have those settings in their names.
         """
-        seeds, shapes = ({part(record) for record in self.records} for part in (_seed, _index))
+        seeds, shapes, families = ({part(record) for record in self.records} for part in (_seed, _index, family))
+        kind = KINDS[self.name]
         return [
             row_name(record)
-            + self._own_settings(record)
+            + (self._own_settings(record) if not kind.varies else "")
+            + "".join(
+                f", {value} {key}" for key in kind.cell if (value := setting(record["config"], "task", key)) is not None
+            )
+            + (f", {family(record)}" if len(families) > 1 else "")
             + (f", seed {_seed(record)}" if len(seeds) > 1 else "")
             + (f", shape {_index(record)}" if len(shapes) > 1 else "")
             for record in self.records
@@ -77,21 +113,28 @@ def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Exper
     that was run more than once with the same renderer is its newest record. The rows may be of different machines:
     captions say so.
     """
-    found = [r for r in records if r["config"].get("experiment") == name and r["task"] == TASKS[name]]
+    found = [r for r in records if r["config"].get("experiment") == name and r["task"] in KINDS[name].tasks]
     if not found:
         return None
     found.sort(key=started)
-    last = _shared(max(found, key=asked))
-    same = [r for r in found if _shared(r) == last]
+    kind = KINDS[name]
+    last = _shared(max(found, key=asked), kind)
+    same = [r for r in found if _shared(r, kind) == last]
     rows: dict[Hashable, dict[str, Any]] = {}
     for record in same:
-        rows[_key(record)] = record  # takes the place of the first, with the content of the newest
-    return Experiment(name, results_dir, list(rows.values()), len(found) - len(same))
+        rows[_key(record, kind)] = record  # takes the place of the first, with the content of the newest
+    return Experiment(name, results_dir, list(rows.values()), len(found) - len(same), records)
 
 
 def row_name(record: dict[str, Any]) -> str:
     """The name of the record's row: its label, or else its renderer's name."""
     return str(record["config"].get("label") or record["renderer"])
+
+
+def family(record: dict[str, Any]) -> str:
+    """The name of the record's dataset: a family's, or that of the mesh file or folder."""
+    path = setting(record["config"], "dataset", "path")
+    return Path(path).stem if path else record["dataset"]
 
 
 def measured(record: dict[str, Any], name: str) -> int | float | None:
@@ -138,8 +181,11 @@ def repeated(records: list[dict[str, Any]]) -> str:
     return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""
 
 
-def _key(record: dict[str, Any]) -> Hashable:
-    return (row_name(record), _seed(record), _index(record), str(sorted(_renderer(record).items())))
+def _key(record: dict[str, Any], kind: Kind) -> Hashable:
+    own = (row_name(record), _seed(record), _index(record))
+    if not kind.varies:
+        return (*own, str(sorted(_renderer(record).items())))
+    return (*own, record["task"], family(record), *(str(setting(record["config"], "task", key)) for key in kind.cell))
 
 
 def _renderer(record: dict[str, Any]) -> dict[str, str]:
@@ -155,5 +201,5 @@ def _index(record: dict[str, Any]) -> Any:
     return record["config"].get("index")
 
 
-def _shared(record: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in record["config"].items() if key not in NOT_SHARED}
+def _shared(record: dict[str, Any], kind: Kind) -> dict[str, Any]:
+    return {key: value for key, value in record["config"].items() if key not in {*NOT_SHARED, *kind.varies}}

@@ -52,3 +52,8 @@ def seconds(x: int | float | None) -> str:
     if abs(x) < 120:
         return f"{number(x)} s"
     return f"{number(x, 1 / 60)} min" if abs(x) < 7200 else f"{number(x, 1 / 3600)} h"
+
+
+def interval(low: float | None, high: float | None) -> str:
+    """The ends of an interval, such as [0.12, 0.34]; empty where there is none."""
+    return "" if low is None or math.isnan(low) else f"[{number(low)}, {number(high)}]"

@@ -3,30 +3,42 @@
 import html
 import os
 import re
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 FOLDER = "paper"
-ORDER = ("table1", "gradients", "fig4", "fig5", "fig7")
-SUFFIXES = (".pdf", ".csv", ".md", ".tex")
+SUFFIXES = (".html", ".pdf", ".csv", ".md", ".tex")
+MAKERS = {  # each file's name, its experiment and what makes it, in the order of the page
+    "table1": ("table1", "table1.make"),
+    "table2": ("table2", "table2.make"),
+    "table2_intervals": ("table2", "table2.intervals"),
+    "priors": ("priors", "priors.make"),
+    "speed_front": ("speed_accuracy", "speed_front.make"),
+    "speed_curves": ("speed_accuracy", "speed_curves.make"),
+    "speed_volume": ("speed_accuracy", "speed_front.volume"),
+    "loss_chamfer": ("speed_accuracy", "speed_curves.correlation"),
+    "gradients": ("gradients", "gradients.make"),
+    "fig4": ("fig4", "fig4.make"),
+    "fig5": ("fig5", "fig5.make"),
+    "fig7": ("fig7", "fig7.make"),
+}
+ORDER = tuple(MAKERS)
 
 
 def write_paper(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
     """Writes the files of every experiment that has records, to `results_dir/paper`; gives a CSV's path for each."""
-    from bench.report import fig4, fig5, fig7, gradients, table1  # matplotlib and scipy: not needed to find the files
-    from bench.report.experiments import choose
-    from bench.report.tables import Result, write
+    from bench.report.experiments import choose  # matplotlib and scipy: not needed to find the files
+    from bench.report.tables import write
 
-    makers: dict[str, Callable[[Any], Result]] = {
-        module.__name__.rsplit(".", 1)[-1]: module.make for module in (table1, gradients, fig4, fig5, fig7)
-    }
     written = []
-    for name in ORDER:
-        experiment = choose(records, name, results_dir)
+    for experiment_name, maker in MAKERS.values():
+        experiment = choose(records, experiment_name, results_dir)
         if experiment is not None:
-            written.append(write(makers[name](experiment), results_dir / FOLDER)[0])
+            module, function = maker.split(".")
+            make = getattr(import_module(f"bench.report.{module}"), function)
+            written.append(write(make(experiment), results_dir / FOLDER)[0])
     return written
 
 

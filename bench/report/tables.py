@@ -8,6 +8,7 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from bench.report.interactive import write_plotly
 from bench.report.style import RC
 
 # LaTeX's own characters, and those of ours that its standard fonts lack.
@@ -53,15 +54,19 @@ class Result:
     table: pd.DataFrame | None = None
     notes: list[str] = field(default_factory=list)
     figure: Figure | None = None
+    page: str | None = None  # HTML of the figure that answers the mouse
 
 
 def write(result: Result, folder: Path) -> list[Path]:
-    """Writes `folder/NAME.csv` and `.md`, `.tex` for a table, `.png` and `.pdf` for a figure; gives their paths."""
+    """Writes `folder/NAME.csv`, `.md`, `.tex` of a table, `.png`, `.pdf` of a figure, `.html`; gives their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     base = folder / result.name
     texts = {".csv": result.data.to_csv(index=False), ".md": markdown(result)}
     if result.table is not None:
         texts[".tex"] = latex(result)
+    if result.page is not None:
+        texts[".html"] = result.page
+        write_plotly(folder)
     for suffix, text in texts.items():
         base.with_suffix(suffix).write_bytes(text.encode("utf-8", "backslashreplace"))
     drawn = [base.with_suffix(suffix) for suffix in (".png", ".pdf")] if result.figure is not None else []

@@ -1,0 +1,107 @@
+"""Speed against accuracy: the runs of each setting of each renderer, aligned by shape and seed."""
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bench.report import statistics
+from bench.report.experiments import Experiment, family, measured, row_name, setting
+
+SEED = 0  # of the bootstrap
+TARGET = 1e-3  # Chamfer distance (squared scene units) whose time is asked for
+SCALE = 1000.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A task of which the chart is made: what it calls error, cost and evaluations."""
+
+    task: str
+    title: str
+    error: str
+    factor: float
+    heading: str
+
+
+TRIALS = (
+    Trial("completion", "completing a shape", "chamfer_l2", SCALE, "Chamfer × 1000 (scene units²)"),
+    Trial("ablation", "rendering an image", "error_p95", SCALE, "depth error, 95th percentile × 1000 (scene units)"),
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All runs of one setting in one trial, aligned with those of the others: a group of seeds for each shape."""
+
+    name: str
+    renderer: str
+    trial: Trial
+    records: list[dict[str, Any]]
+    keys: list[Hashable]  # the shapes of all settings of the trial
+
+    @cached_property
+    def errors(self) -> list[np.ndarray]:
+        """Of each shape; infinite where a run did not end ok or is missing."""
+        return self._groups(lambda r: _scaled(measured(r, self.trial.error), self.trial.factor))
+
+    @cached_property
+    def costs(self) -> list[np.ndarray]:
+        """Seconds of each shape: of the loop, or of one rendering. Infinite as the errors."""
+        return self._groups(seconds)
+
+    @property
+    def failed(self) -> int:
+        """Runs that did not end ok."""
+        return sum(record["status"] != "ok" for record in self.records)
+
+    @property
+    def point(self) -> tuple[float, float]:
+        """Median seconds and median error."""
+        return tuple(float(statistics.median(np.concatenate(groups))) for groups in (self.costs, self.errors))
+
+    def _groups(self, value: Any) -> list[np.ndarray]:
+        found: dict[Hashable, float] = {}
+        for record in self.records:
+            number = value(record) if record["status"] == "ok" else None
+            found[_run_key(record)] = math.inf if number is None or number != number else float(number)
+        shapes = list(dict.fromkeys(shape for shape, _ in self.keys))
+        return [np.array([found.get(key, math.inf) for key in self.keys if key[0] == shape]) for shape in shapes]
+
+
+def settings(experiment: Experiment, trial: Trial) -> list[Setting]:
+    """The settings of a trial, in the order in which they started. Renderings must be of one size to be compared."""
+    own = [record for record in experiment.records if record["task"] == trial.task]
+    if trial.task == "ablation" and own:
+        largest = max(setting(record["config"], "view", "resolution") for record in own)
+        own = [record for record in own if setting(record["config"], "view", "resolution") == largest]
+    keys = sorted({_run_key(record) for record in own}, key=str)
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for record in own:
+        rows.setdefault(row_name(record), []).append(record)
+    return [Setting(name, records[0]["renderer"], trial, records, keys) for name, records in rows.items()]
+
+
+def seconds(record: dict[str, Any]) -> float | None:
+    """What a run cost: the loop of an optimisation, or one rendering without gradient."""
+    if record["task"] == "ablation":
+        return measured(record, "forward_seconds")
+    spent = [record["seconds"].get(name) for name in ("forward", "backward")]
+    return None if None in spent else sum(spent)
+
+
+def evaluations(record: dict[str, Any]) -> float | None:
+    """Field values that a run asked for, in the loop or in one rendering."""
+    return measured(record, "queries") if record["task"] == "ablation" else record["evaluations"].get("value")
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
+def _run_key(record: dict[str, Any]) -> tuple[Hashable, Hashable]:
+    """The shape and the seed of a run."""
+    return (family(record), record["config"].get("index")), record["seed"]

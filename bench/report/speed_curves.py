@@ -1,0 +1,200 @@
+"""Error over time and evaluations, the time to a target, and whether the loss tells of the error."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from bench.report import curves, format, interactive, statistics, style
+from bench.report.caption import joined, omitted, setup
+from bench.report.experiments import Experiment, family, identity, measured
+from bench.report.speed import SCALE, SEED, TARGET, TRIALS, Setting, settings
+from bench.report.tables import Result
+
+
+def make(experiment: Experiment) -> Result:
+    """Error over seconds and over evaluations, and the share of runs that have not reached the target yet."""
+    rows = settings(experiment, TRIALS[0])
+    main = [row for row in rows if row.name == row.renderer or row.renderer not in {r.name for r in rows}]
+    shown = {row.name: [_course(experiment, record) for record in row.records] for row in rows}
+    data = []
+    for row in rows:
+        for record, course in zip(row.records, shown[row.name], strict=True):
+            data += [{**identity(record), "family": family(record), **point} for point in course.to_dict("records")]
+    times = {row.name: [_time_to(course, record) for course, record in _pairs(shown, row)] for row in rows}
+    table = []
+    for row in rows:
+        reached = [time for time, hit in times[row.name] if hit]
+        table.append(
+            [row.name, len(row.records), len(reached), format.seconds(float(np.median(reached))) if reached else "–"]
+        )
+    return Result(
+        name="speed_curves",
+        title="Error over time and over evaluations.",
+        caption=joined(
+            setup(experiment),
+            "Left and middle: Chamfer distance times 1000 on the way, medians over the runs of each renderer's own "
+            "setting; bands hold the middle half. A run that did not end ok is infinite past its end. Right: the share "
+            f"of runs not yet at {SCALE * TARGET:g} × 10⁻³ (Kaplan and Meier); a run that ended above it is censored. "
+            "Looks on the way are on half the grid. The table has all settings, "
+            "and the median time of the runs that reached it.",
+            omitted(experiment),
+        ),
+        data=pd.DataFrame(data, dtype=object),
+        table=pd.DataFrame(table, columns=["Setting", "Runs", "Reached", "Median time of these"]),
+        figure=draw_curves(main, shown, times),
+        page=interactive.curves(rows, shown),
+    )
+
+
+@style.styled
+def draw_curves(
+    rows: list[Setting], shown: dict[str, list[pd.DataFrame]], times: dict[str, list[tuple[float, bool]]]
+) -> Figure:
+    """Error over seconds, over evaluations, and survival."""
+    figure = Figure(figsize=(style.WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for axis, along, label in zip(
+        axes, ("seconds", "value_evaluations"), ("time (seconds)", "field values"), strict=False
+    ):
+        everything: list[float] = []
+        for row in rows:
+            where, low, middle, high = band(shown[row.name], [r["status"] != "ok" for r in row.records], along)
+            look = style.look(row.renderer)
+            axis.plot(where, style.finite(middle), color=look.colour, ls=look.line, label=row.name)
+            axis.fill_between(where, style.finite(low), style.finite(high), color=look.colour, alpha=0.15, lw=0)
+            everything += [*where]
+        style.log_axis(axis, "x", everything)
+        style.log_axis(axis, "y", [x for name in shown for course in shown[name] for x in course["error"]])
+        axis.set(xlabel=label, ylabel=TRIALS[0].heading)
+    for row in rows:
+        ended, hit = zip(*times[row.name], strict=True)
+        left, look = statistics.kaplan_meier(ended, hit), style.look(row.renderer)
+        where = np.append(left.times, max(ended))
+        axes[2].step(
+            where, np.append(left.remaining, left.remaining[-1]), where="post", color=look.colour, label=row.name
+        )
+        censored = [time for time, reached in times[row.name] if not reached]
+        at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in censored]
+        axes[2].plot(censored, at, "|", color=look.colour, ms=6)
+    axes[2].set(xlabel="time (seconds)", ylabel=f"share not yet at {SCALE * TARGET:g}", ylim=(-0.03, 1.03))
+    style.log_axis(axes[2], "x", [time for row in rows for time, _ in times[row.name]])
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5)
+    return figure
+
+
+def band(
+    runs: list[pd.DataFrame], failed: list[bool], along: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Places, and the quartiles of the error there: a run's error is that of its last look, infinite before the first
+    and past the end of a run that failed."""
+    ends = [run[along].iloc[-1] for run in runs if len(run)]
+    starts = [run[along][run[along] > 0].min() for run in runs if len(run) > 1]
+    if not starts:
+        return (np.empty(0),) * 4
+    where = np.geomspace(min(starts), max(ends), 60)
+    values = np.full((len(runs), len(where)), np.inf)
+    for row, (run, over) in enumerate(zip(runs, failed, strict=True)):
+        last = np.searchsorted(run[along].to_numpy(), where, side="right") - 1
+        known = last >= 0
+        values[row, known] = run["error"].to_numpy()[last[known]]
+        if over and len(run):
+            values[row, where > run[along].iloc[-1]] = np.inf
+    low, middle, high = (np.quantile(values, q, axis=0, method="higher") for q in (0.25, 0.5, 0.75))
+    return where, low, middle, high
+
+
+def _course(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:
+    """A run's error over seconds and evaluations: its looks on the way, and the end.
+
+    A line of a curve tells of the parameters before its step, but of the costs after it: the costs of the line before
+    are what the look had cost.
+    """
+    lines = curves.read(experiment.folder(record))[0].sort_values("iteration")
+    costs = lines[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
+    course = costs.assign(iteration=lines["iteration"], error=SCALE * lines["chamfer_l2"], loss=lines["total"])
+    course = course.dropna(subset=["error"])
+    if record["status"] == "ok" and len(lines) and (error := measured(record, "chamfer_l2")) is not None:
+        last = lines.iloc[-1]
+        end = {"seconds": last["seconds"], "value_evaluations": last["value_evaluations"]}
+        end |= {"iteration": last["iteration"] + 1, "error": SCALE * error, "loss": math.nan}
+        course = pd.concat([course, pd.DataFrame([end])], ignore_index=True)
+    return course[["iteration", "seconds", "value_evaluations", "error", "loss"]]
+
+
+def _pairs(shown: dict[str, list[pd.DataFrame]], row: Setting) -> Any:
+    return zip(shown[row.name], row.records, strict=True)
+
+
+def _time_to(course: pd.DataFrame, record: dict[str, Any]) -> tuple[float, bool]:
+    """When a run was first seen at the target, or else when it ended."""
+    if record["status"] == "ok":
+        below = course[course["error"] <= SCALE * TARGET]
+        if len(below):
+            return float(below["seconds"].iloc[0]), True
+    return float(course["seconds"].iloc[-1]) if len(course) else 0.0, False
+
+
+def correlation(experiment: Experiment) -> Result:
+    """Whether the loss tells of the error: rank correlation over the looks of each run, and over all runs of a row."""
+    rows = settings(experiment, TRIALS[0])
+    data, clouds = [], {}
+    for row in rows:
+        courses = [_course(experiment, record).dropna() for record in row.records]
+        within = [rho for course in courses if (rho := _spearman(course)) is not None]
+        together = pd.concat(courses, ignore_index=True)
+        clouds[row.name] = together
+        spread = statistics.bootstrap([np.array([x]) for x in within], statistics.median, seed=SEED) if within else None
+        numbers = {"within": spread.value, "low": spread.low, "high": spread.high} if spread else {}
+        pooled = {"together": _spearman(together), "looks": len(together), "runs": len(within)}
+        data.append({"row": row.name, "renderer": row.renderer, **numbers, **pooled})
+    table = [
+        [
+            row["row"],
+            str(row["runs"]),
+            format.number(row.get("within")),
+            format.interval(row.get("low"), row.get("high")),
+            format.number(row["together"]),
+        ]
+        for row in data
+    ]
+    return Result(
+        name="loss_chamfer",
+        title="Does the loss tell of the Chamfer distance?",
+        caption=joined(
+            setup(experiment),
+            "Spearman's rank correlation of loss and Chamfer distance over the looks on the way: within each run, the "
+            "median over runs with its 95 % bootstrap interval, and over the looks of all runs of a row together "
+            "(DIST, Fig. 5, right, shows such a cloud). Looks of one run follow each other: no test of significance.",
+            omitted(experiment),
+        ),
+        data=pd.DataFrame(data, dtype=object),
+        table=pd.DataFrame(table, columns=["Setting", "Runs", "Within a run", "95 % interval", "All together"]),
+        figure=draw_correlation([row for row in rows if row.name == row.renderer] or rows, clouds),
+    )
+
+
+@style.styled
+def draw_correlation(rows: list[Setting], clouds: dict[str, pd.DataFrame]) -> Figure:
+    """Loss against error of each renderer's own setting."""
+    figure = Figure(figsize=(style.WIDTH * 0.6, 3.0), layout="constrained")
+    axis = figure.subplots()
+    for row in rows:
+        look, cloud = style.look(row.renderer), clouds[row.name]
+        axis.plot(
+            cloud["loss"], cloud["error"], look.marker, color=look.colour, ls="none", ms=3, alpha=0.7, label=row.name
+        )
+    for letter, column in (("x", "loss"), ("y", "error")):
+        style.log_axis(axis, letter, [x for row in rows for x in clouds[row.name][column]])
+    axis.set(xlabel="weighted loss", ylabel=TRIALS[0].heading)
+    figure.legend(loc="outside right upper")
+    return figure
+
+
+def _spearman(cloud: pd.DataFrame) -> float | None:
+    varied = len(cloud) > 2 and all(cloud[column].nunique() > 1 for column in ("loss", "error"))
+    return float(spearmanr(cloud["loss"], cloud["error"]).statistic) if varied else None
