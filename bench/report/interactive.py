@@ -1,16 +1,16 @@
 """Figures that answer the mouse: hovering says which setting, a click opens the run. They need no network."""
 
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
 
 from bench.report import format, style
-
-if TYPE_CHECKING:
-    from bench.report.speed import Setting, Trial
+from bench.report.experiments import measured
+from bench.report.speed import Placed, Setting, front_line, seconds
 
 LIBRARY = "plotly.min.js"  # beside the pages that use it, so that they work without a network
 SYMBOLS = {"o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "<": "triangle-left"}
@@ -32,41 +32,34 @@ def write_plotly(folder: Path) -> None:
         path.write_text(get_plotlyjs(), encoding="utf-8")
 
 
-def front(found: "list[tuple[Trial, list[Setting]]]", chances: dict[str, list[float]]) -> str:
+def front(panels: list[list[Placed]]) -> str:
     """Error against time: a large point a setting, which opens the run nearest to its median, a small one a run."""
     from plotly.subplots import make_subplots
 
-    figure = make_subplots(cols=len(found), subplot_titles=[trial.title for trial, _ in found])
+    titles = [panel[0].row.trial.title for panel in panels]
+    figure = make_subplots(cols=len(panels), subplot_titles=titles)
     seen: set[str] = set()
-    for column, (trial, rows) in enumerate(found, start=1):
-        for row, chance in zip(rows, chances[trial.task], strict=True):
-            shown = _runs(row)
-            common = {"legendgroup": row.renderer, "name": row.renderer, "marker": _marker(row.renderer)}
-            small = {**common["marker"], "size": 5, "opacity": 0.35}
-            figure.add_scatter(
-                **{**common, "marker": small, "showlegend": False, "mode": "markers"},
-                **{"x": shown["seconds"], "y": shown["error"], "text": shown["told"], "customdata": shown["link"]},
-                hoverinfo="text", row=1, col=column,
-            )  # fmt: skip
-            cost, error = row.point
-            if np.isfinite([cost, error]).all():
-                nearest = shown.iloc[(shown["error"] - error).abs().argsort()[:1]]
-                told = (
-                    f"<b>{row.name}</b><br>{format.seconds(cost)}, error × 1000 {format.number(error)}<br>"
-                    f"failed {row.failed} of {len(row.records)}<br>on the front with probability {chance:.2f}"
-                    f"<br>{_settings(row)}"
-                )
-                figure.add_scatter(
-                    **common, mode="markers", showlegend=row.renderer not in seen, hoverinfo="text", x=[cost],
-                    y=[error], text=[told], customdata=list(nearest["link"]), row=1, col=column,
-                )  # fmt: skip
-                seen.add(row.renderer)
-        figure.update_xaxes(type="log", title="time (seconds)", row=1, col=column)
-        figure.update_yaxes(type="log", title=trial.heading, row=1, col=column)
+    for column, panel in enumerate(panels, start=1):
+        where = {"row": 1, "col": column}
+        line = front_line(panel)
+        x, y = [point.x for point in line], [point.y for point in line]
+        how = {"mode": "lines", "line": {"shape": "hv", "color": "#999999", "width": 1}, "hoverinfo": "skip"}
+        figure.add_scatter(x=x, y=y, showlegend=False, **how, **where)
+        for point in panel:
+            renderer, runs = point.row.renderer, _runs(point.row)
+            named = {"legendgroup": renderer, "name": renderer, "mode": "markers", "hoverinfo": "text"}
+            small = {"color": style.look(renderer).colour, "size": 4, "opacity": 0.4}
+            columns = {"x": runs["seconds"], "y": runs["error"], "text": runs["told"], "customdata": runs["link"]}
+            figure.add_scatter(marker=small, showlegend=False, **columns, **named, **where)
+            large = {"x": [point.x], "y": [point.y], "text": [_about(point)], "customdata": [_nearest(point, runs)]}
+            figure.add_scatter(marker=_marker(point), showlegend=renderer not in seen, **large, **named, **where)
+            seen.add(renderer)
+        figure.update_xaxes(type="log", title="time (seconds)", **where)
+        figure.update_yaxes(type="log", title=panel[0].row.trial.heading, **where)
     return _page(figure)
 
 
-def curves(rows: "list[Setting]", shown: dict[str, list[pd.DataFrame]]) -> str:
+def curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]]) -> str:
     """Error over seconds and over evaluations, a line a run."""
     from plotly.subplots import make_subplots
 
@@ -95,35 +88,39 @@ def _page(figure: Any) -> str:
     return figure.to_html(include_plotlyjs=LIBRARY, full_html=True, post_script=OPEN, div_id="figure")
 
 
-def _runs(row: "Setting") -> pd.DataFrame:
+def _runs(row: Setting) -> pd.DataFrame:
     """The runs of a setting that ended ok."""
-    from bench.report.experiments import measured
-    from bench.report.speed import seconds
-
     found = []
     for record in row.records:
         cost, error = seconds(record), measured(record, row.trial.error)
         if record["status"] == "ok" and cost is not None and error is not None and np.isfinite(error):
-            found.append(
-                {
-                    "seconds": cost,
-                    "error": row.trial.factor * error,
-                    "told": _told(row, record),
-                    "link": _link(record),
-                }
-            )
+            found.append([cost, row.trial.factor * error, _told(row, record), _link(record)])
     return pd.DataFrame(found, columns=["seconds", "error", "told", "link"])
 
 
-def _told(row: "Setting", record: dict[str, Any]) -> str:
-    return (
-        f"<b>{row.name}</b><br>{record.get('scene') or record['dataset']}, seed {record['seed']}<br>{record['folder']}"
-    )
+def _nearest(point: Placed, runs: pd.DataFrame) -> str:
+    """The run nearest to the setting's median; of a setting that failed, its first one."""
+    if not len(runs):
+        return _link(point.row.records[0])
+    return runs["link"].iloc[(runs["error"] - point.y).abs().argmin()]
 
 
-def _settings(row: "Setting") -> str:
-    config = row.records[0]["config"].get("renderer") or {}
-    return "<br>".join(f"{key} = {value}" for key, value in config.items() if not key.startswith("_"))
+def _about(point: Placed) -> str:
+    cost, error = point.row.point
+    settings = point.row.records[0]["config"].get("renderer") or {}
+    lines = [
+        f"<b>{escape(point.row.name)}</b>",
+        f"{format.seconds(cost)}, error × 1000 {format.number(error)}",
+        f"failed {point.row.failed} of {len(point.row.records)}",
+        f"on the front with probability {point.chance:.2f}",
+        *(f"{key} = {escape(str(value))}" for key, value in settings.items() if not key.startswith("_")),
+    ]
+    return "<br>".join(lines)
+
+
+def _told(row: Setting, record: dict[str, Any]) -> str:
+    scene = record.get("scene") or record["dataset"]
+    return f"<b>{escape(row.name)}</b><br>{escape(scene)}, seed {record['seed']}<br>{escape(record['folder'])}"
 
 
 def _link(record: dict[str, Any]) -> str:
@@ -131,6 +128,9 @@ def _link(record: dict[str, Any]) -> str:
     return f"../index.html#run-{quote(record['folder'], safe='')}"
 
 
-def _marker(renderer: str) -> dict[str, Any]:
-    look = style.look(renderer)
-    return {"color": look.colour, "symbol": SYMBOLS.get(look.marker, "circle"), "size": 10}
+def _marker(point: Placed) -> dict[str, Any]:
+    """Filled on the front, hollow where dominated, a cross where the median is infinite."""
+    look = style.look(point.row.renderer)
+    symbol = "x-thin" if point.lost else SYMBOLS.get(look.marker, "circle")
+    hollow = "" if point.on_front else "-open"
+    return {"color": look.colour, "symbol": symbol + hollow, "size": 10, "line": {"color": look.colour, "width": 2}}

@@ -72,6 +72,42 @@ class Setting:
         return [np.array([found.get(key, math.inf) for key in self.keys if key[0] == shape]) for shape in shapes]
 
 
+@dataclass(frozen=True)
+class Placed:
+    """A setting in the chart of error against time.
+
+    Args:
+        row: the setting.
+        x, y: where it is drawn: its median seconds and error, or the edge where one is infinite.
+        lost: whether one is.
+        dominated: whether another setting is no worse in both and better in one.
+        chance: the probability of being on the front.
+    """
+
+    row: Setting
+    x: float
+    y: float
+    lost: bool
+    dominated: bool
+    chance: float
+
+    @property
+    def on_front(self) -> bool:
+        """Whether no other setting beats it."""
+        return not (self.lost or self.dominated)
+
+    @property
+    def label(self) -> str:
+        """The setting without its renderer's name, and the probability."""
+        name = self.row.name.removeprefix(f"{self.row.renderer}, ")
+        return name if self.lost else f"{name} ({self.chance:.2f})"
+
+
+def front_line(panel: list[Placed]) -> list[Placed]:
+    """The points on the front, from the fastest to the best."""
+    return sorted((point for point in panel if point.on_front), key=lambda point: point.x)
+
+
 def settings(experiment: Experiment, trial: Trial) -> list[Setting]:
     """The settings of a trial, in the order in which they started. Renderings must be of one size to be compared."""
     own = [record for record in experiment.records if record["task"] == trial.task]

@@ -4,28 +4,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.report import format, interactive, statistics, style
 from bench.report.caption import joined, omitted, setup
 from bench.report.experiments import Experiment, setting
-from bench.report.speed import SEED, TRIALS, Setting, Trial, evaluations, settings
+from bench.report.speed import SEED, TRIALS, Placed, Setting, Trial, evaluations, front_line, settings
 from bench.report.tables import Result
 
 
 def make(experiment: Experiment) -> Result:
     """A point a setting: median error against median seconds, and how probably it is on the front."""
-    found = [(trial, settings(experiment, trial)) for trial in TRIALS]
-    found = [(trial, rows) for trial, rows in found if rows]
-    chances = {
-        trial.task: statistics.front([(row.costs, row.errors) for row in rows], seed=SEED) for trial, rows in found
-    }
-    data = [
-        _front_row(row, chance, inside)
-        for trial, rows in found
-        for row, chance, inside in zip(rows, chances[trial.task], _dominated(rows), strict=True)
-    ]
+    panels = [place(trial, settings(experiment, trial)) for trial in TRIALS]
+    panels = [panel for panel in panels if panel]
+    data = [_row(point) for panel in panels for point in panel]
     table = [
         [
             row["trial"],
@@ -45,42 +37,62 @@ def make(experiment: Experiment) -> Result:
         caption=joined(
             setup(experiment),
             "Medians over shapes and seeds: error at the end of a completion against the seconds of its loop, and "
-            "depth error of one rendering against its seconds. A run that did not end ok is infinite in both; a "
-            "setting whose median is, stands at the right edge. Filled points are on the front, hollow ones dominated. "
-            "The probability of being on the front is over 2,000 bootstrap draws of shapes and seeds, the same for all "
-            "settings.",
+            "depth error of one rendering (95 % of the reference's pixels have less, lost ones are infinite) against "
+            "its seconds. A run that did not end ok is infinite in both. Filled points are on the front, hollow ones "
+            "are dominated, and a cross stands at the edge for a median that is infinite. In brackets and in the last "
+            "column, the probability of being on the front, over 2,000 bootstrap draws of shapes and seeds, the same "
+            "for all settings.",
             omitted(experiment),
         ),
         data=pd.DataFrame(data, dtype=object),
         table=pd.DataFrame(table, columns=columns),
-        figure=draw_front(found, chances),
-        page=interactive.front(found, chances),
+        figure=draw(panels),
+        page=interactive.front(panels),
     )
 
 
+def place(trial: Trial, rows: list[Setting]) -> list[Placed]:
+    """Where the settings of a trial stand in the chart; what is infinite stands a little beyond all else."""
+    if not rows:
+        return []
+    points = np.array([row.point for row in rows])
+    finite = np.isfinite(points)
+    largest = np.where(finite, points, 0.0).max(axis=0)
+    shown = np.where(finite, points, np.where(largest > 0, 1.5 * largest, 1.0))
+    beaten = statistics.dominated(*points.T)
+    chances = statistics.front([(row.costs, row.errors) for row in rows], seed=SEED)
+    return [
+        Placed(row, float(x), float(y), lost=not sound, dominated=bool(inside), chance=chance)
+        for row, (x, y), sound, inside, chance in zip(rows, shown, finite.all(axis=1), beaten, chances, strict=True)
+    ]
+
+
 @style.styled
-def draw_front(found: list[tuple[Trial, list[Setting]]], chances: dict[str, list[float]]) -> Figure:
+def draw(panels: list[list[Placed]]) -> Figure:
     """A panel a trial."""
     figure = Figure(figsize=(style.WIDTH, 3.9), layout="constrained")
-    axes = figure.subplots(1, len(found), squeeze=False)[0]
-    for axis, (trial, rows) in zip(axes, found, strict=True):
-        points = np.array([row.point for row in rows])
-        edge = _edge(points)
-        inside = _dominated(rows)
-        for row, point, hollow, chance in zip(rows, points, inside, chances[trial.task], strict=True):
-            look = style.look(row.renderer)
-            lost = not np.isfinite(point).all()
-            x, y = np.where(np.isfinite(point), point, edge)
-            fill = "none" if hollow or lost else look.colour
-            axis.plot(x, y, "x" if lost else look.marker, color=look.colour, mfc=fill, ls="none", ms=5)
-            if not hollow or lost:
-                note = row.name.removeprefix(f"{row.renderer}, ") + ("" if lost else f" ({chance:.2f})")
-                axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=5.5)
-        _step(axis, points[~inside & np.isfinite(points).all(axis=1)])
-        for letter, values in (("x", points[:, 0]), ("y", points[:, 1])):
-            style.log_axis(axis, letter, values)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, panel in zip(axes, panels, strict=True):
+        middle = np.sqrt(np.prod([point.x for point in (panel[0], panel[-1])]))
+        for number, point in enumerate(sorted(panel, key=lambda point: point.x)):
+            look = style.look(point.row.renderer)
+            fill = look.colour if point.on_front else "none"
+            axis.plot(
+                point.x, point.y, "x" if point.lost else look.marker, color=look.colour, mfc=fill, ls="none", ms=5
+            )
+            if point.on_front or point.lost:
+                side = "left" if point.x < middle else "right"
+                at = (4 if side == "left" else -4, 4 if number % 2 else -8)
+                axis.annotate(point.label, (point.x, point.y), at, textcoords="offset points", fontsize=5.5, ha=side)
+        line = front_line(panel)
+        axis.step(
+            [point.x for point in line], [point.y for point in line], where="post", color="#999999", lw=0.8, zorder=0
+        )
+        trial = panel[0].row.trial
+        for letter in ("x", "y"):
+            style.log_axis(axis, letter, [getattr(point, letter) for point in panel])
         axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
-    for renderer in dict.fromkeys(row.renderer for _, rows in found for row in rows):
+    for renderer in dict.fromkeys(point.row.renderer for panel in panels for point in panel):
         look = style.look(renderer)
         axes[0].plot([], [], look.marker, color=look.colour, ls="none", label=renderer)
     handles, labels = axes[0].get_legend_handles_labels()
@@ -88,7 +100,8 @@ def draw_front(found: list[tuple[Trial, list[Setting]]], chances: dict[str, list
     return figure
 
 
-def _front_row(row: Setting, chance: float, inside: bool) -> dict[str, Any]:
+def _row(point: Placed) -> dict[str, Any]:
+    row = point.row
     cost, error = row.point
     asked = [evaluations(record) for record in row.records if record["status"] == "ok"]
     known = [x for x in asked if x is not None]
@@ -98,27 +111,11 @@ def _front_row(row: Setting, chance: float, inside: bool) -> dict[str, Any]:
         **{"trial": row.trial.title, "setting": row.name, "renderer": row.renderer},
         **{"seconds": cost, "evaluations": float(np.median(known)) if known else None, "error": error},
         **{"error_iqm": spread.value, "error_low": spread.low, "error_high": spread.high},
-        **{"failed": row.failed, "runs": len(row.records), "on_front": chance, "dominated": bool(inside)},
+        **{"failed": row.failed, "runs": len(row.records)},
+        **{"on_front": point.chance, "dominated": point.dominated},
         **{f"renderer.{key}": value for key, value in (config.get("renderer") or {}).items() if key[0] != "_"},
         "resolution": setting(config, "view", "resolution"),
     }
-
-
-def _dominated(rows: list[Setting]) -> np.ndarray:
-    costs, errors = np.array([row.point for row in rows]).T
-    return statistics.dominated(costs, errors) | ~np.isfinite(costs) | ~np.isfinite(errors)
-
-
-def _edge(points: np.ndarray) -> np.ndarray:
-    """Where what is infinite is drawn: a little beyond the largest finite values."""
-    finite = np.where(np.isfinite(points), points, 0.0).max(axis=0)
-    return np.where(finite > 0, 1.5 * finite, 1.0)
-
-
-def _step(axis: Axes, points: np.ndarray) -> None:
-    ordered = points[np.argsort(points[:, 0])]
-    if len(ordered):
-        axis.step(ordered[:, 0], ordered[:, 1], where="post", color="#999999", lw=0.8, zorder=0)
 
 
 def volume(experiment: Experiment) -> Result:

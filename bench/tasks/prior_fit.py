@@ -25,8 +25,8 @@ DEFINITIONS = {
     "floor_chamfer_l2": "chamfer_l2 between two independent samplings of the truth, which no prediction can beat;"
     " in squared scene units.",
     "distance_error": f"Mean error of the field within {NEAR} of the true surface, in scene units.",
-    "gradient_median": f"Median length of the field's gradient within {NEAR} of the true surface; 1 for a distance.",
-    "gradient_p99": "The length of the gradient that 99 % of these points stay below.",
+    "slope_median": f"Median length of the field's gradient within {NEAR} of the true surface; 1 for a distance.",
+    "slope_p99": "The length of the gradient that 99 % of these points stay below.",
 }
 
 
@@ -82,8 +82,8 @@ class PriorFit:
         record.metrics |= {
             "floor_chamfer_l2": floor["chamfer_l2"],
             "distance_error": error.item(),
-            "gradient_median": middle.item(),
-            "gradient_p99": high.item(),
+            "slope_median": middle.item(),
+            "slope_p99": high.item(),
         }
         camera = stage.scene.view.camera.resized(stage.evaluation.picture, stage.evaluation.picture)
         found, true = look(field, camera, stage), see(Truth(stage.scene.mesh), camera)
