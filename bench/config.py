@@ -58,7 +58,7 @@ class EvaluationSettings:
     grid: int = MISSING
     points: int = MISSING
     fscore_threshold: float = MISSING
-    picture: int = MISSING
+    picture: int | None = MISSING
     every: int | str | None = MISSING
 
     def looks(self, iterations: int) -> set[int]:

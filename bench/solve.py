@@ -55,7 +55,8 @@ def solve(task: InverseTask, cell: Cell) -> Field:
     if after.mesh is not None:
         after.mesh.save(cell.folder / "mesh.ply")
     title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
-    draw_run(cell.folder, stage, (first, last), problem.observed.cpu().numpy(), course.curve, title)
+    if stage.evaluation.picture is not None:
+        draw_run(cell.folder, stage, (first, last), problem.observed.cpu().numpy(), course.curve, title)
     record.seconds["evaluation"] += time.perf_counter() - clock
     return last
 

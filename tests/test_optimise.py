@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import pytest
 import torch
@@ -145,3 +146,24 @@ def test_the_course_is_there_when_the_loop_is_cut_short(error):
 def test_memory_is_measured_or_unknown():
     peak = go(Toy(), 2).peak_memory_bytes
     assert peak is None or peak >= 0
+
+
+def test_a_cosine_falls_from_the_rate_to_nearly_zero():
+    rates = [OptimiserSettings(10, 0.2, "cosine").rate(iteration) for iteration in range(10)]
+    assert rates[0] == 0.2
+    assert rates[5] == pytest.approx(0.1)
+    assert rates == sorted(rates, reverse=True)
+    assert 0 < rates[-1] < 0.01
+    assert {OptimiserSettings(10, 0.2, "constant").rate(iteration) for iteration in range(10)} == {0.2}
+
+
+def test_the_optimiser_takes_the_rate_of_the_iteration():
+    moved = []
+    for schedule in ("constant", "cosine"):
+        toy = Toy()
+        places = [toy.radius.item()]
+        settings = OptimiserSettings(4, 0.05, schedule)
+        optimise(toy, settings, CPU, course=Course(), on_step=lambda line, p=places, t=toy: p.append(t.radius.item()))
+        moved.append([b - a for a, b in pairwise(places)])
+    ratios = [cosine / constant for constant, cosine in zip(*moved, strict=True)]
+    assert ratios == pytest.approx([1.0, 0.854, 0.5, 0.146], abs=0.02)

@@ -85,7 +85,8 @@ class PriorFit:
             "slope_median": middle.item(),
             "slope_p99": high.item(),
         }
-        camera = stage.scene.view.camera.resized(stage.evaluation.picture, stage.evaluation.picture)
+        size = stage.evaluation.picture or stage.scene.view.camera.height
+        camera = stage.scene.view.camera.resized(size, size)
         found, true = look(field, camera, stage), see(Truth(stage.scene.mesh), camera)
         save_images(cell.folder, found, true, gradient_length=lengths.cpu().numpy())
 
