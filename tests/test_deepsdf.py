@@ -31,8 +31,8 @@ FIT = PriorFit(
 
 @pytest.fixture
 def wall() -> Scene:
-    """The plane z = 0.2, seen head-on by 4 x 4 pixels."""
-    camera = camera_of(4)
+    """The plane z = 0.2, seen head-on by 4 x 4 pixels, all within the unit sphere."""
+    camera = camera_of(4, field_of_view=20.0)
     depth = torch.full((4, 4), 2.3)
     normals = torch.tensor([0.0, 0, 1]).expand(4, 4, 3).clone()
     corners = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))

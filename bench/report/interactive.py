@@ -10,7 +10,7 @@ import pandas as pd
 
 from bench.report import format, style
 from bench.report.experiments import measured
-from bench.report.speed import Placed, Setting, front_line, seconds
+from bench.report.speed import Placed, Setting, front_line, own, seconds
 
 LIBRARY = "plotly.min.js"  # beside the pages that use it, so that they work without a network
 SYMBOLS = {"o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "<": "triangle-left"}
@@ -74,7 +74,7 @@ def curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]]) -> str:
                     x=course[along], y=course["error"], mode="lines+markers", name=row.name, legendgroup=row.name,
                     showlegend=row.name not in seen, line={"color": colour, "width": 1}, marker={"size": 4},
                     text=[_told(row, record)] * len(course), customdata=links, hoverinfo="text+x+y", row=1, col=column,
-                    visible=True if row.name == row.renderer else "legendonly",
+                    visible=True if row in own(rows) else "legendonly",
                 )  # fmt: skip
                 seen.add(row.name)
     for column, label in enumerate(("time (seconds)", "field values"), start=1):

@@ -14,6 +14,7 @@ from bench.report.experiments import Experiment, family, measured, row_name, set
 SEED = 0  # of the bootstrap
 TARGET = 1e-3  # Chamfer distance (squared scene units) whose time is asked for
 SCALE = 1000.0
+LEAST = 1e-9  # an error below this cannot be told from none, and its logarithm would be without bounds
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,12 @@ def settings(experiment: Experiment, trial: Trial) -> list[Setting]:
     return [Setting(name, records[0]["renderer"], trial, records, keys) for name, records in rows.items()]
 
 
+def own(rows: list[Setting]) -> list[Setting]:
+    """The setting that bears each renderer's name; all of a renderer where none does."""
+    names = {row.name for row in rows}
+    return [row for row in rows if row.name == row.renderer or row.renderer not in names]
+
+
 def seconds(record: dict[str, Any]) -> float | None:
     """What a run cost: the loop of an optimisation, or one rendering without gradient."""
     if record["task"] == "ablation":
@@ -135,7 +142,7 @@ def evaluations(record: dict[str, Any]) -> float | None:
 
 
 def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
+    return None if value is None else factor * max(value, LEAST)
 
 
 def _run_key(record: dict[str, Any]) -> tuple[Hashable, Hashable]:

@@ -11,14 +11,13 @@ from scipy.stats import spearmanr
 from bench.report import curves, format, interactive, statistics, style
 from bench.report.caption import joined, omitted, setup
 from bench.report.experiments import Experiment, family, identity, measured
-from bench.report.speed import SCALE, SEED, TARGET, TRIALS, Setting, settings
+from bench.report.speed import SCALE, SEED, TARGET, TRIALS, Setting, own, settings
 from bench.report.tables import Result
 
 
 def make(experiment: Experiment) -> Result:
     """Error over seconds and over evaluations, and the share of runs that have not reached the target yet."""
     rows = settings(experiment, TRIALS[0])
-    main = [row for row in rows if row.name == row.renderer or row.renderer not in {r.name for r in rows}]
     shown = {row.name: [_course(experiment, record) for record in row.records] for row in rows}
     data = []
     for row in rows:
@@ -29,7 +28,12 @@ def make(experiment: Experiment) -> Result:
     for row in rows:
         reached = [time for time, hit in times[row.name] if hit]
         table.append(
-            [row.name, len(row.records), len(reached), format.seconds(float(np.median(reached))) if reached else "–"]
+            [
+                row.name,
+                str(len(row.records)),
+                str(len(reached)),
+                format.seconds(float(np.median(reached))) if reached else "–",
+            ]
         )
     return Result(
         name="speed_curves",
@@ -45,7 +49,7 @@ def make(experiment: Experiment) -> Result:
         ),
         data=pd.DataFrame(data, dtype=object),
         table=pd.DataFrame(table, columns=["Setting", "Runs", "Reached", "Median time of these"]),
-        figure=draw_curves(main, shown, times),
+        figure=draw_curves(own(rows), shown, times),
         page=interactive.curves(rows, shown),
     )
 
@@ -174,7 +178,7 @@ def correlation(experiment: Experiment) -> Result:
         ),
         data=pd.DataFrame(data, dtype=object),
         table=pd.DataFrame(table, columns=["Setting", "Runs", "Within a run", "95 % interval", "All together"]),
-        figure=draw_correlation([row for row in rows if row.name == row.renderer] or rows, clouds),
+        figure=draw_correlation(own(rows), clouds),
     )
 
 

@@ -143,9 +143,9 @@ def intervals(experiment: Experiment) -> Result:
             ERROR,
             "Interquartile means with 95 % bootstrap intervals over shapes and seeds (expanded percentiles, 2,000 "
             "draws); failure rates with Wilson's intervals. The ratio is that of the row's interquartile mean over all "
-            f"points to that of “{REFERENCE}”, paired by shape. The rank is the mean over shapes and points that all "
-            "rows planned; a failure ranks last. Below, Wilcoxon's signed-rank test over the shapes of all families, "
-            "on medians over points, adjusted for their number (Holm).",
+            f"points to that of “{REFERENCE}”, paired by shape, over shapes that both have. The rank is the mean over "
+            "shapes and points; a run that failed, or that a row lacks, ranks last. Below, Wilcoxon's signed-rank test "
+            "over the shapes of all families, on medians over points, adjusted for their number (Holm).",
             _numbers(runs),
             omitted(experiment),
         ),
@@ -230,18 +230,13 @@ def _ratio(runs: Runs, name: str, row: str) -> str:
 
 
 def _ranks(runs: Runs, name: str) -> dict[str, float]:
-    planned = [row for row in runs.rows if any(runs.groups(name, row, points) for points in runs.points)]
-    shapes = runs.common(name, *planned)
-    return rank(
-        {
-            row: {
-                (shape, points): float(median(runs.errors[name, row, points][shape]))
-                for shape in shapes
-                for points in runs.points
-            }
-            for row in planned
-        }
-    )
+    """Each row's mean rank over shapes and points; what a row lacks counts as a failure, lest dropping one pays."""
+    table: dict[str, dict[Any, float | None]] = {}
+    for family_name, row, points in runs.errors:
+        if family_name == name:
+            errors = runs.errors[name, row, points]
+            table.setdefault(row, {}).update({(shape, points): float(median(e)) for shape, e in errors.items()})
+    return rank(table)
 
 
 def _p_values(runs: Runs) -> dict[str, float]:
