@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from skimage.measure import marching_cubes
+from scipy.ndimage import binary_dilation
+from skimage.measure import block_reduce, marching_cubes
 
 from datasets.mesh import Mesh
 from renderers.field import Field, Kind
@@ -63,18 +64,9 @@ def _near_values(
         wanted = (near & ~known)[np.ix_(block_of, block_of, block_of)]
         values[wanted] = ask(_places(np.flatnonzero(wanted), axis))
         known |= near
-        for first, second in _crossings(values < 0):
-            near[tuple((first // BLOCK).T)] = near[tuple((second // BLOCK).T)] = True
+        inside = values < 0
+        near |= block_reduce(binary_dilation(inside) & binary_dilation(~inside), BLOCK, np.any)
     return values
-
-
-def _crossings(inside: np.ndarray) -> list[tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]]:
-    """Pairs of neighbouring samples of different sign, along each axis."""
-    pairs = []
-    for step in np.eye(3, dtype=int):
-        first = np.argwhere(np.diff(inside, axis=int(step.argmax())))
-        pairs.append((first, first + step))
-    return pairs
 
 
 def _places(flat: Int[np.ndarray, " n"], axis: Float[np.ndarray, " grid"]) -> Float[np.ndarray, "n 3"]:

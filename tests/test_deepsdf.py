@@ -20,7 +20,7 @@ from tests.tiny import CPU, ball_prior, camera_of, plane_decoder
 
 RENDERER = load("renderer", "dist")  # neither task renders with it
 SETTINGS = DeepSDF(
-    points="dense", offset=0.1, free=0, distance_weight=2.0, free_weight=3.0, code_weight=0.5, code_average="sum",
+    points="dense", offset=0.1, distance_weight=2.0, code_weight=0.5, code_average="sum",
     iterations=5, learning_rate=0.01, schedule="constant",
 )  # fmt: skip
 FIT = PriorFit(
@@ -51,7 +51,7 @@ def problem_of(scene, prior, **changed):
 def test_the_true_plane_costs_nothing(wall):
     terms = problem_of(wall, plane(0.2)).loss(0)
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(
-        {"total": 0, "distance": 0, "free": 0, "code": 0}, abs=1e-6
+        {"total": 0, "distance": 0, "code": 0}, abs=1e-6
     )
 
 
@@ -66,17 +66,6 @@ def test_the_samples_lie_on_both_sides_at_the_offset(wall):
     samples = problem_of(wall, plane(0.2)).compare.__self__
     assert samples.points[:, 2].sort().values.tolist() == pytest.approx([0.1] * 16 + [0.3] * 16, abs=1e-5)
     assert torch.equal(samples.distances.sign(), (samples.points[:, 2] - 0.2).sign())
-
-
-def test_free_space_may_not_be_inside(wall):
-    problem = problem_of(wall, plane(0.5), free=8, distance_weight=0.0)
-    samples = problem.compare.__self__
-    assert len(samples.free) == 8 * 16
-    assert (samples.free[:, 2] > 0.2).all()  # before the surface
-    assert (samples.free.norm(dim=-1) <= 1.0 + 1e-5).all()
-    expected = (0.5 - samples.free[:, 2]).clamp_min(0).mean()
-    assert problem.loss(0)["free"].item() == pytest.approx(3.0 * expected.item(), rel=1e-4)
-    assert problem_of(wall, plane(0.1), free=8).loss(0)["free"].item() == 0.0
 
 
 def test_it_finds_the_plane_and_counts_its_samples(wall):
@@ -97,7 +86,7 @@ def test_the_code_costs_its_squares():
     ("changed", "message"),
     [
         ({"offset": 0.0}, "task.offset must be positive"),
-        ({"free": -1}, "task.free must be at least 0"),
+        ({"distance_weight": 0.0}, "task.distance_weight must be positive"),
         ({"points": "0"}, "points must be positive"),
         ({"iterations": 0}, "task.iterations must be at least 1"),
         ({"schedule": "linear"}, "task.schedule must be one of constant, cosine"),

@@ -1,5 +1,6 @@
 """Which records make up an experiment: the newest, those that may be compared with it, and their rows."""
 
+import math
 from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
@@ -141,6 +142,12 @@ def measured(record: dict[str, Any], name: str) -> int | float | None:
     """The metric of that name; None where there is no such number."""
     value = record["metrics"].get(name)
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def error(record: dict[str, Any], name: str) -> float:
+    """The metric of that name as an error of the run: infinite where it did not end ok, or has no such number."""
+    value = measured(record, name) if record["status"] == "ok" else None
+    return math.inf if value is None or math.isnan(value) else value
 
 
 def setting(config: dict[str, Any], *path: str) -> Any:

@@ -10,29 +10,18 @@ import pandas as pd
 
 from bench.report import format, style
 from bench.report.experiments import measured
-from bench.report.speed import Placed, Setting, front_line, own, seconds
+from bench.report.speed import SCALE, Placed, Setting, front_line, own, seconds
 
-LIBRARY = "plotly.min.js"  # beside the pages that use it, so that they work without a network
 SYMBOLS = {"o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "<": "triangle-left"}
 OPEN = """
-var chart = document.getElementsByClassName('plotly-graph-div')[0];
-chart.on('plotly_click', function (event) {
+document.getElementById('figure').on('plotly_click', function (event) {
   var link = event.points[0].customdata;
   if (link) { window.open(link, '_blank'); }
 });
 """
 
 
-def write_plotly(folder: Path) -> None:
-    """Puts Plotly's own script into a folder, where the pages find it."""
-    from plotly.offline import get_plotlyjs
-
-    path = folder / LIBRARY
-    if not path.is_file():
-        path.write_text(get_plotlyjs(), encoding="utf-8")
-
-
-def front(panels: list[list[Placed]]) -> str:
+def front(panels: list[list[Placed]]) -> Any:
     """Error against time: a large point a setting, which opens the run nearest to its median, a small one a run."""
     from plotly.subplots import make_subplots
 
@@ -56,15 +45,16 @@ def front(panels: list[list[Placed]]) -> str:
             seen.add(renderer)
         figure.update_xaxes(type="log", title="time (seconds)", **where)
         figure.update_yaxes(type="log", title=panel[0].row.trial.heading, **where)
-    return _page(figure)
+    return _styled(figure)
 
 
-def curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]]) -> str:
+def curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]]) -> Any:
     """Error over seconds and over evaluations, a line a run."""
     from plotly.subplots import make_subplots
 
     figure = make_subplots(cols=2)
     seen: set[str] = set()
+    shown_first = {row.name for row in own(rows)}
     for row in rows:
         colour = style.look(row.renderer).colour
         for record, course in zip(row.records, shown[row.name], strict=True):
@@ -74,18 +64,22 @@ def curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]]) -> str:
                     x=course[along], y=course["error"], mode="lines+markers", name=row.name, legendgroup=row.name,
                     showlegend=row.name not in seen, line={"color": colour, "width": 1}, marker={"size": 4},
                     text=[_told(row, record)] * len(course), customdata=links, hoverinfo="text+x+y", row=1, col=column,
-                    visible=True if row in own(rows) else "legendonly",
+                    visible=True if row.name in shown_first else "legendonly",
                 )  # fmt: skip
                 seen.add(row.name)
     for column, label in enumerate(("time (seconds)", "field values"), start=1):
         figure.update_xaxes(type="log", title=label, row=1, col=column)
         figure.update_yaxes(type="log", title="Chamfer × 1000 (scene units²)", row=1, col=column)
-    return _page(figure)
+    return _styled(figure)
 
 
-def _page(figure: Any) -> str:
-    figure.update_layout(template="plotly_white", hovermode="closest", legend={"itemsizing": "constant"})
-    return figure.to_html(include_plotlyjs=LIBRARY, full_html=True, post_script=OPEN, div_id="figure")
+def write(figure: Any, path: Path) -> None:
+    """Writes a page, and beside it Plotly's own script, so that it works without a network."""
+    figure.write_html(path, include_plotlyjs="directory", post_script=OPEN, div_id="figure")
+
+
+def _styled(figure: Any) -> Any:
+    return figure.update_layout(template="plotly_white", hovermode="closest", legend={"itemsizing": "constant"})
 
 
 def _runs(row: Setting) -> pd.DataFrame:
@@ -94,7 +88,7 @@ def _runs(row: Setting) -> pd.DataFrame:
     for record in row.records:
         cost, error = seconds(record), measured(record, row.trial.error)
         if record["status"] == "ok" and cost is not None and error is not None and np.isfinite(error):
-            found.append([cost, row.trial.factor * error, _told(row, record), _link(record)])
+            found.append([cost, SCALE * error, _told(row, record), _link(record)])
     return pd.DataFrame(found, columns=["seconds", "error", "told", "link"])
 
 

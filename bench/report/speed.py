@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bench.report import statistics
-from bench.report.experiments import Experiment, family, measured, row_name, setting
+from bench.report.experiments import Experiment, error, family, measured, row_name, setting
 
 SEED = 0  # of the bootstrap
 TARGET = 1e-3  # Chamfer distance (squared scene units) whose time is asked for
@@ -24,13 +24,12 @@ class Trial:
     task: str
     title: str
     error: str
-    factor: float
     heading: str
 
 
 TRIALS = (
-    Trial("completion", "completing a shape", "chamfer_l2", SCALE, "Chamfer × 1000 (scene units²)"),
-    Trial("ablation", "rendering an image", "error_p95", SCALE, "depth error, 95th percentile × 1000 (scene units)"),
+    Trial("completion", "completing a shape", "chamfer_l2", "Chamfer × 1000 (scene units²)"),
+    Trial("ablation", "rendering an image", "error_p95", "depth error, 95th percentile × 1000 (scene units)"),
 )
 
 
@@ -47,7 +46,7 @@ class Setting:
     @cached_property
     def errors(self) -> list[np.ndarray]:
         """Of each shape; infinite where a run did not end ok or is missing."""
-        return self._groups(lambda r: _scaled(measured(r, self.trial.error), self.trial.factor))
+        return self._groups(lambda r: SCALE * max(error(r, self.trial.error), LEAST))
 
     @cached_property
     def costs(self) -> list[np.ndarray]:
@@ -68,7 +67,7 @@ class Setting:
         found: dict[Hashable, float] = {}
         for record in self.records:
             number = value(record) if record["status"] == "ok" else None
-            found[_run_key(record)] = math.inf if number is None or number != number else float(number)
+            found[_run_key(record)] = math.inf if number is None else float(number)
         shapes = list(dict.fromkeys(shape for shape, _ in self.keys))
         return [np.array([found.get(key, math.inf) for key in self.keys if key[0] == shape]) for shape in shapes]
 
@@ -139,10 +138,6 @@ def seconds(record: dict[str, Any]) -> float | None:
 def evaluations(record: dict[str, Any]) -> float | None:
     """Field values that a run asked for, in the loop or in one rendering."""
     return measured(record, "queries") if record["task"] == "ablation" else record["evaluations"].get("value")
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * max(value, LEAST)
 
 
 def _run_key(record: dict[str, Any]) -> tuple[Hashable, Hashable]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
 Values = np.ndarray | Sequence[float]
@@ -151,16 +152,8 @@ def rank(table: dict[str, dict[Hashable, float | None]]) -> dict[str, float]:
     A method that lacks a shape, or has None, nan or inf for it, has the worst rank there: the number of methods. A
     shape at which no method succeeds counts for none, else leaving it out of all would improve their ranks.
     """
-    succeeded = {
-        method: {shape: error for shape, error in errors.items() if error is not None and math.isfinite(error)}
-        for method, errors in table.items()
-    }
-    shapes = list(dict.fromkeys(shape for errors in succeeded.values() for shape in errors))
-    if not shapes:
-        return dict.fromkeys(table, float(len(table)))
-    errors = np.array([[row.get(shape, math.inf) for shape in shapes] for row in succeeded.values()])
-    ranks = np.where(np.isinf(errors), len(table), stats.rankdata(errors, axis=0))
-    return dict(zip(table, ranks.mean(axis=1).tolist(), strict=True))
+    errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
+    return errors.rank(axis=1).fillna(len(table)).mean().fillna(len(table)).to_dict()
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:

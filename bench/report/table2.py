@@ -1,6 +1,5 @@
 """Table 2 of DIST: shape completion over sparsity, with the published numbers beside ours."""
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bench.report import format, style
 from bench.report.caption import joined, omitted, setup
-from bench.report.experiments import Experiment, family, identity, measured, row_name, setting
+from bench.report.experiments import Experiment, error, family, identity, measured, row_name, setting
 from bench.report.planned import NOT_RUN
 from bench.report.statistics import bootstrap, compare, holm, interquartile_mean, median, paired_bootstrap, rank, wilson
 from bench.report.tables import Result
@@ -34,6 +33,8 @@ PUBLISHED = {
         "DIST with mask": (5.37, 5.15, 5.16, 5.26, 6.33, 7.62),
     },
 }
+Cell = tuple[str, str, str]  # family, row, points
+Run = tuple[Any, Any]  # shape, seed
 REFERENCE = "DIST with mask"  # what the other rows are compared with
 ORACLE = "oracle: the prior at its best"
 SCALE = 1000.0
@@ -52,42 +53,50 @@ CAPTION = (
 
 
 class Runs:
-    """The errors of an experiment's runs by family, row and points: a group of seeds for each shape."""
+    """The errors of an experiment's runs, by family, row and points, then by shape and seed."""
 
     def __init__(self, experiment: Experiment):
-        self.errors: dict[tuple[str, str, str], dict[Any, list[float]]] = {}
-        self.statuses: dict[tuple[str, str, str], Counter[str]] = {}
+        self.errors: dict[Cell, dict[Run, float]] = {}
+        self.statuses: dict[Cell, Counter[str]] = {}
         for record in experiment.records:
             cell = (family(record), row_name(record), str(setting(record["config"], "task", "points")))
-            error = measured(record, "chamfer_l2") if record["status"] == "ok" else None
-            shape = self.errors.setdefault(cell, {}).setdefault(record["config"].get("index"), [])
-            shape.append(math.inf if error is None else SCALE * error)
+            run = (record["config"].get("index"), record["seed"])
+            self.errors.setdefault(cell, {})[run] = SCALE * error(record, "chamfer_l2")
             self.statuses.setdefault(cell, Counter())[record["status"]] += 1
         self.families = list(dict.fromkeys(name for name, _, _ in self.errors))
-        self.rows = list(dict.fromkeys(name for _, name, _ in self.errors))
+        self.rows = list(dict.fromkeys(row for _, row, _ in self.errors))
         found = {points for _, _, points in self.errors}
         self.points = [p for p in POINTS if p in found] + sorted(found - {*POINTS})
 
-    def groups(self, *cell: str) -> list[np.ndarray]:
-        """The errors of a cell's shapes; none where it was not planned."""
-        return [np.array(values) for values in self.errors.get(cell, {}).values()]
+    def rows_of(self, name: str) -> list[str]:
+        """The rows that a family has."""
+        return [row for row in self.rows if any((name, row, points) in self.errors for points in self.points)]
 
-    def of_row(self, name: str, row: str, shapes: list[Any]) -> list[np.ndarray]:
-        """The errors of a row's shapes in a family, at all points together."""
-        return [
-            np.array([x for p in self.points for x in self.errors.get((name, row, p), {}).get(shape, ())])
-            for shape in shapes
-        ]
+    def median(self, *cell: str) -> float | None:
+        """Over shapes and seeds; None where nothing was planned."""
+        return float(median(list(self.errors[cell].values()))) if cell in self.errors else None
 
-    def common(self, name: str, *rows: str) -> list[Any]:
-        """The shapes of a family that all these rows planned, at every point that one of them has."""
-        cells = [self.errors.get((name, row, points), {}) for row in rows for points in self.points]
-        return [shape for shape in cells[0] if all(shape in cell for cell in cells)] if all(cells) else []
+    def pair(self, name: str, row: str, other: str) -> list[list[np.ndarray]]:
+        """The errors of two rows in a family at all points together: groups of the same runs, one a shape."""
+        mine, others = (
+            {(*run, p): e for p in self.points for run, e in self.errors.get((name, one, p), {}).items()}
+            for one in (row, other)
+        )
+        common = [key for key in mine if key in others]
+        return [_by_shape({key: errors[key] for key in common}) for errors in (mine, others)]
 
     def failures(self, name: str, row: str) -> tuple[int, int]:
         """How many of a row's runs in a family did not end ok, and how many there are."""
         together = sum((self.statuses.get((name, row, points), Counter()) for points in self.points), Counter())
         return together.total() - together["ok"], together.total()
+
+
+def _by_shape(errors: dict[Any, float]) -> list[np.ndarray]:
+    """The errors of runs, whose keys begin with the shape, as a group a shape."""
+    shapes: dict[Any, list[float]] = {}
+    for key, value in errors.items():
+        shapes.setdefault(key[0], []).append(value)
+    return [np.array(values) for values in shapes.values()]
 
 
 def make(experiment: Experiment) -> Result:
@@ -98,11 +107,10 @@ def make(experiment: Experiment) -> Result:
     for name in runs.families:
         if name in oracle:
             rows.append([name, ORACLE, *[format.number(oracle[name])] * len(runs.points), ""])
-        for row in runs.rows:
-            if any(runs.groups(name, row, points) for points in runs.points):
-                failed, total = runs.failures(name, row)
-                medians = [_median(runs.groups(name, row, points)) for points in runs.points]
-                rows.append([name, row, *map(format.number, medians), f"{failed} of {total}"])
+        for row in runs.rows_of(name):
+            failed, total = runs.failures(name, row)
+            medians = [runs.median(name, row, points) for points in runs.points]
+            rows.append([name, row, *map(format.number, medians), f"{failed} of {total}"])
         for row, numbers in PUBLISHED.get(name, {}).items():
             known = dict(zip(POINTS, numbers, strict=True))
             rows.append([name, f"published: {row}", *[format.number(known.get(p)) for p in runs.points], ""])
@@ -119,22 +127,18 @@ def make(experiment: Experiment) -> Result:
 def intervals(experiment: Experiment) -> Result:
     """The same with interquartile means, their intervals, ratios to the reference row, and failure rates."""
     runs = Runs(experiment)
-    data = [_statistics(runs, name, row, points) for name, row, points in runs.errors]
-    p_values = _p_values(runs)
+    cells = {cell: _statistics(runs, *cell) for cell in runs.errors}
     rows = []
     for name in runs.families:
         ranks = _ranks(runs, name)
-        for row in runs.rows:
-            if not any(runs.groups(name, row, points) for points in runs.points):
-                continue
-            shown = [
-                s["shown"] for p in runs.points for s in data if (s["family"], s["row"], s["points"]) == (name, row, p)
-            ]
+        for row in runs.rows_of(name):
+            found = [cells.get((name, row, points)) for points in runs.points]
+            shown = [format.MISSING if one is None else _told(one) for one in found]
             share = wilson(*runs.failures(name, row))
             failed = f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]"
-            rows.append([name, row, *shown, failed, _ratio(runs, name, row), format.number(ranks.get(row))])
+            rows.append([name, row, *shown, failed, _ratio(runs, name, row), format.number(ranks[row])])
     columns = ["Family", "Method", *map(_heading, runs.points), "Failed", "Ratio to the reference", "Mean rank"]
-    notes = [f"{row} against {REFERENCE}: p = {p:.2g}" for row, p in p_values.items()]
+    notes = [f"{row} against {REFERENCE}: p = {p:.2g}" for row, p in _p_values(runs).items()]
     return Result(
         name="table2_intervals",
         title="The same, with intervals.",
@@ -149,7 +153,7 @@ def intervals(experiment: Experiment) -> Result:
             _numbers(runs),
             omitted(experiment),
         ),
-        data=pd.DataFrame(data, dtype=object).drop(columns="shown"),
+        data=pd.DataFrame(cells.values(), dtype=object),
         table=pd.DataFrame(rows, columns=columns),
         notes=notes,
     )
@@ -161,9 +165,8 @@ def oracles(experiment: Experiment) -> dict[str, float]:
     shapes = {(family(record), record["config"].get("index")) for record in experiment.records}
     found: dict[str, list[float]] = {}
     for record in fits.records if fits else []:
-        value = measured(record, "chamfer_l2")
-        if (family(record), record["config"].get("index")) in shapes and value is not None and record["status"] == "ok":
-            found.setdefault(family(record), []).append(SCALE * value)
+        if (family(record), record["config"].get("index")) in shapes:
+            found.setdefault(family(record), []).append(SCALE * error(record, "chamfer_l2"))
     return {name: float(median(values)) for name, values in found.items()}
 
 
@@ -176,8 +179,8 @@ def draw(runs: Runs, oracle: dict[str, float]) -> Figure:
     axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
     everything = []
     for axis, name in zip(axes.flat, runs.families, strict=False):
-        for row in runs.rows:
-            medians = [_median(runs.groups(name, row, points)) for points in runs.points]
+        for row in runs.rows_of(name):
+            medians = [runs.median(name, row, points) for points in runs.points]
             everything += medians
             look = style.look(row)
             axis.plot(style.finite(medians), linestyle=look.line, color=look.colour, marker=look.marker, label=row)
@@ -196,64 +199,61 @@ def draw(runs: Runs, oracle: dict[str, float]) -> Figure:
     return figure
 
 
-def _median(groups: list[np.ndarray]) -> float | None:
-    return float(median(np.concatenate(groups))) if groups else None
-
-
-def _statistics(runs: Runs, name: str, row: str, points: str) -> dict[str, Any]:
+def _statistics(runs: Runs, *cell: str) -> dict[str, Any]:
     """Everything about a cell."""
-    groups, statuses = runs.groups(name, row, points), runs.statuses[name, row, points]
+    errors, statuses = runs.errors[cell], runs.statuses[cell]
+    groups = _by_shape(errors)
     mean = bootstrap(groups, interquartile_mean, seed=SEED)
     failed = statuses.total() - statuses["ok"]
     share = wilson(failed, statuses.total())
-    told = format.number(mean.value)
-    if math.isfinite(mean.value) and not math.isnan(mean.low):
-        told += f" [{format.number(mean.low)}, {format.number(mean.high)}]"
     return {
-        **{"family": name, "row": row, "points": points, "shapes": len(groups), "runs": statuses.total()},
-        **{"median": _median(groups), "iqm": mean.value, "iqm_low": mean.low, "iqm_high": mean.high},
-        "mean": float(np.concatenate(groups).mean()),
-        **{"failed": failed, "failed_low": share.low, "failed_high": share.high},
-        "not_run": statuses[NOT_RUN],
-        "shown": told,
+        **dict(zip(("family", "row", "points"), cell, strict=True)),
+        **{
+            "shapes": len(groups),
+            "runs": len(errors),
+            "median": runs.median(*cell),
+            "mean": np.mean([*errors.values()]),
+        },
+        **{"mean": float(np.mean([*errors.values()])), "iqm": mean.value, "iqm_low": mean.low, "iqm_high": mean.high},
+        **{"failed": failed, "failed_low": share.low, "failed_high": share.high, "not_run": statuses[NOT_RUN]},
     }
 
 
+def _told(found: dict[str, Any]) -> str:
+    return f"{format.number(found['iqm'])} {format.interval(found['iqm_low'], found['iqm_high'])}".strip()
+
+
 def _ratio(runs: Runs, name: str, row: str) -> str:
-    shapes = runs.common(name, row, REFERENCE)
-    if row == REFERENCE or not shapes:
+    first, second = runs.pair(name, row, REFERENCE)
+    if row == REFERENCE or not first:
         return ""
-    pair = [runs.of_row(name, one, shapes) for one in (row, REFERENCE)]
-    ratio = paired_bootstrap(*pair, interquartile_mean, seed=SEED)
-    ends = "" if math.isnan(ratio.low) else f" [{format.number(ratio.low)}, {format.number(ratio.high)}]"
-    return format.number(ratio.value) + ends
+    ratio = paired_bootstrap(first, second, interquartile_mean, seed=SEED)
+    return f"{format.number(ratio.value)} {format.interval(ratio.low, ratio.high)}".strip()
 
 
 def _ranks(runs: Runs, name: str) -> dict[str, float]:
     """Each row's mean rank over shapes and points; what a row lacks counts as a failure, lest dropping one pays."""
-    table: dict[str, dict[Any, float | None]] = {}
-    for family_name, row, points in runs.errors:
-        if family_name == name:
-            errors = runs.errors[name, row, points]
-            table.setdefault(row, {}).update({(shape, points): float(median(e)) for shape, e in errors.items()})
-    return rank(table)
+    return rank(
+        {
+            row: {(p, run): e for p in runs.points for run, e in runs.errors.get((name, row, p), {}).items()}
+            for row in runs.rows_of(name)
+        }
+    )
 
 
 def _p_values(runs: Runs) -> dict[str, float]:
     """Holm's p-value of each row against the reference, over the shapes of all families."""
     raw = {}
     for row in runs.rows:
-        pairs = [(name, runs.common(name, row, REFERENCE)) for name in runs.families]
-        first, second = (
-            [g for name, shapes in pairs for g in runs.of_row(name, one, shapes)] for one in (row, REFERENCE)
-        )
+        pairs = [runs.pair(name, row, REFERENCE) for name in runs.families]
+        first, second = ([group for pair in pairs for group in pair[side]] for side in (0, 1))
         if row != REFERENCE and first:
             raw[row] = compare(first, second)
     return dict(zip(raw, holm(list(raw.values())).tolist(), strict=True)) if raw else {}
 
 
 def _numbers(runs: Runs) -> str:
-    counts = {len(runs.groups(*cell)) for cell in runs.errors}
+    counts = {len(_by_shape(errors)) for errors in runs.errors.values()}
     least = min(counts)
     told = f"{least}" if len(counts) == 1 else f"{least} to {max(counts)}"
     few = " Of fewer than 6 shapes an interval covers less than it says: 88 % of four." if least < 6 else ""
@@ -261,7 +261,7 @@ def _numbers(runs: Runs) -> str:
 
 
 def _outcome(experiment: Experiment) -> str:
-    """How many runs did not end ok, by status, and the commonest reasons."""
+    """How many runs did not end ok, by status."""
     failed = [record for record in experiment.records if record["status"] != "ok"]
     total = len(experiment.records)
     if not failed:

@@ -3,12 +3,13 @@
 import html
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench.report.interactive import write_plotly
+from bench.report import interactive
 from bench.report.style import RC
 
 # LaTeX's own characters, and those of ours that its standard fonts lack.
@@ -54,7 +55,7 @@ class Result:
     table: pd.DataFrame | None = None
     notes: list[str] = field(default_factory=list)
     figure: Figure | None = None
-    page: str | None = None  # HTML of the figure that answers the mouse
+    page: Any = None  # the same as a figure of Plotly that answers the mouse
 
 
 def write(result: Result, folder: Path) -> list[Path]:
@@ -64,9 +65,6 @@ def write(result: Result, folder: Path) -> list[Path]:
     texts = {".csv": result.data.to_csv(index=False), ".md": markdown(result)}
     if result.table is not None:
         texts[".tex"] = latex(result)
-    if result.page is not None:
-        texts[".html"] = result.page
-        write_plotly(folder)
     for suffix, text in texts.items():
         base.with_suffix(suffix).write_bytes(text.encode("utf-8", "backslashreplace"))
     drawn = [base.with_suffix(suffix) for suffix in (".png", ".pdf")] if result.figure is not None else []
@@ -74,7 +72,11 @@ def write(result: Result, folder: Path) -> list[Path]:
         for path in drawn:
             # Without a date, so that the same records give the same file.
             result.figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
-    return [base.with_suffix(suffix) for suffix in texts] + drawn
+    written = [base.with_suffix(suffix) for suffix in texts] + drawn
+    if result.page is not None:
+        written.append(base.with_suffix(".html"))
+        interactive.write(result.page, written[-1])
+    return written
 
 
 def markdown(result: Result) -> str:
