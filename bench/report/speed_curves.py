@@ -72,7 +72,7 @@ def draw_curves(
             axis.fill_between(where, style.finite(low), style.finite(high), color=look.colour, alpha=0.15, lw=0)
             everything += [*where]
         style.log_axis(axis, "x", everything)
-        style.log_axis(axis, "y", [x for name in shown for course in shown[name] for x in course["error"]])
+        style.log_axis(axis, "y", [x for row in rows for course in shown[row.name] for x in course["error"]])
         axis.set(xlabel=label, ylabel=TRIALS[0].heading)
     for row in rows:
         ended, hit = zip(*times[row.name], strict=True)
@@ -108,8 +108,8 @@ def band(
         values[row, known] = run["error"].to_numpy()[last[known]]
         if over and len(run):
             values[row, where > run[along].iloc[-1]] = np.inf
-    low, middle, high = (np.quantile(values, q, axis=0, method="higher") for q in (0.25, 0.5, 0.75))
-    return where, low, middle, high
+    low, high = (np.quantile(values, q, axis=0, method="nearest") for q in (0.25, 0.75))
+    return where, low, np.median(values, axis=0), high
 
 
 def _course(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:

@@ -73,17 +73,20 @@ def draw(panels: list[list[Placed]]) -> Figure:
     figure = Figure(figsize=(style.WIDTH, 3.9), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, panel in zip(axes, panels, strict=True):
-        middle = np.sqrt(np.prod([point.x for point in (panel[0], panel[-1])]))
+        middle = np.exp(np.mean(np.log([min(point.x for point in panel), max(point.x for point in panel)])))
         for number, point in enumerate(sorted(panel, key=lambda point: point.x)):
             look = style.look(point.row.renderer)
             fill = look.colour if point.on_front else "none"
             axis.plot(
                 point.x, point.y, "x" if point.lost else look.marker, color=look.colour, mfc=fill, ls="none", ms=5
             )
-            if point.on_front or point.lost:
+            how = {"textcoords": "offset points", "fontsize": 5.5}
+            if point.lost:
+                axis.annotate(point.label, (point.x, point.y), (2, 4), rotation=30, **how)
+            elif point.on_front:
                 side = "left" if point.x < middle else "right"
                 at = (4 if side == "left" else -4, 4 if number % 2 else -8)
-                axis.annotate(point.label, (point.x, point.y), at, textcoords="offset points", fontsize=5.5, ha=side)
+                axis.annotate(point.label, (point.x, point.y), at, ha=side, **how)
         line = front_line(panel)
         axis.step(
             [point.x for point in line], [point.y for point in line], where="post", color="#999999", lw=0.8, zorder=0
@@ -91,6 +94,7 @@ def draw(panels: list[list[Placed]]) -> Figure:
         trial = panel[0].row.trial
         for letter in ("x", "y"):
             style.log_axis(axis, letter, [getattr(point, letter) for point in panel])
+        axis.margins(x=0.08, y=0.1)
         axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
     for renderer in dict.fromkeys(point.row.renderer for panel in panels for point in panel):
         look = style.look(renderer)
