@@ -16,6 +16,7 @@ from renderers.field import Field
 COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
+    "evaluations.observed": "pixels whose depth was given",
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
     "seconds.warmup": "one step's forward and backward pass before the clock, whose work is not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
@@ -93,6 +94,7 @@ def _note_costs(record: Record, problem: Problem, course: Course) -> None:
         "gradient": course.counts.gradient,
         "per_ray": course.counts.value / problem.rays_per_iteration / iterations,
         "rays_per_iteration": problem.rays_per_iteration,
+        "observed": int(problem.observed.sum()),
         "iterations": len(course.curve),
     }
     record.peak_memory_bytes = course.peak_memory_bytes

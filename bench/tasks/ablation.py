@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 from statistics import median
 
 import torch
@@ -43,8 +44,8 @@ DEFINITIONS = {
     "lost, false": "pixels that the float64 reference hits and the renderer does not, and the other way round",
     "rays, hits": "pixels of that image; those that the reference hits",
     "wrong": "pixels that both hit at depths further apart than task.wrong",
-    "error_p95": "difference of depth that 95 % of the reference's pixels stay below, a lost one counted as infinite; "
-    "in scene units",
+    "error_p95": "difference of depth that 95 % of the pixels that either hits do not exceed, where a pixel that only "
+    "one of them hits counts as infinite; in scene units",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
 
@@ -202,9 +203,9 @@ class Workbench:
             "false": int((found.mask & ~true.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
-        beyond = torch.cat([error, torch.full((numbers["lost"],), torch.inf, dtype=error.dtype)])
+        beyond = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
         if beyond.numel():
-            numbers["error_p95"] = beyond.sort().values[int(0.95 * (len(beyond) - 1))].item()
+            numbers["error_p95"] = beyond.sort().values[ceil(0.95 * len(beyond)) - 1].item()
         if error.numel():
             middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
             numbers |= {"depth_error_median": middle, "depth_error_p99": high, "depth_error_max": error.max().item()}

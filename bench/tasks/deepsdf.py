@@ -89,5 +89,5 @@ class Samples:
     distances: Float[Tensor, " n"]
 
     def compare(self, field: Field, iteration: int) -> Terms:
-        """The weighted error (DeepSDF, Eq. 10, without its clamp, beyond which no sample lies)."""
+        """The weighted error (DeepSDF, Eq. 10, without its clamp)."""
         return {"distance": self.settings.distance_weight * (field(self.points) - self.distances).abs().mean()}
