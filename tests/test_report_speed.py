@@ -145,6 +145,51 @@ def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
     ]  # failed runs did not, whatever they scored
 
 
+def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_path):
+    for index in range(5):
+        completed(tmp_path, "dist", [9, 8], index=index, status="nan")
+    completed(tmp_path, "dist", [9, 8, 8, 0.5], index=5)
+    figure = made(tmp_path, speed_curves.make).figure
+    (steps,) = [line for line in figure.axes[2].lines if len(line.get_xdata()) > 1]
+    assert steps.get_ydata()[-1] == pytest.approx(5 / 6)
+
+
+def test_a_run_without_a_curve_that_ended_ok_is_censored_when_it_ended(tmp_path):
+    folder = completed(tmp_path, "dist", [9, 8, 2])
+    (folder / "curve.jsonl").unlink()
+    (record,) = read_records(tmp_path)[0]
+    course = speed_curves._course(choose([record], "speed_accuracy", tmp_path), record)
+    assert speed_curves._time_to(course, record) == (2.0, False)
+
+
+def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
+    for index in range(2):
+        completed(tmp_path, "dist", [9, 1], index=index)
+    completed(tmp_path, "idr", [9, 1], renderer="idr")
+    result = made(tmp_path, speed_front.make)
+    row = result.table.set_index("Setting").loc["idr"]
+    assert row["Failed"] == "0 of 1, 1 missing"
+    assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
+
+
+def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
+    folder = completed(tmp_path, "dist", [9, 1])
+    record = json.loads((folder / "record.json").read_text())
+    record["seconds"]["forward"] = "nan"
+    (folder / "record.json").write_text(json.dumps(record))
+    assert math.isinf(made(tmp_path, speed_front.make).data["seconds"].iloc[0])
+
+
+def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
+    completed(tmp_path, "dist", [9, 1])
+    settings = {"index": 0, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "validation"}
+    write_run(tmp_path, "speed_accuracy", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
+              settings=settings, minute=0)  # fmt: skip
+    result = made(tmp_path, speed_front.make)
+    assert result.data["error"].tolist() == [1.0]
+    assert "Not shown: 1 run" in result.caption
+
+
 def test_the_median_over_runs_holds_a_failed_run_as_infinite():
     columns = ["seconds", "value_evaluations", "error"]
     runs = [pd.DataFrame([[0, 0, 9.0], [1, 10, e], [2, 20, e]], columns=columns) for e in (1.0, 2.0)]
@@ -158,7 +203,9 @@ def test_renderings_of_another_size_are_not_compared(tmp_path):
     rendered(tmp_path, "dist", 1.0, 0.01)
     rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
     rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
-    data = made(tmp_path, speed_front.make).data
+    result = made(tmp_path, speed_front.make)
+    data = result.data
+    assert "Not shown: 1 renderings of another size." in result.caption
     assert data["setting"].tolist() == ["dist", "dist, 20 steps"]
     assert data["dominated"].tolist() == [False, False]
     assert data["evaluations"].tolist() == [1000, 1000]

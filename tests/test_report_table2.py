@@ -1,24 +1,26 @@
 """Table 2 and the priors' page, made from run folders whose numbers are known."""
 
+import json
 import math
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from bench.report import priors, style, table2
+from bench.report import priors, style, table2, table2_intervals
 from bench.report.experiments import choose
 from bench.report.paper import write_paper
 from bench.report.records import read_records
+from bench.report.table2_runs import POINTS
 from tests.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture
 
-REFERENCE, OTHER = table2.REFERENCE, "Naive with mask"
+REFERENCE, OTHER = table2_intervals.REFERENCE, "Naive with mask"
 
 
 def completed(results, label, chamfer, **changed):
     """A run of Table 2; `points`, `index`, `dataset` as named."""
     points, index = changed.pop("points", "100"), changed.pop("index", 0)
-    task = changed.pop("task", "completion")
+    task, minute = changed.pop("task", "completion"), changed.pop("minute", None)
     failed = chamfer is None
     return write_run(
         results,
@@ -27,6 +29,7 @@ def completed(results, label, chamfer, **changed):
         **{"task": task, "dataset": "sofa", "status": "diverged" if failed else "ok"} | changed,
         metrics={} if failed else {"chamfer_l2": chamfer / 1000},
         settings={"task": {"points": points, "_target_": task}, "index": index, "dataset": {"name": "sofa"}},
+        **({"minute": minute} if minute is not None else {}),
     )
 
 
@@ -68,7 +71,7 @@ def test_columns_stand_as_in_the_paper_and_published_numbers_are_marked(tmp_path
 def test_published_numbers_with_a_mask_are_no_worse_than_without(family):
     """As the paper says of them: a wrong digit would stand out; dense depth has the mask in both."""
     numbers = table2.PUBLISHED[family]
-    assert all(len(values) == len(table2.POINTS) for values in numbers.values())
+    assert all(len(values) == len(POINTS) for values in numbers.values())
     assert numbers["DIST"][0] == numbers["DIST with mask"][0]
     assert all(b < a for a, b in zip(numbers["DIST"][1:], numbers["DIST with mask"][1:], strict=True))
 
@@ -90,7 +93,8 @@ def test_the_same_cell_run_again_is_its_newest_run(tmp_path):
 def test_families_and_both_tasks_share_a_table(tmp_path):
     completed(tmp_path, REFERENCE, 1.0)
     completed(tmp_path, "DeepSDF samples", 2.0, task="deepsdf")
-    folder = {"task": {"points": "100"}, "index": 0, "dataset": {"path": "/somewhere/chairs"}}
+    task = {"points": "100", "_target_": "completion"}
+    folder = {"task": task, "index": 0, "dataset": {"path": "/some/where/chairs"}}
     write_run(
         tmp_path, "table2", REFERENCE, task="completion", dataset="mesh", metrics={"chamfer_l2": 0.005}, settings=folder
     )
@@ -99,7 +103,7 @@ def test_families_and_both_tasks_share_a_table(tmp_path):
     assert own[["Family", "Method", "100 pts"]].to_numpy().tolist() == [
         ["sofa", REFERENCE, "1.00"],
         ["sofa", "DeepSDF samples", "2.00"],
-        ["chairs", REFERENCE, "5.00"],
+        ["where/chairs", REFERENCE, "5.00"],
     ]
 
 
@@ -116,7 +120,7 @@ def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
     for index, value in enumerate(size):
         completed(tmp_path, REFERENCE, value, index=index)
         completed(tmp_path, OTHER, 2 * value, index=index)
-    result = made(tmp_path, table2.intervals)
+    result = made(tmp_path, table2_intervals.make)
     data = result.data.set_index("row")
     for row in (REFERENCE, OTHER):
         assert data.loc[row, "iqm_low"] < data.loc[row, "iqm"] < data.loc[row, "iqm_high"]
@@ -125,7 +129,7 @@ def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
     assert cell(result, OTHER, "Ratio to the reference") == "2.00 [2.00, 2.00]"
     assert cell(result, REFERENCE, "Mean rank") == "1.00"
     assert cell(result, OTHER, "Mean rank") == "2.00"
-    assert result.notes == [f"{OTHER} against {REFERENCE}: p = 0.0078"]  # 2 / 2^8
+    assert result.notes == [f"{OTHER} is no better (0 of 8 shapes) than {REFERENCE}: p = 0.0078"]  # 2 / 2^8
 
 
 @pytest.mark.parametrize("missing", ["deleted", "not_run"])
@@ -135,15 +139,15 @@ def test_dropping_failed_runs_improves_no_rank(tmp_path, missing):
         completed(tmp_path, REFERENCE, value, index=index)
     for index, value in enumerate((2.0, 2.0, 2.0, None)):
         folder = completed(tmp_path, OTHER, value, index=index)
-    before = float(cell(made(tmp_path, table2.intervals), OTHER, "Mean rank"))
+    before = float(cell(made(tmp_path, table2_intervals.make), OTHER, "Mean rank"))
     if missing == "deleted":
         (folder / "record.json").unlink()
         folder.rmdir()
-        after = float(cell(made(tmp_path, table2.intervals), OTHER, "Mean rank"))
+        after = float(cell(made(tmp_path, table2_intervals.make), OTHER, "Mean rank"))
     else:
         text = (folder / "record.json").read_text().replace('"diverged"', '"not_run"')
         (folder / "record.json").write_text(text)
-        after = float(cell(made(tmp_path, table2.intervals), OTHER, "Mean rank"))
+        after = float(cell(made(tmp_path, table2_intervals.make), OTHER, "Mean rank"))
     assert after >= before
 
 
@@ -151,11 +155,81 @@ def test_a_shape_that_a_row_lacks_is_a_failure_in_its_rank_and_no_part_of_its_ra
     for index, value in enumerate((1.0, 9.0)):
         completed(tmp_path, REFERENCE, value, index=index)
     completed(tmp_path, OTHER, 2.0, index=1)
-    result = made(tmp_path, table2.intervals)
+    result = made(tmp_path, table2_intervals.make)
     assert cell(result, OTHER, "Mean rank") == "1.50"
     assert cell(result, OTHER, "Ratio to the reference") == "0.222"
     assert "Shapes a cell: 1 to 2." in result.caption
-    assert "88 % of four" in result.caption
+
+
+def test_a_method_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
+    for index in range(6):
+        for points in ("dense", "100", "20"):
+            completed(tmp_path, REFERENCE, 1.0 + index, index=index, points=points)
+            completed(tmp_path, OTHER, None if points == "20" else 0.5, index=index, points=points)
+    result = made(tmp_path, table2_intervals.make)
+    assert cell(result, OTHER, "Ratio to the reference").startswith("∞")
+    assert cell(result, OTHER, "Shapes with a failure") == "100 % [61, 100]"
+    assert result.notes == [f"{OTHER} is no better (0 of 6 shapes) than {REFERENCE}: p = 0.031"]
+
+
+def test_a_row_without_some_points_has_no_ratio(tmp_path):
+    for points in ("dense", "20"):
+        completed(tmp_path, REFERENCE, 1.0, points=points)
+    completed(tmp_path, OTHER, 2.0, points="dense")
+    result = made(tmp_path, table2_intervals.make)
+    assert cell(result, OTHER, "Ratio to the reference") == ""
+    assert cell(result, OTHER, "20 pts") == "–"
+
+
+def test_the_points_of_a_shape_are_not_drawn_as_if_they_were_seeds(tmp_path):
+    for points, mine, other in (("dense", 1.0, 4.0), ("20", 4.0, 1.0)):
+        for index in range(6):
+            completed(tmp_path, REFERENCE, mine, index=index, points=points)
+            completed(tmp_path, OTHER, other, index=index, points=points)
+    assert cell(made(tmp_path, table2_intervals.make), OTHER, "Ratio to the reference") == "1.00 [1.00, 1.00]"
+
+
+@pytest.mark.parametrize("changed", [{"evaluation": {"grid": 8}}, {"split": "validation"}, {"prior": {"shapes": 1}}])
+def test_an_oracle_that_was_judged_otherwise_is_not_shown(tmp_path, changed):
+    completed(tmp_path, REFERENCE, 1.0)
+    settings = {"index": 0, "dataset": {"name": "sofa"}} | changed
+    write_run(
+        tmp_path, "priors", None, task="prior_fit", dataset="sofa", metrics={"chamfer_l2": 1e-4}, settings=settings
+    )
+    assert table2.ORACLE not in made(tmp_path).table["Method"].tolist()
+
+
+def test_an_oracle_of_some_shapes_is_not_shown(tmp_path):
+    for index in range(2):
+        completed(tmp_path, REFERENCE, 1.0, index=index)
+    fitted(tmp_path, 0.25)
+    assert table2.ORACLE not in made(tmp_path).table["Method"].tolist()
+
+
+def test_another_setting_under_the_same_label_is_no_part_of_the_row(tmp_path):
+    for index in range(3):
+        completed(tmp_path, REFERENCE, 2.0, index=index, minute=10 + index)
+    task = {"points": "100", "_target_": "completion"}
+    odd = {"task": task, "index": 0, "dataset": {"name": "sofa"}, "renderer": {"epsilon": 1.0}}
+    write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 1}, settings=odd,
+              minute=1)  # fmt: skip
+    result = made(tmp_path)
+    assert cell(result, REFERENCE, "100 pts") == "2.00"
+    assert "Not shown: 1 run" in result.caption
+    write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 1}, settings=odd,
+              minute=50)  # fmt: skip
+    assert cell(made(tmp_path), REFERENCE, "Failed") == "0 of 1"  # the newest setting, alone
+
+
+def test_the_number_of_points_given_is_told_and_orders_the_figure(tmp_path):
+    for points, given in (("10%", 20), ("50", 50), ("dense", 200)):
+        folder = completed(tmp_path, REFERENCE, float(given), points=points)
+        record = json.loads((folder / "record.json").read_text())
+        record["evaluations"] = {"observed": given}
+        (folder / "record.json").write_text(json.dumps(record))
+    result = made(tmp_path)
+    assert "Points given, medians: sofa dense 200, 10% 20." in result.caption
+    assert list(result.figure.axes[0].lines[0].get_xdata()) == [20, 50, 200]
 
 
 def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):

@@ -13,7 +13,8 @@ def setup(experiment: Experiment) -> str:
     config, records = experiment.asked(), experiment.records
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in records))
     known = [scene for scene in scenes if scene] or [records[0]["dataset"]]
-    resolution = setting(config, "view", "resolution")
+    sizes = {setting(record["config"], "view", "resolution") for record in records}
+    resolution = sizes.pop() if len(sizes) == 1 else None
     machines = [_machine(*machine) for machine in experiment.machines()]
     parts = [
         f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ class Kind:
     Args:
         tasks: of its runs.
         varies: keys of the configuration, beside `ROW_KEYS`, in which its runs differ.
-        cell: settings of the task that tell apart runs of one row; where `varies` is empty, the renderer's do.
+        cell: settings of the task in which runs of one row differ.
     """
 
     tasks: tuple[str, ...]
@@ -36,7 +36,7 @@ KINDS = {
     "fig5": Kind(("completion",)),
     "fig7": Kind(("ablation",)),
     "gradients": Kind(("gradients",)),
-    "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split"), ("points",)),
+    "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split")),
 }
 MACHINE = ("cpu", "device", "threads")
 
@@ -108,19 +108,25 @@ class Experiment:
 
 
 def choose(records: list[dict[str, Any]], name: str, results_dir: Path) -> Experiment | None:
-    """The record that was asked for last and those that share all but the row's own with it; None without a record.
+    """The record that was asked for last and those that may be compared with it; None without a record.
 
-    What must be shared is the configuration but for `NOT_SHARED`. Rows stand in the order in which they started; a row
-    that was run more than once with the same renderer is its newest record. The rows may be of different machines:
-    captions say so.
+    These share all of the configuration but for `NOT_SHARED` and what the experiment varies; runs of one task share the
+    split and the camera, too. Rows stand in the order in which they started; a run that was made more than once is its
+    newest record. Where an experiment varies more than its rows, a row is of one setting, the one asked for last: two
+    settings under one label would be one row otherwise. The rows may be of different machines: captions say so.
     """
-    found = [r for r in records if r["config"].get("experiment") == name and r["task"] in KINDS[name].tasks]
+    kind = KINDS[name]
+    found = [r for r in records if r["config"].get("experiment") == name and r["task"] in kind.tasks]
     if not found:
         return None
     found.sort(key=started)
-    kind = KINDS[name]
-    last = _shared(max(found, key=asked), kind)
-    same = [r for r in found if _shared(r, kind) == last]
+    same = _like_newest(found, lambda record: _shared(record, kind))
+    if kind.varies:
+        by_task = [[r for r in same if r["task"] == task] for task in kind.tasks]
+        same = [r for own in by_task for r in _like_newest(own, _seen)]
+        named = {(row_name(r), r["task"]): r for r in sorted(same, key=asked)}
+        same = [r for r in same if _variant(r, kind) == _variant(named[row_name(r), r["task"]], kind)]
+        same.sort(key=started)
     rows: dict[Hashable, dict[str, Any]] = {}
     for record in same:
         rows[_key(record, kind)] = record  # takes the place of the first, with the content of the newest
@@ -133,9 +139,9 @@ def row_name(record: dict[str, Any]) -> str:
 
 
 def family(record: dict[str, Any]) -> str:
-    """The name of the record's dataset: a family's, or that of the mesh file or folder."""
+    """The name of the record's dataset: a family's, or the end of the path of a mesh file or folder."""
     path = setting(record["config"], "dataset", "path")
-    return Path(path).stem if path else record["dataset"]
+    return "/".join(Path(path).parts[-2:]) if path else record["dataset"]
 
 
 def measured(record: dict[str, Any], name: str) -> int | float | None:
@@ -188,11 +194,32 @@ def repeated(records: list[dict[str, Any]]) -> str:
     return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""
 
 
+def _like_newest(records: list[dict[str, Any]], part: Callable[[dict[str, Any]], Any]) -> list[dict[str, Any]]:
+    """The records that are in some part as the one that was asked for last."""
+    if not records:
+        return []
+    newest = part(max(records, key=asked))
+    return [record for record in records if part(record) == newest]
+
+
 def _key(record: dict[str, Any], kind: Kind) -> Hashable:
-    own = (row_name(record), _seed(record), _index(record))
-    if not kind.varies:
-        return (*own, str(sorted(_renderer(record).items())))
-    return (*own, record["task"], family(record), *(str(setting(record["config"], "task", key)) for key in kind.cell))
+    """What tells a run from the others of its experiment."""
+    return (
+        *(row_name(record), _seed(record), _index(record), str(sorted(_renderer(record).items())), record["task"]),
+        *((family(record), *(str(setting(record["config"], "task", key)) for key in kind.cell)) if kind.varies else ()),
+    )
+
+
+def _seen(record: dict[str, Any]) -> tuple[Any, Any]:
+    """The split and the camera, whose resolution is a setting."""
+    view = record["config"].get("view") or {}
+    return record["config"].get("split"), {key: value for key, value in view.items() if key != "resolution"}
+
+
+def _variant(record: dict[str, Any], kind: Kind) -> Any:
+    """All settings of a row: its renderer's, its task's but for those that tell its cells apart, and the resolution."""
+    task = {key: value for key, value in (record["config"].get("task") or {}).items() if key not in kind.cell}
+    return _renderer(record), task, setting(record["config"], "view", "resolution")
 
 
 def _renderer(record: dict[str, Any]) -> dict[str, str]:

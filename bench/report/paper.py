@@ -13,7 +13,7 @@ SUFFIXES = (".html", ".pdf", ".csv", ".md", ".tex")
 MAKERS = {  # each file's name, its experiment and what makes it, in the order of the page
     "table1": ("table1", "table1.make"),
     "table2": ("table2", "table2.make"),
-    "table2_intervals": ("table2", "table2.intervals"),
+    "table2_intervals": ("table2", "table2_intervals.make"),
     "priors": ("priors", "priors.make"),
     "speed_front": ("speed_accuracy", "speed_front.make"),
     "speed_curves": ("speed_accuracy", "speed_curves.make"),

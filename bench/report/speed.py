@@ -1,6 +1,7 @@
 """Speed against accuracy: the runs of each setting of each renderer, aligned by shape and seed."""
 
 import math
+from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,7 +34,7 @@ TRIALS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Setting:
     """All runs of one setting in one trial, aligned with those of the others: a group of seeds for each shape."""
 
@@ -53,6 +54,16 @@ class Setting:
         """Seconds of each shape: of the loop, or of one rendering. Infinite as the errors."""
         return self._groups(seconds)
 
+    @cached_property
+    def evaluations(self) -> list[np.ndarray]:
+        """Field values asked for, of each shape; infinite as the errors."""
+        return self._groups(evaluations)
+
+    @property
+    def missing(self) -> int:
+        """Runs that others have and this setting lacks."""
+        return len(set(self.keys) - {_run_key(record) for record in self.records})
+
     @property
     def failed(self) -> int:
         """Runs that did not end ok."""
@@ -67,7 +78,8 @@ class Setting:
         found: dict[Hashable, float] = {}
         for record in self.records:
             number = value(record) if record["status"] == "ok" else None
-            found[_run_key(record)] = math.inf if number is None else float(number)
+            sound = number is not None and not math.isnan(number)
+            found[_run_key(record)] = float(number) if sound else math.inf
         shapes = list(dict.fromkeys(shape for shape, _ in self.keys))
         return [np.array([found.get(key, math.inf) for key in self.keys if key[0] == shape]) for shape in shapes]
 
@@ -109,11 +121,14 @@ def front_line(panel: list[Placed]) -> list[Placed]:
 
 
 def settings(experiment: Experiment, trial: Trial) -> list[Setting]:
-    """The settings of a trial, in the order in which they started. Renderings must be of one size to be compared."""
+    """The settings of a trial, in the order in which they started.
+
+    Renderings must be of one size to be compared: of that of most of them.
+    """
     own = [record for record in experiment.records if record["task"] == trial.task]
     if trial.task == "ablation" and own:
-        largest = max(setting(record["config"], "view", "resolution") for record in own)
-        own = [record for record in own if setting(record["config"], "view", "resolution") == largest]
+        size = Counter(map(resolution, own)).most_common(1)[0][0]
+        own = [record for record in own if resolution(record) == size]
     keys = sorted({_run_key(record) for record in own}, key=str)
     rows: dict[str, list[dict[str, Any]]] = {}
     for record in own:
@@ -125,6 +140,29 @@ def own(rows: list[Setting]) -> list[Setting]:
     """The setting that bears each renderer's name; all of a renderer where none does."""
     names = {row.name for row in rows}
     return [row for row in rows if row.name == row.renderer or row.renderer not in names]
+
+
+def resolution(record: dict[str, Any]) -> Any:
+    """Pixels a side that were asked for."""
+    return setting(record["config"], "view", "resolution")
+
+
+def left_out(experiment: Experiment) -> str:
+    """How many renderings of another size are not shown, as a sentence; empty where none is."""
+    renderings = sum(record["task"] == "ablation" for record in experiment.records)
+    count = renderings - sum(len(row.records) for row in settings(experiment, TRIALS[1]))
+    return f"Not shown: {count} renderings of another size." if count else ""
+
+
+def sizes(experiment: Experiment) -> str:
+    """The sizes of the images of each trial, as a sentence."""
+    told = []
+    for trial in TRIALS:
+        found = Counter(resolution(r) for row in settings(experiment, trial) for r in row.records)
+        if found:
+            listed = ", ".join(f"{size}×{size} ({count} runs)" for size, count in found.most_common())
+            told.append(f"{trial.title} {listed}")
+    return f"Pixels: {'; '.join(told)}."
 
 
 def seconds(record: dict[str, Any]) -> float | None:
@@ -142,4 +180,9 @@ def evaluations(record: dict[str, Any]) -> float | None:
 
 def _run_key(record: dict[str, Any]) -> tuple[Hashable, Hashable]:
     """The shape and the seed of a run."""
-    return (family(record), record["config"].get("index")), record["seed"]
+    return shape_of(record), record["seed"]
+
+
+def shape_of(record: dict[str, Any]) -> tuple[str, Any]:
+    """The shape of a run."""
+    return family(record), record["config"].get("index")

@@ -5,14 +5,18 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from bench.report import curves, format, interactive, statistics, style
 from bench.report.caption import joined, omitted, setup
 from bench.report.experiments import Experiment, family, identity, measured
-from bench.report.speed import SCALE, SEED, TARGET, TRIALS, Setting, own, settings
+from bench.report.speed import SCALE, SEED, TARGET, TRIALS, Setting, own, seconds, settings, shape_of, sizes
 from bench.report.tables import Result
+
+ALONG = {"seconds": "time (seconds)", "value_evaluations": "field values"}
+Reached = tuple[float, bool]  # seconds, and whether that is when the target was reached
 
 
 def make(experiment: Experiment) -> Result:
@@ -40,10 +44,12 @@ def make(experiment: Experiment) -> Result:
         title="Error over time and over evaluations.",
         caption=joined(
             setup(experiment),
+            sizes(experiment),
             "Left and middle: Chamfer distance times 1000 on the way, medians over the runs of each renderer's own "
             "setting; bands hold the middle half. A run that did not end ok is infinite past its end. Right: the share "
-            f"of runs not yet at {SCALE * TARGET:g} × 10⁻³ (Kaplan and Meier); a run that ended above it is censored. "
-            "Looks on the way are on half the grid. The table has all settings, "
+            f"of runs not yet at {SCALE * TARGET:g} × 10⁻³ (Kaplan and Meier); a run that ended above it is censored, "
+            "one that failed stays to the end. "
+            "The table has all settings, "
             "and the median time of the runs that reached it.",
             omitted(experiment),
         ),
@@ -55,15 +61,11 @@ def make(experiment: Experiment) -> Result:
 
 
 @style.styled
-def draw_curves(
-    rows: list[Setting], shown: dict[str, list[pd.DataFrame]], times: dict[str, list[tuple[float, bool]]]
-) -> Figure:
+def draw_curves(rows: list[Setting], shown: dict[str, list[pd.DataFrame]], times: dict[str, list[Reached]]) -> Figure:
     """Error over seconds, over evaluations, and survival."""
     figure = Figure(figsize=(style.WIDTH, 2.9), layout="constrained")
     axes = figure.subplots(1, 3)
-    for axis, along, label in zip(
-        axes, ("seconds", "value_evaluations"), ("time (seconds)", "field values"), strict=False
-    ):
+    for axis, (along, label) in zip(axes, ALONG.items(), strict=False):
         everything: list[float] = []
         for row in rows:
             where, low, middle, high = band(shown[row.name], [r["status"] != "ok" for r in row.records], along)
@@ -74,21 +76,32 @@ def draw_curves(
         style.log_axis(axis, "x", everything)
         style.log_axis(axis, "y", [x for row in rows for course in shown[row.name] for x in course["error"]])
         axis.set(xlabel=label, ylabel=TRIALS[0].heading)
-    for row in rows:
-        ended, hit = zip(*times[row.name], strict=True)
-        left, look = statistics.kaplan_meier(ended, hit), style.look(row.renderer)
-        where = np.append(left.times, max(ended))
-        axes[2].step(
-            where, np.append(left.remaining, left.remaining[-1]), where="post", color=look.colour, label=row.name
-        )
-        censored = [time for time, reached in times[row.name] if not reached]
-        at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in censored]
-        axes[2].plot(censored, at, "|", color=look.colour, ms=6)
-    axes[2].set(xlabel="time (seconds)", ylabel=f"share not yet at {SCALE * TARGET:g}", ylim=(-0.03, 1.03))
-    style.log_axis(axes[2], "x", [time for row in rows for time, _ in times[row.name]])
+    _survival(axes[2], {row: times[row.name] for row in rows})
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5)
     return figure
+
+
+def _survival(axis: Axes, times: dict[Setting, list[Reached]]) -> None:
+    """The share of each row's runs that are not at the target yet; a tick where one ended before it got there."""
+    known = [time for row in times.values() for time, _ in row if math.isfinite(time)]
+    latest = max(known, default=1.0)
+    for row, reached in times.items():
+        look = style.look(row.renderer)
+        left = survival(reached, latest)
+        end = max(min(time, latest) for time, _ in reached)
+        where, share = np.append(left.times, end), np.append(left.remaining, left.remaining[-1])
+        axis.step(where, share, where="post", color=look.colour)
+        ticks = [time for time, hit in reached if not hit and math.isfinite(time)]
+        at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in ticks]
+        axis.plot(ticks, at, "|", color=look.colour, ms=6)
+    axis.set(xlabel="time (seconds)", ylabel=f"share not yet at {SCALE * TARGET:g}", ylim=(-0.03, 1.03))
+    style.log_axis(axis, "x", known)
+
+
+def survival(reached: list[Reached], latest: float) -> statistics.Survival:
+    """Kaplan and Meier's curve of runs, of which those with an infinite time, which failed, stay to the latest."""
+    return statistics.kaplan_meier([min(time, latest) for time, _ in reached], [hit for _, hit in reached])
 
 
 def band(
@@ -134,13 +147,17 @@ def _pairs(shown: dict[str, list[pd.DataFrame]], row: Setting) -> Any:
     return zip(shown[row.name], row.records, strict=True)
 
 
-def _time_to(course: pd.DataFrame, record: dict[str, Any]) -> tuple[float, bool]:
-    """When a run was first seen at the target, or else when it ended."""
-    if record["status"] == "ok":
-        below = course[course["error"] <= SCALE * TARGET]
-        if len(below):
-            return float(below["seconds"].iloc[0]), True
-    return float(course["seconds"].iloc[-1]) if len(course) else 0.0, False
+def _time_to(course: pd.DataFrame, record: dict[str, Any]) -> Reached:
+    """When a run was first seen at the target; or else when it ended, and infinite where it failed or was not run.
+
+    A run that failed would never have come there: it stays among those that have not, to the end.
+    """
+    if record["status"] != "ok":
+        return math.inf, False
+    below = course[course["error"] <= SCALE * TARGET]
+    if len(below):
+        return float(below["seconds"].iloc[0]), True
+    return seconds(record) or 0.0, False
 
 
 def correlation(experiment: Experiment) -> Result:
@@ -149,12 +166,16 @@ def correlation(experiment: Experiment) -> Result:
     data, clouds = [], {}
     for row in rows:
         courses = [_course(experiment, record).dropna() for record in row.records]
-        within = [rho for course in courses if (rho := _spearman(course)) is not None]
+        within: dict[Any, list[float]] = {}
+        for record, course in zip(row.records, courses, strict=True):
+            if (rho := _spearman(course)) is not None:
+                within.setdefault(shape_of(record), []).append(rho)
         together = pd.concat(courses, ignore_index=True)
         clouds[row.name] = together
-        spread = statistics.bootstrap([np.array([x]) for x in within], statistics.median, seed=SEED) if within else None
+        groups = [np.array(values) for values in within.values()]
+        spread = statistics.bootstrap(groups, statistics.median, seed=SEED) if groups else None
         numbers = {"within": spread.value, "low": spread.low, "high": spread.high} if spread else {}
-        pooled = {"together": _spearman(together), "looks": len(together), "runs": len(within)}
+        pooled = {"together": _spearman(together), "looks": len(together), "runs": sum(map(len, groups))}
         data.append({"row": row.name, "renderer": row.renderer, **numbers, **pooled})
     table = [
         [
@@ -171,6 +192,7 @@ def correlation(experiment: Experiment) -> Result:
         title="Does the loss tell of the Chamfer distance?",
         caption=joined(
             setup(experiment),
+            sizes(experiment),
             "Spearman's rank correlation of loss and Chamfer distance over the looks on the way: within each run, the "
             "median over runs with its 95 % bootstrap interval, and over the looks of all runs of a row together "
             "(DIST, Fig. 5, right, shows such a cloud). Looks of one run follow each other: no test of significance.",

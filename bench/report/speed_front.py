@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from bench.report import format, interactive, statistics, style
 from bench.report.caption import joined, omitted, setup
 from bench.report.experiments import Experiment, setting
-from bench.report.speed import SEED, TRIALS, Placed, Setting, Trial, evaluations, front_line, settings
+from bench.report.speed import SEED, TRIALS, Placed, Setting, Trial, front_line, left_out, settings, sizes
 from bench.report.tables import Result
 
 
@@ -25,7 +25,7 @@ def make(experiment: Experiment) -> Result:
             format.seconds(row["seconds"]),
             format.count(row["evaluations"]),
             format.number(row["error"]),
-            f"{row['failed']} of {row['runs']}",
+            f"{row['failed']} of {row['runs']}" + (f", {row['missing']} missing" if row["missing"] else ""),
             format.number(row["on_front"]),
         ]
         for row in data
@@ -36,12 +36,15 @@ def make(experiment: Experiment) -> Result:
         title="Error against the time that it takes.",
         caption=joined(
             setup(experiment),
+            sizes(experiment),
             "Medians over shapes and seeds: error at the end of a completion against the seconds of its loop, and "
             "depth error of one rendering (95 % of the reference's pixels have less, lost ones are infinite) against "
             "its seconds. A run that did not end ok is infinite in both. Filled points are on the front, hollow ones "
             "are dominated, and a cross stands at the edge for a median that is infinite. In brackets and in the last "
             "column, the probability of being on the front, over 2,000 bootstrap draws of shapes and seeds, the same "
-            "for all settings.",
+            "for all settings. A run that others have and a setting lacks is infinite, too. Settings that differ in "
+            "what only an optimisation uses render alike; chance decides between them.",
+            left_out(experiment),
             omitted(experiment),
         ),
         data=pd.DataFrame(data, dtype=object),
@@ -107,15 +110,14 @@ def draw(panels: list[list[Placed]]) -> Figure:
 def _row(point: Placed) -> dict[str, Any]:
     row = point.row
     cost, error = row.point
-    asked = [evaluations(record) for record in row.records if record["status"] == "ok"]
-    known = [x for x in asked if x is not None]
     spread = statistics.bootstrap(row.errors, statistics.interquartile_mean, seed=SEED)
     config = row.records[0]["config"]
     return {
         **{"trial": row.trial.title, "setting": row.name, "renderer": row.renderer},
-        **{"seconds": cost, "evaluations": float(np.median(known)) if known else None, "error": error},
+        **{"seconds": cost, "evaluations": float(statistics.median(np.concatenate(row.evaluations)))},
+        "error": error,
         **{"error_iqm": spread.value, "error_low": spread.low, "error_high": spread.high},
-        **{"failed": row.failed, "runs": len(row.records)},
+        **{"failed": row.failed, "runs": len(row.records), "missing": row.missing},
         **{"on_front": point.chance, "dominated": point.dominated},
         **{f"renderer.{key}": value for key, value in (config.get("renderer") or {}).items() if key[0] != "_"},
         "resolution": setting(config, "view", "resolution"),
@@ -152,6 +154,7 @@ def volume(experiment: Experiment) -> Result:
         title="How much of the plane of error and time each renderer reaches.",
         caption=joined(
             setup(experiment),
+            sizes(experiment),
             "Area dominated by the medians of a renderer's settings, in powers of ten of seconds times powers of ten "
             "of error, up to twice the largest finite median of either; larger is better. More settings can only add "
             "to it. 95 % bootstrap intervals over shapes and seeds.",
