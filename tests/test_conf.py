@@ -43,7 +43,7 @@ SWEEPS = [
     (name, f"{key}={value}")
     for name in EXPERIMENTS
     for key, values in swept(name).items()
-    for value in values.replace("\\", "").split(",")
+    for value in (values.split(",") if values != "glob(*)" else sorted(n for group, n in YAMLS if f"+{group}" == key))
 ]
 
 
