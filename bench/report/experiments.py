@@ -141,7 +141,7 @@ def row_name(record: dict[str, Any]) -> str:
 def family(record: dict[str, Any]) -> str:
     """The name of the record's dataset: a family's, or the end of the path of a mesh file or folder."""
     path = setting(record["config"], "dataset", "path")
-    return "/".join(Path(path).parts[-2:]) if path else record["dataset"]
+    return "/".join(Path(path).absolute().parts[-2:]) if path else record["dataset"]
 
 
 def measured(record: dict[str, Any], name: str) -> int | float | None:
