@@ -157,8 +157,8 @@ def volume(experiment: Experiment) -> Result:
             sizes(experiment),
             "Area dominated by the medians of a renderer's settings, in powers of ten of seconds times powers of ten "
             "of error, up to twice the largest finite median of either; larger is better. More settings can only add "
-            "to it: it does not rank renderers with different numbers of settings. 95 % bootstrap intervals over shapes "
-            "and seeds.",
+            "to it: it does not rank renderers with different numbers of settings. 95 % bootstrap intervals over "
+            "shapes and seeds.",
             omitted(experiment),
         ),
         data=pd.DataFrame(data, dtype=object),
