@@ -65,6 +65,14 @@ KNOWN = {  # a strategy that is but a renderer looks as that renderer
     "DVR, n = 64": Look("#d1495b", "^"),
     "IDR": Look("#6a3d9a", "D"),
     "Naive, all rays at once": Look("#5b4a3f", "p", "--"),
+    "DIST with mask": Look("#0072b2", "s"),
+    "DIST": Look("#56b4e9", "o", "--"),
+    "DIST with mask, paper's": Look("#5b4a3f", "p"),
+    "DIST, paper's": Look("#b39c8a", "h", "--"),
+    "DeepSDF samples": Look("#009e73", "P", "-."),
+    "DVR with mask": Look("#d1495b", "^"),
+    "IDR with mask": Look("#6a3d9a", "D"),
+    "Naive with mask": Look("#111111", "<", "-."),
 }
 _COLOURS = (
     "#1b9e77",
