@@ -108,6 +108,13 @@ class Camera:
         intrinsics[1] *= height / self.height
         return Camera(intrinsics, self.world_to_camera, height, width)
 
+    def zoomed(self, factor: float) -> "Camera":
+        """The same place and pixels with focal lengths that are `factor` times as long."""
+        intrinsics = self.intrinsics.clone()
+        intrinsics[0, 0] *= factor
+        intrinsics[1, 1] *= factor
+        return Camera(intrinsics, self.world_to_camera, self.height, self.width)
+
     def moved(self, twist: Float[Tensor, "6"]) -> "Camera":
         """The camera after a rigid motion in its own axes; gradients flow to the twist.
 
@@ -115,12 +122,12 @@ class Camera:
             twist: element of se(3): translation in scene units, then rotation vector in radians. World points in the
                 camera's coordinates go through its matrix exponential.
         """
-        x, y, z = twist[3:]
-        zero = torch.zeros_like(x)
-        turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-        rows = torch.cat([turn, twist[:3, None]], dim=1)
-        motion = torch.linalg.matrix_exp(torch.cat([rows, torch.zeros_like(rows[:1])]))
+        motion = rigid(twist)
         return Camera(self.intrinsics, motion @ self.world_to_camera, self.height, self.width)
+
+    def to(self, device: torch.device) -> "Camera":
+        """The same camera on a device."""
+        return Camera(self.intrinsics.to(device), self.world_to_camera.to(device), self.height, self.width)
 
     def double(self) -> "Camera":
         """The same camera in float64."""
@@ -144,6 +151,15 @@ class Camera:
         )
         pixels = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
         return pixels @ torch.linalg.inv(self.intrinsics).T
+
+
+def rigid(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
+    """The matrix exponential of an element of se(3): translation in scene units, then rotation vector in radians."""
+    x, y, z = twist[3:]
+    zero = torch.zeros_like(x)
+    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    rows = torch.cat([turn, twist[:3, None]], dim=1)
+    return torch.linalg.matrix_exp(torch.cat([rows, torch.zeros_like(rows[:1])]))
 
 
 def sphere_span(
