@@ -11,7 +11,7 @@ import torch
 
 from datasets.dataset import Split, seed_of
 from datasets.extract import extract
-from datasets.mesh import Mesh, normalise
+from datasets.mesh import Mesh, fit_in_sphere, normalise
 from renderers.checks import check_at_least, check_choice, check_share
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union
 
@@ -52,11 +52,21 @@ class Family:
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh, by marching cubes."""
-        shape = BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
-        mesh = extract(shape, grid=self.resolution, reach=HALF_GRID)
+        return normalise(self._raw_mesh(split, index), self.radius)
+
+    def formula(self, split: Split, index: int) -> Shape:
+        """The same shape as the formula that the mesh was made from."""
+        centre, factor = fit_in_sphere(self._raw_mesh(split, index), self.radius)
+        return self._raw_shape(split, index).translate(tuple(-centre)).scale(factor)
+
+    def _raw_shape(self, split: Split, index: int) -> Shape:
+        return BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
+
+    def _raw_mesh(self, split: Split, index: int) -> Mesh:
+        mesh = extract(self._raw_shape(split, index), grid=self.resolution, reach=HALF_GRID)
         if mesh is None:
             raise ValueError(f"{self.name} {split} {index} has no surface: check dataset.ranges")
-        return normalise(mesh, self.radius)
+        return mesh
 
     def identity(self) -> dict[str, Any]:
         """What decides the shapes: two families of equal identity hold the same ones."""

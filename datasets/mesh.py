@@ -129,6 +129,12 @@ def normalise(mesh: Mesh, radius: float) -> Mesh:
         mesh: any mesh; vertices that no face uses are moved along but not measured.
         radius: positive, scene units.
     """
+    centre, factor = fit_in_sphere(mesh, radius)
+    return replace(mesh, vertices=(mesh.vertices - centre) * factor)
+
+
+def fit_in_sphere(mesh: Mesh, radius: float) -> tuple[Float[np.ndarray, "3"], float]:
+    """The point that `normalise` moves to the origin, and the factor that it scales by then."""
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: must be positive, found {radius}; the scenes use a little less than 1")
     used = mesh.vertices[np.unique(mesh.faces)]
@@ -136,4 +142,4 @@ def normalise(mesh: Mesh, radius: float) -> Mesh:
     farthest = np.linalg.norm(used - centre, axis=1).max()
     if farthest == 0:
         raise ValueError("mesh: must have an extent, found all vertices at one place; export the mesh again")
-    return replace(mesh, vertices=(mesh.vertices - centre) * (radius / farthest))
+    return centre, radius / farthest

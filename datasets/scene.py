@@ -1,17 +1,21 @@
 """A scene: one shape, one camera, and what the camera saw of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from zlib import crc32
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.dataset import Dataset, Split, seed_of
+from datasets.dataset import Dataset, Formulas, Split, seed_of
 from datasets.mesh import Mesh
 from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers.camera import Camera
+from renderers.field import Field
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,16 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """A true shape and one view of it."""
+    """A true shape and one view of it; `formula` makes the shape's field, where the shape has one."""
 
     name: str
     mesh: Mesh
     view: View
+    formula: Callable[[], Field] | None = None
+
+    def seed(self, seed: int) -> int:
+        """A run's seed, made another one for each scene: what is drawn for one says nothing of the next."""
+        return crc32(self.name.encode()) ^ seed
 
 
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
@@ -46,7 +55,8 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
     view = see(Truth(mesh), views.draw(seed_of(split, index)))
     if not bool(view.mask.any()):
         raise ValueError(f"the camera sees nothing of {dataset.name} {index}: widen view.field_of_view or distance")
-    return Scene(f"{dataset.name} {split} {index}", mesh, view)
+    formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
+    return Scene(f"{dataset.name} {split} {index}", mesh, view, formula)
 
 
 def see(truth: Truth, camera: Camera) -> View:

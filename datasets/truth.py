@@ -64,6 +64,11 @@ class Truth:
         flat = self._tensor(np.ascontiguousarray(points.reshape(-1, 3)))
         return self._scene.compute_signed_distance(flat, nsamples=5).numpy().reshape(points.shape[:-1])
 
+    def distance_grid(self, samples: int, reach: float) -> Float[np.ndarray, "n n n"]:
+        """Signed distances at evenly spaced points of the cube from -reach to reach, indexed by x, y and z."""
+        axis = np.linspace(-reach, reach, samples, dtype=np.float32)
+        return self.signed_distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
+
 
 def sample_surface(mesh: Mesh, count: int, seed: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Draws points evenly by area, and the unit normals of their faces."""

@@ -1,0 +1,121 @@
+"""Colour images of a textured mesh from cameras all around it, with what a real camera adds."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from datasets.scene import View, see
+from datasets.textures import TEXTURES, Texture, make_texture
+from datasets.truth import Truth
+from renderers.camera import Camera
+from renderers.checks import check_at_least, check_choice, check_positive
+
+SUPERSAMPLING = 2  # rays a side of a pixel, whose mean is its colour
+LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
+AMBIENT = 0.4  # of the light; the rest comes from one side
+GREY = 0.5
+UNIFORM = 1e-3  # between the quartiles of a surface's colours: below this it tells nothing
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What a camera saw, with its colours: RGB from 0 to 1."""
+
+    view: View
+    colours: Float[Tensor, "height width 3"]
+
+    def __post_init__(self) -> None:
+        size = (self.view.camera.height, self.view.camera.width, 3)
+        if tuple(self.colours.shape) != size:
+            raise ValueError(f"colours must have the camera's size, {size}, not {tuple(self.colours.shape)}")
+
+
+@dataclass(frozen=True)
+class Photography:
+    """How photographs are taken.
+
+    Args:
+        views: cameras, evenly spaced on a circle about the vertical axis, of which the first is the scene's own.
+        texture: one of `datasets.textures.TEXTURES`.
+        texture_size: of its largest parts, in scene units; see `datasets.textures.make_texture`.
+        shading: "unlit": the texture's own colours; "lambertian": under a light that stands still.
+        background: "grey", or "noise" that differs from view to view, as a background far behind does.
+        noise: standard deviation of each colour's noise.
+        blur: standard deviation of a Gaussian, in pixels.
+        exposure: standard deviation of the logarithm of each view's exposure.
+    """
+
+    views: int
+    texture: str
+    texture_size: float
+    shading: str
+    background: str
+    noise: float
+    blur: float
+    exposure: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.images.views", self.views, 2, "a view is compared with its neighbour: 24 work")
+        check_choice("task.images.texture", self.texture, TEXTURES)
+        check_positive("task.images.texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
+        check_choice("task.images.shading", self.shading, ("unlit", "lambertian"))
+        check_choice("task.images.background", self.background, ("grey", "noise"))
+        if (self.texture, self.shading) == ("plain", "unlit"):
+            raise ValueError("a plain texture in no light has nothing to compare: set task.images.shading=lambertian")
+        for name in ("noise", "blur", "exposure"):
+            check_at_least(f"task.images.{name}", getattr(self, name), 0, "0 switches it off")
+
+    def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Photograph]:
+        """The photographs of a mesh.
+
+        Raises:
+            ValueError: where a camera sees nothing of it, or its surface has one colour only.
+        """
+        generator = np.random.default_rng([seed, 2])
+        texture = make_texture(self.texture, self.texture_size, seed)
+        cameras = [turned(first, 2 * np.pi * index / self.views) for index in range(self.views)]
+        taken = [self._one(truth, texture, camera, generator) for camera in cameras]
+        for index, photograph in enumerate(taken):
+            if not bool(photograph.view.mask.any()):
+                raise ValueError(f"camera {index} sees nothing of the shape: widen view.field_of_view or distance")
+        if max(_spread(photograph) for photograph in taken) < UNIFORM:
+            raise ValueError("the surface has one colour in all images: choose another task.images.texture or shading")
+        return taken
+
+    def _one(self, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator) -> Photograph:
+        fine = camera.resized(SUPERSAMPLING * camera.height, SUPERSAMPLING * camera.width)
+        rays = fine.rays().flat()
+        origins, directions = rays.origins.numpy().astype(float), rays.directions.numpy().astype(float)
+        hits = truth.cast(origins, directions)
+        colours = np.full((len(origins), 3), GREY)
+        if self.background == "noise":
+            colours = generator.random((len(origins), 3))
+        points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
+        normals = hits.normals[hits.hit].astype(float)
+        light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+        shade = 1.0 if self.shading == "unlit" else AMBIENT + (1 - AMBIENT) * (normals @ light).clip(0)[:, None]
+        colours[hits.hit] = shade * texture(points, normals)
+        image = colours.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3).mean(axis=(1, 3))
+        image = image * np.exp(self.exposure * generator.standard_normal())
+        if self.blur:
+            image = gaussian_filter(image, (self.blur, self.blur, 0))
+        image = image + self.noise * generator.standard_normal(image.shape)
+        return Photograph(see(truth, camera), torch.from_numpy(image.clip(0, 1).astype(np.float32)))
+
+
+def _spread(photograph: Photograph) -> float:
+    """Between the quartiles of the colours on the shape: its outline, mixed with the background, is no texture."""
+    quartiles = photograph.colours[photograph.view.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
+    return float((quartiles[1] - quartiles[0]).max())
+
+
+def turned(camera: Camera, angle: float) -> Camera:
+    """The camera after it went around the world's vertical axis, by an angle in radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = torch.eye(4, dtype=camera.world_to_camera.dtype)
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = c, s, -s, c
+    return Camera(camera.intrinsics, camera.world_to_camera @ turn, camera.height, camera.width)
