@@ -60,6 +60,7 @@ class EvaluationSettings:
     fscore_threshold: float = MISSING
     picture: int | None = MISSING
     every: int | str | None = MISSING
+    film: str | None = MISSING
 
     def looks(self, iterations: int) -> set[int]:
         """The iterations, counted from 0, whose Chamfer distance is looked at: with the first also the last."""
@@ -114,6 +115,10 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError(f"evaluation.fscore_threshold must be positive, not {config.evaluation.fscore_threshold}")
     if isinstance(config.evaluation.every, str) and config.evaluation.every != DOUBLING:
         raise ValueError(f"evaluation.every must be {DOUBLING}, a number or null, not {config.evaluation.every!r}")
+    if config.evaluation.film not in (None, "gif", "webp"):
+        raise ValueError(f"evaluation.film must be gif, webp or null, not {config.evaluation.film!r}")
+    if config.evaluation.film is not None and config.evaluation.picture is None:
+        raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
     for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
         if isinstance(value, int) and value < least:

@@ -5,11 +5,8 @@ from math import atan2, degrees
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Bool
-
 from bench.judge import look
-from bench.pictures import Looks, draw_all
+from bench.pictures import Given, Looks, draw_all
 from bench.stage import Stage
 from datasets.scene import see
 from datasets.truth import Truth
@@ -24,7 +21,7 @@ def draw_run(
     folder: Path,
     stage: Stage,
     fields: tuple[Field, Field],
-    observed: Bool[np.ndarray, "height width"],
+    given: Given,
     curve: list[dict[str, Any]],
     title: str,
 ) -> None:
@@ -34,7 +31,7 @@ def draw_run(
         folder: the run folder.
         stage: what the run worked with.
         fields: before and after the optimisation.
-        observed: pixels of the scene's view whose depth was given.
+        given: what it was given.
         curve: lines of curve.jsonl.
         title: of the summary.
     """
@@ -45,7 +42,7 @@ def draw_run(
     ]
     truth = Truth(stage.scene.mesh)
     looks = (found[0], found[1], Looks("truth", see(truth, front), see(truth, back)))
-    draw_all(folder, looks=looks, given=(stage.scene.view, observed), curve=curve, title=title)
+    draw_all(folder, looks=looks, given=given, curve=curve, title=title)
 
 
 def _cameras(stage: Stage) -> tuple[Camera, Camera]:

@@ -25,6 +25,7 @@ class Course:
     seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
+    objectives: list[float] = field(default_factory=list)  # the problem's own, before and after, where it has one
 
 
 def optimise(
@@ -67,9 +68,10 @@ def optimise(
         }
         course.curve.append(line)
         course.peak_memory_bytes = memory.growth()
+        over = _failed(course, problem)
         with memory.pause():
             on_step(line)
-        if _failed(course, problem):
+        if over:
             break
 
 

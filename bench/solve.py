@@ -2,15 +2,18 @@
 
 import json
 import time
+from collections.abc import Callable
 from typing import Any
 
+from bench.film import Film
 from bench.gallery import draw_run
-from bench.judge import Judgement, glance, judge
+from bench.judge import glance, judge
 from bench.metrics import DEFINITIONS
 from bench.optimise import Course, optimise
+from bench.pictures import Given
 from bench.records import Record, RunStatus, plain
 from bench.stage import Cell
-from bench.tasks.problem import InverseTask, OptimiserSettings, Problem, check_kind
+from bench.tasks.problem import InverseTask, NotReached, OptimiserSettings, Problem, check_kind
 from renderers.field import Field
 
 COSTS = {
@@ -43,46 +46,78 @@ def solve(task: InverseTask, cell: Cell) -> Field:
     clock = time.perf_counter()
     before = judge(first, stage)
     record.metrics_start, record.seconds["evaluation"] = before.metrics, time.perf_counter() - clock
-    course = Course()
-    try:
-        _optimise(problem, task.optimiser, cell, course)
-    finally:
-        _note_costs(record, problem, course)
+    film = Film(stage)
+    camera = stage.scene.view.camera
+
+    def errors_at(iteration: int) -> dict[str, float]:
+        film.shoot(iteration, problem.field(), camera)
+        chamfer = glance(problem.field(), stage) if iteration else before.metrics["chamfer_l2"]
+        return {"chamfer_l2": chamfer}
+
+    course = descend(problem, task.optimiser, cell, errors_at)
     clock = time.perf_counter()
     last = problem.field()
     after = judge(last, stage)
     record.metrics = after.metrics
-    record.status, record.reason = _verdict(course, after)
+    record.status, record.reason = verdict(course, empty=after.mesh is None)
     if after.mesh is not None:
         after.mesh.save(cell.folder / "mesh.ply")
     title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
     if stage.evaluation.picture is not None:
-        draw_run(cell.folder, stage, (first, last), problem.observed.cpu().numpy(), course.curve, title)
+        given = Given(stage.scene.view, problem.observed.cpu().numpy(), problem.photographs)
+        draw_run(cell.folder, stage, (first, last), given, course.curve, title)
+    film.shoot(len(course.curve), last, camera)
+    film.save(cell.folder, title)
     record.seconds["evaluation"] += time.perf_counter() - clock
     return last
 
 
-def _optimise(problem: Problem, settings: OptimiserSettings, cell: Cell, course: Course) -> None:
-    """The loop, with each line of its curve written as it comes.
+def descend(
+    problem: Problem, settings: OptimiserSettings, cell: Cell, errors_at: Callable[[int], dict[str, float]]
+) -> Course:
+    """The loop: each line of its curve is written as it comes, and its costs go to the record, also if it is cut short.
 
-    A line has the loss before its step; the Chamfer distance that stands beside it is of the same parameters.
+    Args:
+        problem: what is solved.
+        settings: for how long and how fast.
+        cell: the run.
+        errors_at: gives the errors of the problem as it stands before an iteration, off the clock. A line has the loss
+            before its step; the errors that stand beside it are of the same parameters.
     """
+    course = Course()
     looks = cell.stage.evaluation.looks(settings.iterations)
-    known: dict[int, float] = {0: cell.record.metrics_start["chamfer_l2"]} if looks else {}
+    known: dict[int, dict[str, float]] = {}
+    cell.record.seconds.setdefault("evaluation", 0.0)
+
+    def look(iteration: int) -> None:
+        clock = time.perf_counter()
+        known[iteration] = errors_at(iteration)
+        cell.record.seconds["evaluation"] += time.perf_counter() - clock
+
     with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
         def on_step(line: dict[str, Any]) -> None:
-            if line["iteration"] in known:
-                line["chamfer_l2"] = known[line["iteration"]]
-            coming = line["iteration"] + 1
-            if coming in looks:
-                clock = time.perf_counter()
-                known[coming] = glance(problem.field(), cell.stage)
-                cell.record.seconds["evaluation"] += time.perf_counter() - clock
+            line |= known.get(line["iteration"], {})
+            if course.status is RunStatus.OK and line["iteration"] + 1 in looks:
+                look(line["iteration"] + 1)
             curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
-            cell.progress("optimising", coming, settings.iterations, line["total"])
+            cell.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
 
-        optimise(problem, settings, cell.stage.device, course=course, on_step=on_step)
+        def judge_loss() -> None:
+            if (value := problem.objective()) is not None:
+                course.objectives.append(value)
+
+        if looks:
+            look(0)
+        try:
+            judge_loss()
+            optimise(problem, settings, cell.stage.device, course=course, on_step=on_step)
+            judge_loss()
+        except NotReached as error:
+            course.status, course.reason = RunStatus.NOT_REACHED, str(error)
+        finally:
+            _note_costs(cell.record, problem, course)
+    return course
 
 
 def _note_costs(record: Record, problem: Problem, course: Course) -> None:
@@ -104,13 +139,13 @@ def _note_costs(record: Record, problem: Problem, course: Course) -> None:
         record.gemm_fraction = record.flops / seconds / record.environment["gemm_peak_flops"]
 
 
-def _verdict(course: Course, after: Judgement) -> tuple[RunStatus, str]:
-    """The truth picks nothing here: a run fails by its own loss and its own surface."""
+def verdict(course: Course, *, empty: bool = False) -> tuple[RunStatus, str]:
+    """The truth picks nothing here: a run fails by its own loss, or by a field that ended without a surface."""
     if course.status is not RunStatus.OK:
         return course.status, course.reason
-    if after.mesh is None:
+    if empty:
         return RunStatus.EMPTY, "the field has no surface in the unit sphere"
-    first, last = course.curve[0]["total"], course.curve[-1]["total"]
+    first, last = course.objectives or (course.curve[0]["total"], course.curve[-1]["total"])
     if last >= first and len(course.curve) > 1:
         return RunStatus.NOT_REACHED, f"the loss did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return RunStatus.OK, ""

@@ -1,6 +1,8 @@
 """The objects that a run's configuration describes, built and ready."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -26,12 +28,18 @@ class Stage:
     renderer: Renderer
     scene: Scene
     views: ViewSampler
-    prior: Prior
+    make_prior: Callable[[], Prior]
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
     cache: Path  # where what is slow to make is kept
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior of the dataset, loaded or trained when it is first asked for: not every task needs one."""
+        with torch.random.fork_rng():  # a prior that is trained first must change nothing of what follows
+            return self.make_prior()
 
     def fitted(self) -> Prior:
         """The prior with the code of the scene's shape alone.
@@ -73,10 +81,14 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
     scene = make_scene(dataset, views, split=Split(config.split), index=config.index)
-    prior = prior_for(dataset, settings, Path(config.priors_dir), device, progress)
-    torch.manual_seed(config.seed)  # here, since a prior that is trained first must change nothing of what follows
+    cache = Path(config.priors_dir)
+    torch.manual_seed(config.seed)
     trained = config.index if config.split == Split.TRAIN and config.index < settings.shapes else None
-    return Stage(renderer, scene, views, prior, evaluation, config.seed, device, Path(config.priors_dir), trained)
+
+    def make_prior() -> Prior:
+        return prior_for(dataset, settings, cache, device, progress)
+
+    return Stage(renderer, scene, views, make_prior, evaluation, config.seed, device, cache, trained)
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

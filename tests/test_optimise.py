@@ -28,6 +28,7 @@ class Toy:
     counts: Counts = field(default_factory=Counts)
     calls: int = 0
     rays_per_iteration: int = POINTS
+    photographs: None = None
     observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
 
     def __post_init__(self):
@@ -36,6 +37,9 @@ class Toy:
 
     def field(self):
         return sphere(self.radius.detach())
+
+    def objective(self):
+        return None
 
     def loss(self, iteration):
         metered = Meter(sphere(self.radius), self.counts)

@@ -15,10 +15,24 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from datasets.views import ViewSampler
 from renderers.camera import Camera
+from renderers.field import Kind
 from renderers.fields.mlp import Decoder
+from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
 PEAK = 1e10  # operations a second that the machine of a cell is said to do
+
+
+class Blind:
+    """A renderer without any gradient, which is never asked to render."""
+
+    capabilities = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
+
+    def render(self, field, rays):
+        raise AssertionError
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        raise AssertionError
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:
@@ -69,8 +83,8 @@ def cell_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed
         renderer=renderer,
         scene=scene,
         views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
-        prior=prior,
-        evaluation=EvaluationSettings(grid=16, points=50, fscore_threshold=0.02, picture=8, every=None),
+        make_prior=lambda: prior,
+        evaluation=EvaluationSettings(grid=16, points=50, fscore_threshold=0.02, picture=8, every=None, film=None),
         seed=0,
         device=CPU,
         cache=folder / "cache",

@@ -15,6 +15,7 @@ from bench.report.records import read_records
 # How a status is coloured; a status of no kind listed here is shown as bad.
 TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute", "not_run": "mute"}
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
+THUMBS = ("summary.png", "strip.png")
 # Metrics with a column of their own, and those that say nothing new beside `chamfer_l2`: kept to the details.
 COLUMNS = ("accuracy", "completeness", "fscore", "normal_consistency", "depth_mae", "mask_iou")
 _NOT_OTHERS = ("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", *COLUMNS)
@@ -52,7 +53,8 @@ def write_index(results_dir: Path) -> Path:
 
 def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """All that the template shows of one run; links are relative to the page and lead to files that exist."""
-    pictures = sorted(folder.glob("*.png"), key=lambda picture: (picture.name != "summary.png", picture.name))
+    found = [path for suffix in ("png", "gif", "webp") for path in folder.glob(f"*.{suffix}")]
+    pictures = sorted(found, key=lambda picture: (picture.name != "summary.png", picture.name))
     names = sorted({*record["metrics"], *record["metrics_start"]}, key=lambda name: (name in _NOT_OTHERS, name))
     machine, threads = _machine(record)
     return {
@@ -68,6 +70,7 @@ def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
         "machine": machine,
         "threads": threads,
         "files": {name: _link(folder / name) for name in FILES if (folder / name).is_file()},
+        "thumb": next((_link(path) for path in pictures if path.name in THUMBS), None),
         "pictures": {picture.name: _link(picture) for picture in pictures},
     }
 

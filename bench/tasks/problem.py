@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from math import cos, pi
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.autodecoder import Prior
@@ -18,6 +19,10 @@ from renderers.rendering import Renderer
 
 class Unsupported(Exception):
     """A renderer lacks what a task needs; the message says what."""
+
+
+class NotReached(Exception):
+    """An optimisation cannot go on, although nothing is wrong with the program; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +58,14 @@ class Problem(Protocol):
     counts: Counts
     rays_per_iteration: int
     observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
+    photographs: Float[np.ndarray, "views height width 3"] | None  # that are given, for pictures
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The loss at an iteration, counted from 0, as "total", beside its weighted terms."""
+        ...
+
+    def objective(self) -> float | None:
+        """The loss as it stands, not counted, where that of different iterations is not comparable; else None."""
         ...
 
     def field(self) -> Field:
