@@ -16,6 +16,9 @@ import bench.tasks.ablation
 import bench.tasks.completion
 import bench.tasks.deepsdf
 import bench.tasks.gradients
+import bench.tasks.multiview
+import bench.tasks.pose
+import bench.tasks.pose_icp
 import bench.tasks.prior_fit  # noqa: F401
 import datasets.families
 import datasets.local  # noqa: F401

@@ -29,7 +29,7 @@ TARGETS = {"prior": "bench.autodecoder.PriorSettings"}  # nodes whose class the 
 PARTS = ("task", "renderer", "dataset", "prior")
 # What a choice needs on the command line.
 NEEDS = {"custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))}
-ADDED = ("strategy", "common", "method", "setting", "trial")  # not chosen by default
+ADDED = ("strategy", "common", "method", "setting", "trial", "condition")  # not chosen by default
 DESK = {"scale": OmegaConf.load(CONF / "scale/desk.yaml")}
 
 
@@ -79,6 +79,7 @@ def test_the_default_configuration_builds(compose_config):
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
     extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
+    extra = ["task=multiview"] if group == "condition" else extra
     new = "+" if group in ADDED else ""  # they are not chosen by default
     config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -101,7 +102,9 @@ def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
 
 @pytest.mark.parametrize(("name", "swept"), SWEEPS)
 def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
-    config = compose_config(f"+experiment={name}", swept)
+    rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
+    method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
+    config = compose_config(*method, f"+experiment={name}", swept)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     for part in PARTS:
         build_part(config, part)
@@ -109,10 +112,16 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
     key, _, value = swept.removeprefix("+").partition("=")
     if key == "dataset":
         assert config.dataset.name == value
-    elif key in ("strategy", "renderer", "method", "setting", "trial"):
+    elif key in ("strategy", "renderer", "method", "setting", "trial", "condition"):
         alone = compose_config(swept)
-        assert config.label == alone.label
-        assert build_part(config, "renderer") == build_part(alone, "renderer")
+        config = compose_config(*method, swept, f"+experiment={name}")  # a sweep has them so
+        if not method:
+            assert config.label == alone.label
+            assert build_part(config, "renderer") == build_part(alone, "renderer")
+        if key == "method":
+            assert config.task._target_ == alone.task._target_
+            own = OmegaConf.load(CONF / f"method/{value}.yaml").get("view")
+            assert own is None or config.view.resolution == alone.view.resolution
     else:
         found = OmegaConf.select(config, key)
         assert found == type(found)(value)
