@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.report import priors, style, table2, table2_intervals
+from bench.report import oracle, priors, style, table2, table2_intervals
 from bench.report.experiments import choose
 from bench.report.paper import write_paper
 from bench.report.records import read_records
@@ -111,7 +111,7 @@ def test_the_oracle_is_of_the_tables_shapes(tmp_path):
     completed(tmp_path, REFERENCE, 1.0, index=3)
     for index, value in ((3, 0.25), (4, 9.0)):
         fitted(tmp_path, value, index=index)
-    assert cell(made(tmp_path), table2.ORACLE, "100 pts") == "0.250"
+    assert cell(made(tmp_path), oracle.LABEL, "100 pts") == "0.250"
 
 
 def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
@@ -196,14 +196,14 @@ def test_an_oracle_that_was_judged_otherwise_is_not_shown(tmp_path, changed):
     write_run(
         tmp_path, "priors", None, task="prior_fit", dataset="sofa", metrics={"chamfer_l2": 1e-4}, settings=settings
     )
-    assert table2.ORACLE not in made(tmp_path).table["Method"].tolist()
+    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
 
 
 def test_an_oracle_of_some_shapes_is_not_shown(tmp_path):
     for index in range(2):
         completed(tmp_path, REFERENCE, 1.0, index=index)
     fitted(tmp_path, 0.25)
-    assert table2.ORACLE not in made(tmp_path).table["Method"].tolist()
+    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
 
 
 def test_another_setting_under_the_same_label_is_no_part_of_the_row(tmp_path):

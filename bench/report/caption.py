@@ -1,6 +1,7 @@
 """Sentences that every caption has: on what it was measured, what failed, what was left out."""
 
 import textwrap
+from collections import Counter
 from typing import Any
 
 from bench.report.experiments import Experiment, setting
@@ -33,6 +34,16 @@ def outcome(experiment: Experiment) -> str:
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
     return f"{len(failed)} of {total} runs did not end ok: {'; '.join(failed)}."
+
+
+def counted_outcome(experiment: Experiment) -> str:
+    """How many of many runs did not end ok, by status."""
+    statuses = Counter(record["status"] for record in experiment.records if record["status"] != "ok")
+    total = len(experiment.records)
+    if not statuses:
+        return f"All {total} runs ended ok."
+    told = ", ".join(f"{count} {status}" for status, count in statuses.most_common())
+    return f"{statuses.total()} of {total} runs did not end ok ({told}); the CSV says why."
 
 
 def omitted(experiment: Experiment) -> str:

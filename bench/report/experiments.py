@@ -2,10 +2,12 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bench.report.records import NEUTRAL_KEYS, asked, started
 
@@ -32,6 +34,9 @@ KINDS = {
     "priors": Kind(("prior_fit",), ("dataset",)),
     "table1": Kind(("ablation",)),
     "table2": Kind(("completion", "deepsdf"), ("dataset", "task"), ("points",)),
+    "table3": Kind(("multiview",), ("dataset", "task")),
+    "fig6": Kind(("pose", "pose_icp"), ("dataset", "task"), ("degrees",)),
+    "fig10": Kind(("multiview",), ("dataset", "task"), ("focal", "start_scale")),
     "fig4": Kind(("ablation",)),
     "fig5": Kind(("completion",)),
     "fig7": Kind(("ablation",)),
@@ -148,6 +153,23 @@ def measured(record: dict[str, Any], name: str) -> int | float | None:
     """The metric of that name; None where there is no such number."""
     value = record["metrics"].get(name)
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def loop_seconds(record: dict[str, Any]) -> float | None:
+    """The time in the loop; None where the record does not have it."""
+    spent = [record["seconds"].get(name) for name in ("forward", "backward")]
+    return None if None in spent else sum(spent)
+
+
+def value_evaluations(record: dict[str, Any]) -> float | None:
+    """The field values that were computed in the loop; None where the record does not say."""
+    return record["evaluations"].get("value")
+
+
+def median_of_known(values: Iterable[float | None]) -> float | None:
+    """The median of the values that are known; None where there is none."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def error(record: dict[str, Any], name: str) -> float:

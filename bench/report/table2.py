@@ -1,6 +1,5 @@
 """Table 2 of DIST: shape completion over sparsity, with the published numbers beside ours."""
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -8,10 +7,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.report import format, style
-from bench.report.caption import joined, omitted, setup
-from bench.report.experiments import Experiment, error, family, identity, measured, row_name, setting
-from bench.report.statistics import median
-from bench.report.table2_runs import ERROR, POINTS, SCALE, Runs, heading, shapes_told
+from bench.report.caption import counted_outcome, joined, omitted, setup
+from bench.report.experiments import (
+    Experiment,
+    family,
+    identity,
+    loop_seconds,
+    measured,
+    row_name,
+    setting,
+    value_evaluations,
+)
+from bench.report.oracle import LABEL, oracles
+from bench.report.table2_runs import ERROR, POINTS, Runs, heading, shapes_told
 from bench.report.tables import Result
 
 # DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of POINTS.
@@ -32,7 +40,6 @@ PUBLISHED = {
         "DIST with mask": (5.37, 5.15, 5.16, 5.26, 6.33, 7.62),
     },
 }
-ORACLE = "oracle: the prior's fit to the truth"
 TITLE = "Shape completion from one depth image, over its sparsity."
 CAPTION = (
     "Medians over shapes. Dense depth implies the mask. “Paper's” is the setting of DIST, B.4 (the mean of the squared "
@@ -46,11 +53,11 @@ CAPTION = (
 def make(experiment: Experiment) -> Result:
     """A row a family and method: the median at each number of points."""
     runs = Runs(experiment)
-    oracle = oracles(experiment)
+    oracle = oracles(experiment, "chamfer_l2")
     rows = []
     for name in runs.families:
         if name in oracle:
-            rows.append([name, ORACLE, *[format.number(oracle[name])] * len(runs.points), ""])
+            rows.append([name, LABEL, *[format.number(oracle[name])] * len(runs.points), ""])
         for row in runs.rows_of(name):
             failed, total = runs.failures(name, row)
             medians = [runs.median(name, row, points) for points in runs.points]
@@ -68,36 +75,13 @@ def make(experiment: Experiment) -> Result:
             CAPTION,
             _given(runs),
             shapes_told(runs),
-            _outcome(experiment),
+            counted_outcome(experiment),
             omitted(experiment),
         ),
         data=pd.DataFrame([_raw(record) for record in experiment.records], dtype=object),
         table=pd.DataFrame(rows, columns=["Family", "Method", *map(heading, runs.points), "Failed"]),
         figure=draw(runs, oracle),
     )
-
-
-def oracles(experiment: Experiment) -> dict[str, float]:
-    """Median Chamfer x 1000 of the prior's fit to each family's shapes, of families of which every shape was fitted.
-
-    The fits must have been judged as the table is: with the same split, prior, grid and number of points.
-    """
-    fits = experiment.beside("priors")
-    if fits is None or _judged(fits.asked()) != _judged(experiment.asked()):
-        return {}
-    wanted, found = (
-        {(family(r), r["config"].get("index")): SCALE * error(r, "chamfer_l2") for r in chosen.records}
-        for chosen in (experiment, fits)
-    )
-    families = dict.fromkeys(name for name, _ in wanted)
-    shapes = {name: [key for key in wanted if key[0] == name] for name in families}
-    complete = [name for name in families if all(key in found for key in shapes[name])]
-    return {name: float(median([found[key] for key in shapes[name]])) for name in complete}
-
-
-def _judged(config: dict[str, Any]) -> list[Any]:
-    paths = (("split",), ("prior",), ("evaluation", "grid"), ("evaluation", "points"))
-    return [setting(config, *path) for path in paths]
 
 
 @style.styled
@@ -119,7 +103,7 @@ def draw(runs: Runs, oracle: dict[str, float]) -> Figure:
             how = {"linestyle": look.line, "color": look.colour, "marker": look.marker, "label": row}
             axis.plot([places[i] for i in order], [medians[i] for i in order], **how)
         if name in oracle:
-            axis.axhline(oracle[name], color="#777777", lw=0.9, label=ORACLE)
+            axis.axhline(oracle[name], color="#777777", lw=0.9, label=LABEL)
             axis.axhline(1.5 * oracle[name], color="#777777", lw=0.9, ls=":", label="1.5 times that")
         axis.set(title=name, xlabel="depth points given")
         style.log_axis(axis, "x", [] if None in given else places)
@@ -143,16 +127,6 @@ def _given(runs: Runs) -> str:
     return f"Points given, medians: {'; '.join(told)}." if told else ""
 
 
-def _outcome(experiment: Experiment) -> str:
-    """How many runs did not end ok, by status."""
-    failed = [record for record in experiment.records if record["status"] != "ok"]
-    total = len(experiment.records)
-    if not failed:
-        return f"All {total} runs ended ok."
-    statuses = ", ".join(f"{count} {status}" for status, count in Counter(r["status"] for r in failed).most_common())
-    return f"{len(failed)} of {total} runs did not end ok ({statuses}); the CSV says why."
-
-
 def _iterations(experiment: Experiment) -> str:
     found: dict[Any, list[str]] = {}
     for record in experiment.records:
@@ -166,13 +140,12 @@ def _iterations(experiment: Experiment) -> str:
 
 
 def _raw(record: dict[str, Any]) -> dict[str, Any]:
-    seconds = [record["seconds"].get(name) for name in ("forward", "backward")]
     return {
         "family": family(record),
         "points": setting(record["config"], "task", "points"),
         **identity(record),
         **{name: measured(record, name) for name in ("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou")},
         "chamfer_l2_start": record["metrics_start"].get("chamfer_l2"),
-        "loop_seconds": None if None in seconds else sum(seconds),
-        "value_evaluations": record["evaluations"].get("value"),
+        "loop_seconds": loop_seconds(record),
+        "value_evaluations": value_evaluations(record),
     }
