@@ -4,7 +4,6 @@ from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
 
 from datasets.mesh import Mesh
-from renderers.field import Field
 
 SPLIT_STRIDE = 1_000_000  # seeds of the three parts are this far apart, more than any has shapes
 
@@ -29,15 +28,6 @@ class Dataset(Protocol):
 
     def identity(self) -> dict[str, Any]:
         """Plain data that decides the shapes: datasets of equal identity hold the same ones."""
-        ...
-
-
-@runtime_checkable
-class Formulas(Protocol):
-    """A dataset whose shapes are formulas."""
-
-    def formula(self, split: Split, index: int) -> Field:
-        """The shape of the same number as a field."""
         ...
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, runtime_checkable
 from zlib import crc32
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.dataset import Dataset, Formulas, Split, seed_of
+from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
 from datasets.truth import Truth
 from datasets.views import ViewSampler
@@ -47,6 +48,15 @@ class Scene:
     def seed(self, seed: int) -> int:
         """A run's seed, made another one for each scene: what is drawn for one says nothing of the next."""
         return crc32(self.name.encode()) ^ seed
+
+
+@runtime_checkable
+class Formulas(Protocol):
+    """A dataset whose shapes are formulas."""
+
+    def formula(self, split: Split, index: int) -> Field:
+        """The shape of the same number as a field."""
+        ...
 
 
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
