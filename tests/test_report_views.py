@@ -107,6 +107,21 @@ def test_a_run_that_never_began_costs_no_table(tmp_path):
     assert row(result, "DIST")["Loop"] == "3.00 s"
 
 
+def test_rows_may_have_images_of_their_own_size(tmp_path):
+    found(tmp_path, "table3", "DIST", 1.0)
+    write_run(
+        *(tmp_path, "table3", "Naive, 32 x 32"),
+        task="multiview",
+        metrics={ENDS: 0.002},
+        metrics_start={ENDS: 0.004},
+        settings={"task": {"focal": 1.0}, "view": {"resolution": 32}, "dataset": {"name": "car"}},
+    )
+    result = made(tmp_path, table3, "table3")
+    assert row(result, "DIST")["End"] == "1.00"
+    assert row(result, "Naive, 32 x 32")["End"] == "2.00"
+    assert "Not shown" not in result.caption
+
+
 def test_figure_10_varies_one_condition_at_a_time(tmp_path):
     found(tmp_path, "fig10", "DIST", 1.0)
     found(tmp_path, "fig10", "DIST", 3.0, focal=0.5)

@@ -34,7 +34,7 @@ KINDS = {
     "priors": Kind(("prior_fit",), ("dataset",)),
     "table1": Kind(("ablation",)),
     "table2": Kind(("completion", "deepsdf"), ("dataset", "task"), ("points",)),
-    "table3": Kind(("multiview",), ("dataset", "task")),
+    "table3": Kind(("multiview",), ("dataset", "task", "view")),
     "fig6": Kind(("pose", "pose_icp"), ("dataset", "task"), ("degrees",)),
     "fig10": Kind(("multiview",), ("dataset", "task"), ("focal", "start_scale")),
     "fig4": Kind(("ablation",)),
