@@ -19,6 +19,7 @@ from renderers.camera import Camera
 from renderers.field import Field
 
 MOST = 9  # columns of a strip
+FRAME = 0.73  # grey between the pictures of a strip
 FRAME_SECONDS = 0.25
 LAST_SECONDS = 1.5  # the end stays for longer
 
@@ -53,27 +54,32 @@ class Film:
 
 
 def _strip(frames: dict[int, View], truth: View, title: str) -> Figure:
-    """A column for each of some evenly chosen frames and for the truth: normals above, silhouette error below."""
+    """A column for each of some evenly chosen frames and for the truth: normals above, silhouette error below.
+
+    One picture on one axis: a figure of twenty axes takes a second to draw.
+    """
     known = list(frames.items())
     if len(known) > 2 and known[-1][0] - known[-2][0] == 1:
         del known[-2]  # the last look, a step before the end
     places = np.unique(np.linspace(0, len(known) - 1, min(MOST, len(known))).round().astype(int))
-    chosen = [known[place] for place in places]
-    part = window([view.mask.numpy() for _, view in chosen] + [truth.mask.numpy()])
-    figure = Figure(figsize=(1.25 * (len(chosen) + 1), 3.2), layout="constrained")
-    axes = figure.subplots(2, len(chosen) + 1, squeeze=False)
-    for column, (iteration, view) in enumerate(chosen):
-        bare(axes[0, column]).imshow(_normals(view)[part])
-        error = silhouette_image(view.mask.numpy(), truth.mask.numpy())
-        bare(axes[1, column]).imshow(error[part], interpolation="nearest")
-        axes[0, column].set_title(f"{iteration}")
-    bare(axes[0, -1]).imshow(_normals(truth)[part])
-    bare(axes[1, -1]).imshow(silhouette_image(truth.mask.numpy(), truth.mask.numpy())[part], interpolation="nearest")
-    axes[0, -1].set_title("truth")
-    axes[0, 0].set_ylabel("normals")
-    axes[1, 0].set_ylabel("silhouette error")
+    shown = {str(known[place][0]): known[place][1] for place in places} | {"truth": truth}
+    part = window([view.mask.numpy() for view in shown.values()])
+    true = truth.mask.numpy()
+    columns = [(_normals(view)[part], silhouette_image(view.mask.numpy(), true)[part]) for view in shown.values()]
+    montage = np.concatenate([np.concatenate([_framed(cell) for cell in column], axis=0) for column in columns], axis=1)
+    size = montage.shape[0] / 2
+    figure = Figure(figsize=(1.25 * len(shown) + 0.4, 3.1), layout="constrained")
+    axis = bare(figure.subplots())
+    axis.imshow(montage, interpolation="nearest")
+    axis.set_xticks([size * (place + 0.5) for place in range(len(shown))], list(shown))
+    axis.set_yticks([size * 0.5, size * 1.5], ["normals", "silhouette error"], rotation=90, va="center")
+    axis.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
     figure.suptitle(f"{title}; after iterations (red lost, blue false)")
     return figure
+
+
+def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "framed_height framed_width 3"]:
+    return np.pad(picture, ((1, 1), (1, 1), (0, 0)), constant_values=FRAME)
 
 
 def _animate(path: Path, views: list[View], truth: View) -> None:

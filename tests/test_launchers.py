@@ -102,7 +102,7 @@ def test_where_no_run_folder_can_be_made_every_planned_cell_is_still_a_row(tmp_p
 
 
 def test_limits_hold_in_a_sweep(tmp_path):
-    done = sweep(tmp_path, "+renderer.how=loop,native_loop,not", "time_limit=1.5")
+    done = sweep(tmp_path, "+renderer.how=loop,native_loop,not", "time_limit=1.5", "evaluation.picture=null")
     statuses = {r["config"]["renderer"]["how"]: r["status"] for r in read_records(tmp_path)[0]}
     assert statuses["loop"] == statuses["native_loop"] == "timeout"
     assert statuses["not"] != "timeout"
