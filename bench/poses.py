@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.metrics import DEFINITIONS as IMAGE_DEFINITIONS
+from bench.metrics import image_metrics
+from datasets.scene import View
 from renderers.camera import Camera, rigid
 from renderers.checks import check_at_least, check_positive
 
@@ -16,6 +19,7 @@ DEFINITIONS = {
     " in scene units",
     "success": "1 where both errors are at most task.success_degrees and task.success_distance, else 0",
 }
+JUDGED = DEFINITIONS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae", "mask_iou")}
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,11 @@ class PoseStart:
         rotation, translation = pose_error(found, true)
         success = rotation <= self.success_degrees and translation <= self.success_distance
         return {"rotation_error_deg": rotation, "translation_error": translation, "success": float(success)}
+
+    def judge(self, seen: View, true: View) -> dict[str, float]:
+        """The numbers of `JUDGED`: the errors of a camera, and how what it sees differs from what is given."""
+        images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())
+        return self.metrics(seen.camera, true.camera) | images
 
 
 def of_moved_object(camera: Camera, twist: Float[Tensor, "6"]) -> Camera:

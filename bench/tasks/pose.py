@@ -9,10 +9,8 @@ from torch import Tensor
 
 from bench.film import Film
 from bench.judge import look
-from bench.metrics import DEFINITIONS as IMAGE_DEFINITIONS
-from bench.metrics import image_metrics
 from bench.pictures import draw_curve
-from bench.poses import DEFINITIONS, PoseStart, of_moved_object
+from bench.poses import JUDGED, PoseStart, of_moved_object
 from bench.solve import COSTS, descend, verdict
 from bench.stage import Cell, Stage
 from bench.starts import Starts, StartSettings
@@ -92,7 +90,7 @@ class Pose:
             raise Unsupported(f"{type(stage.renderer).__name__} has no gradient towards rays, so none towards a camera")
         known = known_shape(self, stage)
         check_kind(stage.renderer, known)
-        record.definitions = DEFINITIONS | COSTS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae", "mask_iou")}
+        record.definitions = JUDGED | COSTS
         cameras = self.start.cameras(view.camera, stage.scene.seed(stage.seed))
         problem = PoseProblem(self, stage.renderer, known, view, cameras, stage.device)
         film = Film(stage)
@@ -101,22 +99,16 @@ class Pose:
             film.shoot(iteration, known, problem.camera())
             return self.start.metrics(problem.camera(), view.camera)
 
-        record.metrics_start = self._judge(known, problem.camera(), stage)
+        record.metrics_start = self.start.judge(look(known, problem.camera(), stage), view)
         course = descend(problem, self.optimiser, cell, errors_at)
         clock = time.perf_counter()
-        record.metrics = self._judge(known, problem.camera(), stage)
+        record.metrics = self.start.judge(look(known, problem.camera(), stage), view)
         record.status, record.reason = verdict(course)
         film.shoot(len(course.curve), known, problem.camera())
         if stage.evaluation.picture is not None:
             draw_curve(cell.folder / "curve.png", course.curve)
         film.save(cell.folder, f"{record.task}, {record.name}, {record.scene}: {record.status}")
         record.seconds["evaluation"] += time.perf_counter() - clock
-
-    def _judge(self, known: Field, camera: Camera, stage: Stage) -> dict[str, float]:
-        """The errors of a camera, and how its images differ from those that are given."""
-        view, seen = stage.scene.view, look(known, camera, stage)
-        images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), view.depth.numpy(), view.mask.numpy())
-        return self.start.metrics(camera, view.camera) | images
 
 
 def known_shape(settings: Pose, stage: Stage) -> Field:

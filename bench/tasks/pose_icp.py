@@ -9,11 +9,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bench.metrics import DEFINITIONS as IMAGE_DEFINITIONS
-from bench.metrics import image_metrics
-from bench.poses import DEFINITIONS, PoseStart
+from bench.poses import JUDGED, PoseStart
 from bench.records import RunStatus
-from bench.stage import Cell, Stage
+from bench.stage import Cell
 from datasets.scene import View, see
 from datasets.truth import Truth, sample_surface
 from renderers.camera import Camera
@@ -72,9 +70,9 @@ class PoseICP:
     def execute(self, cell: Cell) -> None:
         """Registers the points that the camera saw to the mesh, and judges the camera before and after."""
         stage, record, view = cell.stage, cell.record, cell.stage.scene.view
-        record.definitions = DEFINITIONS | COSTS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae", "mask_iou")}
+        record.definitions = JUDGED | COSTS
         cameras = self.start.cameras(view.camera, stage.scene.seed(stage.seed))
-        record.metrics_start = self._judge(cameras[0], stage)
+        record.metrics_start = self.start.judge(see(Truth(stage.scene.mesh), cameras[0]), view)
         points, normals = sample_surface(stage.scene.mesh, self.points, stage.seed)
         clock = time.perf_counter()
         tried = [self._register(camera, view, points, normals) for camera in cameras]
@@ -82,7 +80,7 @@ class PoseICP:
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         clock = time.perf_counter()
-        record.metrics = self._judge(found, stage)
+        record.metrics = self.start.judge(see(Truth(stage.scene.mesh), found), view)
         record.seconds["evaluation"] = time.perf_counter() - clock
         record.status, record.reason = RunStatus.OK, ""
         if not np.isfinite(distance):
@@ -116,12 +114,6 @@ class PoseICP:
         back = torch.from_numpy(np.linalg.inv(motion).copy()).float()
         moved = Camera(camera.intrinsics, _rigid_part(camera.world_to_camera @ back), camera.height, camera.width)
         return moved, distance
-
-    def _judge(self, camera: Camera, stage: Stage) -> dict[str, float]:
-        """The errors of a camera, and how the mesh's images differ from those that are given."""
-        view, seen = stage.scene.view, see(Truth(stage.scene.mesh), camera)
-        images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), view.depth.numpy(), view.mask.numpy())
-        return self.start.metrics(camera, view.camera) | images
 
 
 def world_points(view: View, camera: Camera) -> Float[Tensor, "n 3"]:
