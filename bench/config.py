@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
@@ -79,6 +79,7 @@ class Config:
     task: Any = MISSING
     renderer: Any = MISSING
     dataset: Any = MISSING
+    stress: Any = MISSING
     prior: Any = MISSING
     scale: Any = MISSING
     tracker: Any = MISSING
@@ -182,7 +183,8 @@ def nearest(word: str, known: list[str]) -> str:
 def _typed(cls: type, arguments: dict, name: str) -> Any:
     """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
     types = get_type_hints(cls)
-    nested = {key for key in arguments if is_dataclass(types[key])}
+    classes = {key: _node_class(types[key]) for key in arguments if arguments[key] is not None}
+    nested = {key: found for key, found in classes.items() if found is not None}
     schema = OmegaConf.structured(cls)
     OmegaConf.set_readonly(schema, False)  # frozen dataclasses give read-only nodes
     try:
@@ -192,11 +194,16 @@ def _typed(cls: type, arguments: dict, name: str) -> Any:
         raise ValueError(f"{name}.{error.full_key}: {str(error).splitlines()[0]} (expected {wanted})") from None
     values: Any = OmegaConf.to_container(flat, throw_on_missing=False)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
-    values |= {key: build(arguments[key], f"{name}.{key}", target=_path(types[key])) for key in nested}
+    values |= {key: build(arguments[key], f"{name}.{key}", target=_path(found)) for key, found in nested.items()}
     missing = [key for key, value in values.items() if value == MISSING]
     if missing:
         raise ValueError(f"{name}.{missing[0]} must be given: set {name}.{missing[0]}=...")
     return cls(**values)
+
+
+def _node_class(wanted: Any) -> type | None:
+    """The dataclass that a field's type asks for, alone or beside None; None where it asks for no dataclass."""
+    return next((cls for cls in (wanted, *get_args(wanted)) if isinstance(cls, type) and is_dataclass(cls)), None)
 
 
 def _path(cls: type) -> str:

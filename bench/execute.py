@@ -41,10 +41,13 @@ def execute(
         if not isinstance(task, Task):
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
         stage = set_up(config, progress)
-        record.scene, record.notes = stage.scene.name, [*record.notes, *stage.scene.mesh.repairs]
+        record.scene = stage.scene_name
         record.environment |= environment.describe(stage.device)
         checkpoint(record)
-        task.execute(Cell(stage, folder, record, progress))
+        try:
+            task.execute(Cell(stage, folder, record, progress))
+        finally:
+            record.notes = [*record.notes, *stage.repairs]
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
     except (MemoryError, torch.OutOfMemoryError) as error:

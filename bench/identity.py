@@ -16,6 +16,7 @@ from bench.report.records import NEUTRAL_KEYS
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("renderers", "datasets", "bench")
 PASSIVE = ("bench/report", "bench/trackers", "bench/merge.py", "bench/plan.py", "bench/progress.py", "bench/summary.py")
+NO_STRESS = "none"
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 
 
@@ -24,7 +25,7 @@ class Identity:
     """Which run a configuration asks for.
 
     Args:
-        choices: task, renderer and dataset, by the names of the chosen YAMLs.
+        choices: task, renderer and dataset, by the names of the chosen YAMLs; a stress stands in the dataset's place.
         config: the resolved configuration, as plain data.
     """
 
@@ -55,7 +56,9 @@ def identify(config: DictConfig, choices: DictConfig) -> Identity:
     """The identity of a configuration; `choices` are those of `hydra.runtime`."""
     # As far as it can be resolved: a value that is missing is an error of the run, not of its record.
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    return Identity({name: str(choices[name]) for name in ("task", "renderer", "dataset")}, values)
+    seen = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
+    named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": seen}
+    return Identity({name: str(choice) for name, choice in named.items()}, values)
 
 
 @lru_cache(maxsize=1)

@@ -15,8 +15,8 @@ from torch import Tensor
 from bench.autodecoder import Prior
 from bench.records import alone, digest
 from renderers.camera import Camera
-from renderers.field import Field, autograd_normals
-from renderers.reference import steepest, trace
+from renderers.field import Field, autograd_normals, steepest
+from renderers.reference import trace
 
 VERSION = 1  # to be raised when the reference changes
 LEAST_STEP = 2e-4  # scene units: what is thinner along a ray may be missed; a pixel at 512 x 512 is 4.6e-3 wide

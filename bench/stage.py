@@ -16,7 +16,7 @@ from bench.prior_store import prior_for
 from bench.progress import Report
 from bench.records import Record
 from datasets.dataset import Dataset, Split
-from datasets.scene import Scene, make_scene
+from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.rendering import Renderer
 
@@ -26,14 +26,25 @@ class Stage:
     """What a run works with."""
 
     renderer: Renderer
-    scene: Scene
     views: ViewSampler
+    scene_name: str
+    make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
     cache: Path  # where what is slow to make is kept
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene, made when it is first asked for: not every task needs one."""
+        return self.make_scene()
+
+    @property
+    def repairs(self) -> list[str]:
+        """What was done to the scene's mesh, if it was made."""
+        return self.scene.mesh.repairs if "scene" in vars(self) else []
 
     @cached_property
     def prior(self) -> Prior:
@@ -80,15 +91,28 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     views = build(config.view, "view", target="datasets.views.ViewSampler")
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
-    scene = make_scene(dataset, views, split=Split(config.split), index=config.index)
     cache = Path(config.priors_dir)
     torch.manual_seed(config.seed)
     trained = config.index if config.split == Split.TRAIN and config.index < settings.shapes else None
 
+    def shape_and_view() -> Scene:
+        return make_scene(dataset, views, split=Split(config.split), index=config.index)
+
     def make_prior() -> Prior:
         return prior_for(dataset, settings, cache, device, progress)
 
-    return Stage(renderer, scene, views, make_prior, evaluation, config.seed, device, cache, trained)
+    return Stage(
+        renderer=renderer,
+        views=views,
+        scene_name=scene_name(dataset, Split(config.split), config.index),
+        make_scene=shape_and_view,
+        make_prior=make_prior,
+        evaluation=evaluation,
+        seed=config.seed,
+        device=device,
+        cache=cache,
+        trained=trained,
+    )
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

@@ -66,7 +66,12 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
     if not bool(view.mask.any()):
         raise ValueError(f"the camera sees nothing of {dataset.name} {index}: widen view.field_of_view or distance")
     formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
-    return Scene(f"{dataset.name} {split} {index}", mesh, view, formula)
+    return Scene(scene_name(dataset, split, index), mesh, view, formula)
+
+
+def scene_name(dataset: Dataset, split: Split, index: int) -> str:
+    """What a shape of a dataset is called."""
+    return f"{dataset.name} {split} {index}"
 
 
 def see(truth: Truth, camera: Camera) -> View:

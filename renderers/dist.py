@@ -9,7 +9,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind
+from renderers.field import Field, Kind, steepest
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import Capabilities, Rendering, assemble
@@ -25,15 +25,18 @@ class DIST:
         right direction at each pixel and a wrong scale, alpha * samples * cos(angle of incidence); see
         `gradients.approximate`. That of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
-    Deviates from the paper: `extra_step_cap` and `careful_split` are ours. `step_clamp`, `silhouette_signed` and the
-        average over violating pixels are as in the official code; Eq. 11 states neither sign nor average. Each is
-        named, and off in the setting that takes the paper at its word. A ray that begins at negative values stops at
-        once and says so. Coarse to fine applies to rays that say that they are an image; others march at full
-        resolution.
+    Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step` and `slope_samples` are ours.
+        `step_clamp`, `silhouette_signed` and the average over violating pixels are as in the official code; Eq. 11
+        states neither sign nor average. Each is named, and off in the setting that takes the paper at its word. A ray
+        that begins at negative values stops at once and says so. Coarse to fine applies to rays that say that they are
+        an image; others march at full resolution.
 
     Args:
         steps: most marching steps a ray.
-        epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split: see `march.Stepping`.
+        epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step: see
+            `march.Stepping`.
+        slope_samples: points at which the steepest gradient is looked for before the march, by which values are then
+            divided (`field.steepest`); 0 trusts the field.
         coarse_to_fine: begin with a ray for each 4 x 4 pixels.
         samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
@@ -48,6 +51,9 @@ class DIST:
     active_only: bool
     coarse_to_fine: bool
     careful_split: bool
+    step_back: bool
+    least_step: float
+    slope_samples: int
     samples: int
     sphere_radius: float
     silhouette_signed: bool
@@ -64,6 +70,8 @@ class DIST:
         check_at_least("samples", self.samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        check_at_least("least_step", self.least_step, 0, "0 switches it off")
+        check_at_least("slope_samples", self.slope_samples, 0, "0 switches it off, 4096 cost a pixel's worth a pixel")
         for name in ("extra_step_cap", "step_clamp"):
             if getattr(self, name) is not None:
                 check_positive(name, getattr(self, name), f"{name}=null switches it off")
@@ -90,6 +98,11 @@ class DIST:
             average=self.silhouette_average,
         )
 
+    def _slope(self, field: Field, rays: Rays) -> float:
+        if not self.slope_samples:
+            return 1.0
+        return steepest(field, like=rays.origins, radius=self.sphere_radius, samples=self.slope_samples)
+
     def _trace(self, field: Field, rays: Rays) -> Front:
         stepping = Stepping(
             self.epsilon,
@@ -98,6 +111,9 @@ class DIST:
             self.step_clamp,
             active_only=self.active_only,
             careful_split=self.careful_split,
+            step_back=self.step_back,
+            least_step=self.least_step,
+            slope=self._slope(field, rays),
         )
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(

@@ -28,7 +28,8 @@ class DVR:
     Needs: any level set: only signs are searched. What is thinner along the ray than the spacing may be missed.
     Deviates from the paper: the first sample lies where the ray enters the volume (Eq. 9 from j = 0, as in the official
         code), which is the unit sphere; a ray that begins occupied says so. Rays have a gradient, which the official
-        code leaves out, and the denominator keeps its sign, which the official clamp does not. `early_stop` is ours.
+        code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as the official clamp has
+        it. `early_stop` is ours.
 
     Args:
         samples: n, equally spaced between where a ray enters and leaves the sphere, its ends among them.
@@ -36,7 +37,7 @@ class DVR:
         refinement: "secant" as in the paper, or "bisection".
         refinement_steps: field values that a hit costs after the search.
         early_stop: ask the samples of a ray from front to back until it is found; else all of them, as in the paper.
-        least_slope: see `gradients.implicit`.
+        least_slope, keep_slope_sign: see `gradients.implicit`.
         occupancy_width: length in scene units over which a distance turns from occupied to free in the mask losses;
             see `field.occupancy_logits`. Occupancy networks do not use it.
         mask_weight: of both mask losses; 1 leaves them as the paper's equations have them.
@@ -49,6 +50,7 @@ class DVR:
     refinement_steps: int
     early_stop: bool
     least_slope: float
+    keep_slope_sign: bool
     occupancy_width: float
     mask_weight: float
     sphere_radius: float
@@ -82,7 +84,7 @@ class DVR:
         status, ended, least_distance, least = (torch.cat(part) for part in zip(*parts, strict=True))
         hit = asked[status == Status.HIT]
         distance = entry.index_put((asked,), ended)
-        found = implicit(field, flat[hit], distance[hit], least_slope=self.least_slope)
+        found = implicit(field, flat[hit], distance[hit], least_slope=self.least_slope, keep_sign=self.keep_slope_sign)
         return assemble(
             rays,
             self.sphere_radius,

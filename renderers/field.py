@@ -9,6 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 
+STEEPEST_MARGIN = 1.2  # over the steepest gradient that was found: steeper ones lie between the points
+
+
 class Kind(Enum):
     """What the values of a field mean, from most to least.
 
@@ -105,6 +108,24 @@ def autograd_gradients(field: Field, points: Float[Tensor, "*batch 3"]) -> Float
         leaf = points.detach().requires_grad_(True)
         (gradient,) = torch.autograd.grad(field(leaf).sum(), leaf)
     return gradient
+
+
+def steepest(
+    field: Field, *, radius: float, samples: int = 20_000, margin: float = STEEPEST_MARGIN, like: Tensor | None = None
+) -> float:
+    """An estimate of the field's Lipschitz bound: `margin` times the longest gradient at points drawn in the sphere.
+
+    Args:
+        radius: of the sphere about the origin.
+        samples: how many points, the same ones each time.
+        margin: see `STEEPEST_MARGIN`.
+        like: a tensor of the dtype and on the device in which the field is asked; None for float64 on the CPU.
+    """
+    draws = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
+    direction = torch.nn.functional.normalize(torch.randn(samples, 3, **draws), dim=-1)
+    points = radius * torch.rand(samples, 1, **draws) ** (1 / 3) * direction
+    gradients = autograd_gradients(field, points if like is None else points.to(like))
+    return margin * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
 
 
 def central_difference_normals(

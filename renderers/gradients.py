@@ -79,7 +79,9 @@ def fixed_samples(
     return field(rays.at(distance.detach())) if torch.is_grad_enabled() else value
 
 
-def implicit(field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_slope: float) -> Float[Tensor, "n"]:
+def implicit(
+    field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_slope: float, keep_sign: bool = True
+) -> Float[Tensor, "n"]:
     """The gradient of the distance to a level set, by implicit differentiation.
 
     Source: DVR, Eqs. 8 and 11. On the ray o + d w, the level set stays under the ray's end if
@@ -92,6 +94,7 @@ def implicit(field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_sl
         distance: where they cross the surface.
         least_slope: least magnitude of the field's slope along the ray, grad field . w, in field units a scene unit.
             A flatter crossing is divided by this, with the slope's own sign; rays enter, so zero counts as negative.
+        keep_sign: False takes flat crossings as if rays left there, as DVR's official code does.
     """
     if not torch.is_grad_enabled():
         return distance
@@ -103,7 +106,10 @@ def implicit(field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_sl
     value = field(at)
     (gradient,) = torch.autograd.grad(value.sum(), at, retain_graph=True)
     slope = (gradient * rays.directions.detach()).sum(-1)
-    slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
+    if keep_sign:
+        slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
+    else:
+        slope = torch.where(slope.abs() < least_slope, least_slope, slope)
     change = (gradient * (reached - reached.detach())).sum(-1)
     if towards_field:
         change = change + value - value.detach()

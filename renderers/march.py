@@ -31,6 +31,11 @@ class Stepping:
         active_only: ask the field only for rays that have not finished; else for every ray that meets the sphere.
         careful_split: a ray goes on not from where its coarse ray is, but from where that came closest to the surface,
             if it came about as close as the two rays lie apart there. Else rays beside an edge begin behind it.
+        step_back: a step beyond the value is taken back where the empty balls about its two ends do not meet, and the
+            value itself is gone instead (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1).
+        least_step: forward steps are at least this long, in scene units, but for one that turns back from behind the
+            surface, else a ray would never come to rest there; 0 for none.
+        slope: bound on the length of the field's gradient, by which values are divided before a step is made of them.
     """
 
     epsilon: float
@@ -39,9 +44,13 @@ class Stepping:
     step_clamp: float | None
     active_only: bool
     careful_split: bool
+    step_back: bool = False
+    least_step: float = 0.0
+    slope: float = 1.0
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """The signed step along the ray after the field gave `value`."""
+        value = value / self.slope
         if self.step_clamp is not None:
             value = value.clamp(-self.step_clamp, self.step_clamp)
         extra = (self.alpha - 1) * value
@@ -64,6 +73,8 @@ class Front:
     value: Float[Tensor, "n"]
     sample_distance: Float[Tensor, "n samples"]
     sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
+    safe: Float[Tensor, "n"]  # how far the last value allowed the ray to go, and how far it went
+    gone: Float[Tensor, "n"]
 
     @staticmethod
     def on_sphere(rays: Rays, *, radius: float, samples: int) -> "Front":
@@ -81,6 +92,8 @@ class Front:
             value=torch.zeros_like(entry),
             sample_distance=entry[:, None].repeat(1, samples),
             sample_value=torch.full_like(entry, torch.inf)[:, None].repeat(1, samples),
+            safe=torch.zeros_like(entry),
+            gone=torch.zeros_like(entry),
         )
 
     def split(
@@ -166,7 +179,13 @@ def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], s
     _keep_least(front, asked, torch.where(finite, value, torch.inf), distance)
 
     # The last query moves the ray by the value itself, without alpha (DIST, Eq. 1).
-    step = torch.where(converged, value, torch.where(inside, 0.0, stepping.length(value)))
+    length = stepping.length(value)
+    onward = (value > 0) & (front.value[asked] >= 0)
+    length = torch.where(onward, length.clamp_min(stepping.least_step), length)
+    step = torch.where(converged, value, torch.where(inside, 0.0, length))
+    if stepping.step_back:
+        step, apart = _taken_back(front, asked, value / stepping.slope, step)
+        converged &= ~apart
     moved = distance + step
     left = ~converged & (moved > front.leave[asked])
     behind = moved < front.entry[asked] - stepping.epsilon
@@ -183,6 +202,18 @@ def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], s
     front.distance[asked] = torch.where(left, front.leave[asked], moved)
     front.fresh[asked] = False
     front.active[asked] = finite & ~converged & ~inside & ~left
+
+
+def _taken_back(
+    front: Front, asked: Int[Tensor, "m"], reach: Float[Tensor, "m"], step: Float[Tensor, "m"]
+) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"]]:
+    """The step, or that back to where the last value reached, where the last two empty balls lie apart; and where."""
+    safe, gone = front.safe[asked], front.gone[asked]
+    apart = (gone > safe) & (gone > safe + reach.abs())
+    back = torch.where(apart, safe - gone, step)
+    front.safe[asked] = torch.where(apart, torch.inf, reach.clamp_min(0))  # what was gone back to is sure
+    front.gone[asked] = back
+    return back, apart
 
 
 def _keep_least(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], distance: Float[Tensor, "m"]) -> None:

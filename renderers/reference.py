@@ -21,7 +21,7 @@ def trace(field: Field, rays: Rays, *, lipschitz: float, least_step: float, radi
     Args:
         field: evaluated as it is; give it in float64.
         rays: in float64.
-        lipschitz: bound on the length of the field's gradient; see `steepest`.
+        lipschitz: bound on the length of the field's gradient; see `field.steepest`.
         least_step: in scene units.
         radius: of the sphere about the origin that holds the shape.
 
@@ -67,14 +67,3 @@ def trace(field: Field, rays: Rays, *, lipschitz: float, least_step: float, radi
         residual=residual,
         closest=(asked, residual[asked]),
     )
-
-
-def steepest(field: Field, *, radius: float, samples: int = 20_000, margin: float = 1.2) -> float:
-    """An estimate of the field's Lipschitz bound: `margin` times the longest gradient at points drawn in the sphere."""
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(samples, 3, generator=generator, dtype=torch.float64), dim=-1)
-    distance = radius * torch.rand(samples, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
-    points = (distance * direction).requires_grad_(True)
-    with torch.enable_grad():
-        (gradient,) = torch.autograd.grad(field(points).sum(), points)
-    return margin * float(torch.linalg.vector_norm(gradient, dim=-1).max())

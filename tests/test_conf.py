@@ -134,7 +134,9 @@ def test_every_sweep_is_of_more_than_one_cell_and_repeats_none():
 
 PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2) and nothing of ours
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=True,
-    careful_split=False, samples=1, sphere_radius=1.0, silhouette_signed=False, silhouette_average="all",
+    careful_split=False,
+    step_back=False, least_step=0.0, slope_samples=0, samples=1, sphere_radius=1.0, silhouette_signed=False,
+    silhouette_average="all",
 )  # fmt: skip
 FIRST = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
     steps=50, epsilon=5e-5, gradient="unrolled", samples=1, serial=True, sphere_radius=1.0, silhouette_signed=False,
@@ -212,7 +214,8 @@ def test_the_paper_experiment_has_the_papers_settings(compose_config):
     renderer = build_part(compose_config("+experiment=completion_paper"), "renderer")
     assert renderer == DIST(
         steps=100, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True,
-        coarse_to_fine=True, careful_split=False, samples=3, sphere_radius=1.0, silhouette_signed=False,
+        coarse_to_fine=True, careful_split=False,
+    step_back=False, least_step=0.0, slope_samples=0, samples=3, sphere_radius=1.0, silhouette_signed=False,
         silhouette_average="all",
     )  # fmt: skip
 

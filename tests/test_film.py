@@ -23,7 +23,7 @@ def stage(tmp_path):
     made = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     mesh = Mesh(np.array(made.vertices), np.array(made.faces))
     scene = Scene("ball", mesh, see(Truth(mesh), CAMERA))
-    stage = cell_of(tmp_path, load("renderer", "dist"), ball_prior(), CAMERA, scene=scene).stage
+    stage = cell_of(tmp_path, load("renderer", "dist"), ball_prior(), CAMERA, make_scene=lambda: scene).stage
     return replace(stage, evaluation=replace(stage.evaluation, picture=24))
 
 

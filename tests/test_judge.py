@@ -32,7 +32,8 @@ def stage(tmp_path_factory) -> Stage:
     decoder = Decoder(layers=1, width=2, code_length=0, skip=0, narrow=False)
     return Stage(
         renderer=renderer,
-        scene=Scene("sphere test 0", mesh, see(Truth(mesh), VIEWS.camera(30.0, 20.0))),
+        scene_name="sphere test 0",
+        make_scene=lambda: Scene("sphere test 0", mesh, see(Truth(mesh), VIEWS.camera(30.0, 20.0))),
         views=VIEWS,
         make_prior=lambda: Prior(decoder, torch.zeros(1, 0)),
         evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16, every=None, film=None),

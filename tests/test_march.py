@@ -21,7 +21,9 @@ WALL = plane((0, 0, -1), 0.0)  # solid beyond z = 0: at z the value is -z
 NAIVE = load("renderer", "naive", steps=50, epsilon=5e-5, silhouette_average="all")
 FINE = DIST(
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=0.01, step_clamp=None, active_only=True, coarse_to_fine=False,
-    careful_split=True, samples=1, sphere_radius=1.0, silhouette_signed=True, silhouette_average="all",
+    careful_split=True,
+    step_back=False, least_step=0.0, slope_samples=0, samples=1, sphere_radius=1.0, silhouette_signed=True,
+    silhouette_average="all",
 )  # fmt: skip
 COARSE = replace(FINE, coarse_to_fine=True)
 

@@ -47,7 +47,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def cell(tmp_path, scene):
-    return cell_of(tmp_path, DIST, ball_prior(), CAMERA, scene=scene)
+    return cell_of(tmp_path, DIST, ball_prior(), CAMERA, make_scene=lambda: scene)
 
 
 def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
@@ -158,7 +158,7 @@ def test_a_known_shape_may_be_a_network(cell):
 
 
 def test_a_shape_without_a_formula_is_told(cell):
-    stage = replace(cell.stage, scene=replace(cell.stage.scene, formula=None))
+    stage = replace(cell.stage, make_scene=lambda: replace(cell.stage.scene, formula=None))
     with pytest.raises(ValueError, match=r"box has no formula: set task\.shape=grid"):
         known_shape(SETTINGS, stage)
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from renderers.camera import Rays
+from renderers.field import steepest
 from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.reference import steepest, trace
+from renderers.reference import trace
 from renderers.rendering import Status
 from tests.analytic_cases import CASES, sphere_hits, vector
 

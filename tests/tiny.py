@@ -81,7 +81,8 @@ def cell_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed
     scene = Scene("a scene", Mesh(corners, np.array([[0, 2, 1]])), view)
     stage = Stage(
         renderer=renderer,
-        scene=scene,
+        scene_name=scene.name,
+        make_scene=lambda: scene,
         views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
         make_prior=lambda: prior,
         evaluation=EvaluationSettings(grid=16, points=50, fscore_threshold=0.02, picture=8, every=None, film=None),

@@ -41,6 +41,7 @@ KINDS = {
     "fig5": Kind(("completion",)),
     "fig7": Kind(("ablation",)),
     "gradients": Kind(("gradients",)),
+    "stability": Kind(("stability",), ("stress", "task"), ("stress",)),
     "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split")),
 }
 MACHINE = ("cpu", "device", "threads")
@@ -82,7 +83,9 @@ class Experiment:
             row_name(record)
             + (self._own_settings(record) if not kind.varies else "")
             + "".join(
-                f", {value} {key}" for key in kind.cell if (value := setting(record["config"], "task", key)) is not None
+                f", {value} {key}"
+                for key in kind.cell
+                if isinstance(value := setting(record["config"], "task", key), str | int | float)
             )
             + (f", {family(record)}" if len(families) > 1 else "")
             + (f", seed {_seed(record)}" if len(seeds) > 1 else "")

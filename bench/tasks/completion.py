@@ -1,6 +1,7 @@
 """Shape completion: find the code whose shape agrees with a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,7 +13,7 @@ from bench.stage import Cell
 from bench.tasks.code import CodePenalty, CodeProblem, Terms, code_problem
 from bench.tasks.problem import OptimiserSettings, Unsupported
 from datasets.observe import observed_pixels, parse_amount
-from datasets.scene import Scene
+from datasets.scene import Scene, View
 from renderers.camera import Rays
 from renderers.checks import check_at_least
 from renderers.field import Field
@@ -68,30 +69,55 @@ class Completion:
             raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
         view = scene.view
         observed = observed_pixels(view, self.points, seed)
-        given = GivenView(
-            settings=self,
-            renderer=renderer,
-            rays=view.camera.rays().to(device),
-            depth=view.depth.to(device),
-            depth_of_distance=view.camera.depth(torch.ones(view.depth.shape)).to(device),
-            observed=observed.to(device),
-            mask=view.mask.to(device) if self.mask or self.points == "dense" else None,
-        )
+        mask = view.mask if self.mask or self.points == "dense" else None
+        given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         penalty = CodePenalty(self.code_weight, self.code_average)
         return code_problem(prior, penalty, given.compare, observed=observed, rays=view.mask.numel(), device=device)
+
+
+@runtime_checkable
+class Weights(Protocol):
+    """What weighs the terms of a view's loss."""
+
+    @property
+    def depth_weight(self) -> float: ...
+
+    @property
+    def silhouette_weight(self) -> float: ...
 
 
 @dataclass(frozen=True)
 class GivenView:
     """What is given of a view; `compare` renders a field and compares."""
 
-    settings: Completion
+    settings: Weights
     renderer: Renderer
     rays: Rays
     depth: Float[Tensor, "height width"]
     depth_of_distance: Float[Tensor, "height width"]  # depth of a point at distance 1, the cosine of Eq. 2
     observed: Bool[Tensor, "height width"]
     mask: Bool[Tensor, "height width"] | None
+
+    @staticmethod
+    def of(
+        view: View,
+        settings: Weights,
+        renderer: Renderer,
+        *,
+        observed: Bool[Tensor, "height width"],
+        mask: Bool[Tensor, "height width"] | None,
+        device: torch.device,
+    ) -> "GivenView":
+        """What `observed` and `mask` give of a view, on a device."""
+        return GivenView(
+            settings=settings,
+            renderer=renderer,
+            rays=view.camera.rays().to(device),
+            depth=view.depth.to(device),
+            depth_of_distance=view.camera.depth(torch.ones(view.depth.shape)).to(device),
+            observed=observed.to(device),
+            mask=None if mask is None else mask.to(device),
+        )
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted terms of DIST, Eq. 5, with the weights of B.4."""

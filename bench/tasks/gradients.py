@@ -14,9 +14,8 @@ from bench.stage import Cell
 from bench.tasks.problem import Unsupported, check_kind
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Counts, Meter
+from renderers.field import Counts, Meter, steepest
 from renderers.fields.mlp import Decoder
-from renderers.reference import steepest
 from renderers.rendering import Renderer
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence

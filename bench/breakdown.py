@@ -1,0 +1,131 @@
+"""Where success turns into failure: an adaptive search for the severity at which half of the trials succeed.
+
+The chance of success falls along a logistic curve of the level, from 0 (mild) to 1 (severe). What is known of its
+middle and its width is a table of probabilities; each trial is made where it is expected to tell most (the psi method
+of Kontsevich and Tyler 1999). The interval is the middle 95 % of what is known in the end.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from renderers.checks import check_at_least
+
+WIDTHS = (0.003, 0.01, 0.03, 0.08, 0.2)  # of the logistic curve, in levels from 0 to 1
+LAPSE = 0.02  # chance that a trial fails, or succeeds, whatever its level
+BEYOND = 0.15  # how far outside of the sweep the middle may lie, in levels
+FINENESS = 4  # middles that are told apart between two levels
+CERTAIN = 0.95
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How finely and how long to search.
+
+    Args:
+        levels: of the full grid to whose resolution the breakdown is wanted, ends among them.
+        repeats: trials a level of that grid; the search makes half of the grid's trials at most.
+    """
+
+    levels: int
+    repeats: int
+
+    def __post_init__(self) -> None:
+        check_at_least("task.search.levels", self.levels, 3, "33 tell a fifth of a decade over six")
+        check_at_least("task.search.repeats", self.repeats, 2, "5 are little: 0 of 5 still allows 43 %")
+
+    @property
+    def grid(self) -> int:
+        """Trials of the full grid."""
+        return self.levels * self.repeats
+
+    @property
+    def most(self) -> int:
+        """Trials of the search."""
+        return self.grid // 2
+
+
+@dataclass(frozen=True)
+class Breakdown:
+    """The level at which half of the trials succeed, and the ends of its interval; not in the sweep beyond 0 or 1."""
+
+    level: float
+    low: float
+    high: float
+
+
+class Search:
+    """Says at which level the next trial is made, and learns from each."""
+
+    def __init__(self, settings: SearchSettings) -> None:
+        self.settings = settings
+        self.levels = np.linspace(0.0, 1.0, settings.levels)
+        step = 1.0 / (settings.levels - 1) / FINENESS
+        self.middles = np.arange(-BEYOND, 1.0 + BEYOND + step / 2, step)
+        self.known = np.full((len(self.middles), len(WIDTHS)), 1.0 / len(self.middles) / len(WIDTHS))
+        self.trials: list[tuple[int, bool]] = []
+
+    @cached_property
+    def _success(self) -> np.ndarray:
+        """The chance of success [level, middle, width]."""
+        apart = (self.middles[None, :, None] - self.levels[:, None, None]) / np.array(WIDTHS)
+        return LAPSE + (1 - 2 * LAPSE) / (1 + np.exp(-np.clip(apart, -50, 50)))
+
+    def next(self) -> int | None:
+        """The number of the level of the next trial; None where enough is known, or enough was tried.
+
+        The two ends come first. An end at or beyond which the breakdown lies is tried `repeats` times at least, so that
+        what is said of it has a count behind it.
+        """
+        if len(self.trials) >= self.settings.most:
+            return None
+        tried = [level for level, _ in self.trials]
+        last = self.settings.levels - 1
+        for end in (0, last):
+            if tried.count(end) < 1:
+                return end
+        found = self.result()
+        if found.high - found.low <= 2 / last or found.low > 1 or found.high < 0:
+            wanting = [
+                end for end in (0, last) if self._needed(end, found) and tried.count(end) < self.settings.repeats
+            ]
+            return wanting[0] if wanting else None
+        return self._telling()
+
+    def note(self, level: int, success: bool) -> None:
+        """Learns from a trial at a level."""
+        self.trials.append((level, success))
+        chance = self._success[level]
+        self.known = self.known * (chance if success else 1 - chance)
+        self.known /= self.known.sum()
+
+    def result(self) -> Breakdown:
+        """What is known of the breakdown."""
+        below = self.known.sum(axis=1).cumsum()
+        ends = [(1 - CERTAIN) / 2, 0.5, (1 + CERTAIN) / 2]
+        low, middle, high = (float(self.middles[min(int(np.searchsorted(below, e)), len(below) - 1)]) for e in ends)
+        return Breakdown(middle, low, high)
+
+    def counts(self, level: int) -> tuple[int, int]:
+        """How many trials at a level succeeded, and how many there were."""
+        own = [success for at, success in self.trials if at == level]
+        return sum(own), len(own)
+
+    def _needed(self, end: int, found: Breakdown) -> bool:
+        """Whether the sweep's end needs its full count: the breakdown lies at it or beyond."""
+        step = 1 / (self.settings.levels - 1)
+        return found.level < step if end == 0 else found.level > 1 - step
+
+    def _telling(self) -> int:
+        """The level whose trial leaves the least entropy on average."""
+        chance = self._success
+        succeeds = (chance * self.known).sum(axis=(1, 2))
+        after = _entropy(chance * self.known), _entropy((1 - chance) * self.known)
+        return int(np.argmin(succeeds * after[0] + (1 - succeeds) * after[1]))
+
+
+def _entropy(tables: np.ndarray) -> np.ndarray:
+    """Of each of the tables [levels, middles, widths], scaled to a sum of 1."""
+    shares = tables / tables.sum(axis=(1, 2), keepdims=True)
+    return -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=(1, 2))

@@ -1,0 +1,179 @@
+"""The stability atlas: where each renderer breaks on each axis, as a table and a heat map; what robustness costs."""
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.report import format, style
+from bench.report.atlas import Atlas, Cell, atlas, title
+from bench.report.caption import counted_outcome, joined, omitted
+from bench.report.experiments import Experiment, identity, measured
+from bench.report.tables import Result
+
+CAPTION = (
+    "The severity at which half of the trials succeed, with its 95 % interval, found by an adaptive search; {trials} "
+    "trials in all, {share:.0f} % of a full grid's. 'At once' breaks at the mildest severity, 'none' not at the "
+    "severest; behind either is how many trials failed there and Wilson's interval of their share. – is a renderer "
+    "without that setting. Success: 99 % of the true hits within the pixel's footprint and at most 1 % false hits; a "
+    "gradient whose cosine is over 0.99 and whose length is right within 10 %; a fit within 0.02 scene units of the surface. Every "
+    "renderer has the same trials."
+)
+WORST = 3
+
+
+def make(experiment: Experiment) -> Result:
+    """A line an axis, a column a renderer."""
+    grid = atlas(experiment)
+    header = ["Axis", "Unit", *grid.rows]
+    lines = [[title(axis), grid.unit(axis), *(_told(grid, axis, row) for row in grid.rows)] for axis in grid.axes]
+    trials, full = (sum(measured(cell.record, name) or 0 for cell in grid.cells.values()) for name in _COUNTS)
+    return Result(
+        name="stability",
+        title="Where each renderer breaks.",
+        caption=joined(
+            CAPTION.format(trials=int(trials), share=100 * trials / max(full, 1)),
+            counted_outcome(experiment),
+            omitted(experiment),
+        ),
+        data=pd.DataFrame([_raw(grid, axis, row) for axis in grid.axes for row, _ in grid.on(axis)], dtype=object),
+        table=pd.DataFrame(lines, columns=header),
+        notes=[*(_worst(grid, row) for row in grid.rows), *_theory(grid)],
+        figure=draw(grid),
+    )
+
+
+_COUNTS = ("trials", "grid_trials")
+_WHOLE = ("axes", "at_once", "never")
+
+
+@style.styled
+def draw(grid: Atlas) -> Figure:
+    """The heat map: dark where a renderer breaks at a mild severity."""
+    figure = Figure(figsize=(style.WIDTH, 0.19 * len(grid.axes) + 1.7), layout="constrained")
+    axes = figure.subplots()
+    shades = np.array([[_shade(grid, axis, row) for row in grid.rows] for axis in grid.axes])
+    shown = axes.imshow(np.ma.masked_invalid(shades), cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
+    axes.set_facecolor("#f2f2f2")
+    for line, axis in enumerate(grid.axes):
+        for column, row in enumerate(grid.rows):
+            cell = grid.cells.get((axis, row))
+            if cell is not None:
+                axes.text(column, line, cell.short(), ha="center", va="center", fontsize=5.5)
+    axes.set_xticks(range(len(grid.rows)), grid.rows, rotation=35, ha="left", rotation_mode="anchor")
+    axes.xaxis.tick_top()
+    axes.set_yticks(range(len(grid.axes)), [f"{title(axis)} ({grid.unit(axis)})" for axis in grid.axes])
+    axes.tick_params(length=0, labelsize=6)
+    axes.grid(False)
+    groups = [grid.group(axis) for axis in grid.axes]
+    for line in range(1, len(groups)):
+        if groups[line] != groups[line - 1]:
+            axes.axhline(line - 0.5, color="#222222", lw=0.8)
+    bar = figure.colorbar(shown, ax=axes, location="bottom", shrink=0.5, aspect=40, pad=0.02)
+    bar.set_ticks([0, 1], labels=["breaks at the mildest", "not at the severest"])
+    return figure
+
+
+def cost(experiment: Experiment) -> Result:
+    """What robustness costs: how far each renderer gets, over the field values that it asks."""
+    grid = atlas(experiment)
+    rows = [_cost(grid, row) for row in grid.rows]
+    header = ["Renderer", "Axes", "At once", "None", "Mean level", "Field values a ray"]
+    told = []
+    for r in rows:
+        told.append([r["row"], *(str(r[name]) for name in _WHOLE), format.number(r["level"]), format.number(r["cost"])])
+    return Result(
+        name="stability_cost",
+        title="What robustness costs.",
+        caption=joined(
+            "Over the axes that judge renderings and that all renderers have: on how many a renderer breaks at the "
+            "mildest severity, on how many not even at the severest; the mean level of its breakdown, 0 the mild end "
+            "of a sweep and 1 the severe one; and the median over axes of the field values a ray at the mild end.",
+            counted_outcome(experiment),
+            omitted(experiment),
+        ),
+        data=pd.DataFrame(rows, dtype=object),
+        table=pd.DataFrame(told, columns=header),
+        figure=draw_cost(rows),
+    )
+
+
+@style.styled
+def draw_cost(rows: list[dict[str, Any]]) -> Figure:
+    """The mean level over the field values a ray."""
+    figure = Figure(figsize=(style.WIDTH, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for row in rows:
+        look = style.look(row["row"])
+        axes.plot(row["cost"], row["level"], marker=look.marker, color=look.colour, ls="none", label=row["row"], ms=7)
+    style.log_axis(axes, "x", [row["cost"] for row in rows])
+    axes.set(xlabel="field values a ray at the mild end, median over axes", ylabel="mean level of the breakdown")
+    axes.set_ylim(0, 1)
+    figure.legend(loc="outside right upper")
+    return figure
+
+
+def _cost(grid: Atlas, row: str) -> dict[str, Any]:
+    shared = [
+        axis
+        for axis in grid.axes
+        if grid.measure(axis) == "rendering" and all(cell.known for _, cell in grid.on(axis))
+        and len(list(grid.on(axis))) == len(grid.rows)
+    ]  # fmt: skip
+    cells = [grid.cells[axis, row] for axis in shared]
+    costs = [cost for cell in cells if (cost := measured(cell.record, "evaluations_per_ray")) is not None]
+    return {
+        "row": row,
+        "axes": len(cells),
+        "at_once": sum(cell.at_once for cell in cells),
+        "never": sum(cell.never for cell in cells),
+        "level": float(np.mean([cell.shade for cell in cells])) if cells else math.nan,
+        "cost": float(np.median(costs)) if costs else math.nan,
+    }
+
+
+def _told(grid: Atlas, axis: str, row: str) -> str:
+    cell = grid.cells.get((axis, row))
+    return cell.told() if cell is not None else ""
+
+
+def _shade(grid: Atlas, axis: str, row: str) -> float:
+    cell = grid.cells.get((axis, row))
+    return cell.shade if cell is not None else math.nan
+
+
+def _worst(grid: Atlas, row: str) -> str:
+    """A row's mildest breakdowns, and how its trials failed."""
+    known = [(cell.level, axis, cell) for axis in grid.axes if (cell := grid.cells.get((axis, row))) and cell.known]
+    worst = sorted(known, key=lambda item: (item[0], item[1]))[:WORST]
+    told = [f"{title(axis)} {cell.told()} {grid.unit(axis)}" for _, axis, cell in worst]
+    kinds: Counter[str] = Counter()
+    for cell in grid.of(row):
+        kinds.update(cell.failures())
+    failed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    return f"{row}: worst on {'; '.join(told)}. Failed trials: {failed or 'none'}."
+
+
+def _theory(grid: Atlas) -> list[str]:
+    """A line an axis that has a theory: predicted and measured."""
+    lines = []
+    for axis in grid.axes:
+        told = [
+            f"{row} {format.number(predicted)}, measured {cell.told()}"
+            for row, cell in grid.on(axis)
+            if cell.known and (predicted := measured(cell.record, "predicted")) is not None
+        ]
+        if told:
+            lines.append(f"Predicted, {title(axis)}: {'; '.join(told)}.")
+    return lines
+
+
+def _raw(grid: Atlas, axis: str, row: str) -> dict[str, Any]:
+    cell: Cell = grid.cells[axis, row]
+    numbers = {name: value for name, value in cell.record["metrics"].items() if not name.startswith("failed_")}
+    kinds = "; ".join(f"{count} {kind}" for kind, count in cell.failures().items())
+    told = {"axis": axis, "group": grid.group(axis), "unit": grid.unit(axis), **identity(cell.record)}
+    return {**told, **numbers, "failures": kinds}

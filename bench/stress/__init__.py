@@ -1,0 +1,1 @@
+"""Trials that a renderer passes or fails at a severity, and what theory says of where it fails."""

@@ -1,0 +1,274 @@
+"""Does an inverse problem end where it should? A ball is fitted to one depth image and its silhouette.
+
+Its four numbers, the middle and the logarithm of the radius, are free. What is given is then made worse, or the start.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.limits import Limits
+from bench.optimise import Course, optimise
+from bench.poses import of_moved_object
+from bench.records import RunStatus
+from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.tasks.completion import GivenView
+from bench.tasks.problem import OptimiserSettings, Unsupported
+from datasets.scene import View
+from datasets.stress.solids import Solid, ball
+from datasets.views import ViewSampler
+from renderers.camera import Camera
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Counts, Field, Meter
+from renderers.rendering import Renderer
+
+RADII, FACTORS = (0.35, 0.55), (0.75, 1.3)  # true radii; the radius at the start over the true one
+SURFACE_SAMPLES = 2000
+DEFINITIONS = {
+    "surface_error": "mean magnitude of the fitted ball's distance at points of the true surface, in scene units",
+    "evaluations_per_ray": "field values computed, over rays times iterations",
+}
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The fit whose end is judged.
+
+    Args:
+        resolution: pixels a side.
+        iterations, learning_rate: of Adam; the rate falls to zero along half a cosine.
+        depth_weight, silhouette_weight: as in completion.
+        offset: of the ball's middle at the start, in scene units.
+    """
+
+    resolution: int
+    iterations: int
+    learning_rate: float
+    depth_weight: float
+    silhouette_weight: float
+    offset: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.fit.resolution", self.resolution, 4, "32 suits a ball")
+        check_positive("task.fit.offset", self.offset, "0.1 is easily found back")
+        OptimiserSettings(self.iterations, self.learning_rate, "cosine")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a fit is given."""
+
+    camera: Camera  # that it believes in
+    depth: Float[Tensor, "height width"]
+    observed: Bool[Tensor, "height width"]
+    mask: Bool[Tensor, "height width"]
+
+
+Disturb = Callable[[Observation, float, np.random.Generator], Observation]
+
+
+def judge_fit(
+    trial: "FitTrial", renderer: Renderer, criteria: Criteria, *, limits: Limits, device: torch.device
+) -> Outcome:
+    """Fits the ball that a trial draws, under its disturbance.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+        LimitReached: where a step takes more than it may.
+    """
+    if not renderer.capabilities.field_gradient:
+        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+    fit, draw = trial.fit, trial.draw
+    true, start = _balls(draw, fit.offset)
+    given = trial.disturbed(_observe(_ball(true), fit.resolution, draw))
+    view = View(given.camera, given.depth, torch.zeros(*given.depth.shape, 3), given.mask)
+    compared = GivenView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=device)
+    problem = BallProblem(start.to(device).requires_grad_(), compared, limits)
+    torch.manual_seed(int(draw.integers(2**31)))  # of losses that draw points
+    course = Course()
+    settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
+    optimise(problem, settings, device, course=course, on_step=lambda line: None)
+    error = float(problem.field()(_surface(true, draw).to(device)).abs().mean())
+    spent = course.counts.value / problem.rays_per_iteration / max(len(course.curve), 1)
+    return Outcome(_failure(course, error, criteria), {"surface_error": error, "evaluations_per_ray": spent})
+
+
+@dataclass(frozen=True)
+class FitTrial:
+    """A fit, what is wrong with it, and how much: what is given, or the fit's own settings."""
+
+    fit: FitSettings
+    disturb: "Disturb"
+    severity: float
+    draw: np.random.Generator
+
+    @staticmethod
+    def of(scene: str, fit: FitSettings, severity: float, draw: np.random.Generator) -> "FitTrial":
+        """The trial of that name in `FITS`."""
+        return FitTrial(STARTS.get(scene, _as_is)(fit, severity), DISTURBANCES.get(scene, _undisturbed), severity, draw)
+
+    def disturbed(self, given: Observation) -> Observation:
+        """What is given in its place."""
+        return self.disturb(given, self.severity, self.draw)
+
+
+@dataclass
+class BallProblem:
+    """Four numbers to be found; see `bench.tasks.problem.Problem`."""
+
+    free: Float[Tensor, "4"]
+    given: GivenView
+    limits: Limits
+    counts: Counts = field(default_factory=Counts)
+    photographs: None = None
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """What is free."""
+        return [self.free]
+
+    @property
+    def rays_per_iteration(self) -> int:
+        """All pixels."""
+        return self.given.observed.numel()
+
+    @property
+    def observed(self) -> Bool[Tensor, "height width"]:
+        """Pixels whose depth is given."""
+        return self.given.observed
+
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        """The terms and their sum."""
+        shape = self.limits.watch(_ball(self.free).field, self.free.device)
+        terms = self.given.compare(Meter(shape, self.counts), iteration)
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    def objective(self) -> None:
+        """Losses of different iterations are comparable."""
+
+    def field(self) -> Field:
+        """The ball as it stands."""
+        return _ball(self.free.detach()).field
+
+
+def depth_noise(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """Normal noise of a standard deviation, in scene units, on each depth."""
+    return replace(given, depth=given.depth + severity * _normal(given, draw))
+
+
+def depth_outliers(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the depths is drawn anew, between 1.5 and 3.5."""
+    wild = torch.from_numpy(draw.uniform(1.5, 3.5, given.depth.shape)).float()
+    return replace(given, depth=torch.where(_drawn(given, severity, draw), wild, given.depth))
+
+
+def depth_steps(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """Depths are multiples of a step, in scene units."""
+    return replace(given, depth=severity * torch.round(given.depth / severity))
+
+
+def missing_depth(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the depths is not there."""
+    return replace(given, observed=given.observed & ~_drawn(given, severity, draw))
+
+
+def mask_errors(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the mask's pixels is wrong; depth is known where it was."""
+    return replace(given, mask=given.mask ^ _drawn(given, severity, draw))
+
+
+def wrong_focal_length(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """The camera is thought to have a longer focal length, by a share."""
+    return replace(given, camera=given.camera.zoomed(1 + severity))
+
+
+def wrong_pose(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """The camera is thought to be turned about the object by an angle, in degrees."""
+    axis = draw.normal(size=3)
+    turn = torch.from_numpy(np.radians(severity) * axis / np.linalg.norm(axis)).float()
+    return replace(given, camera=of_moved_object(given.camera, torch.cat([torch.zeros(3), turn])))
+
+
+def far_start(fit: FitSettings, severity: float) -> FitSettings:
+    """The ball begins off by a distance, in scene units."""
+    return replace(fit, offset=severity)
+
+
+def learning_rate(fit: FitSettings, severity: float) -> FitSettings:
+    """Adam's rate."""
+    return replace(fit, learning_rate=severity)
+
+
+def _as_is(fit: FitSettings, severity: float) -> FitSettings:
+    return fit
+
+
+def _undisturbed(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    return given
+
+
+DISTURBANCES: dict[str, Disturb] = {
+    function.__name__: function
+    for function in (
+        depth_noise,
+        depth_outliers,
+        depth_steps,
+        missing_depth,
+        mask_errors,
+        wrong_focal_length,
+        wrong_pose,
+    )
+}
+STARTS: dict[str, Callable[[FitSettings, float], FitSettings]] = {
+    "far_start": far_start,
+    "learning_rate": learning_rate,
+}
+FITS = (*DISTURBANCES, *STARTS, "a_ball")  # the last as it is, for a severity that is the renderer's own
+
+
+def _balls(draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:
+    """The true four numbers, and those at the start."""
+    true = np.append(draw.uniform(-0.05, 0.05, 3), np.log(draw.uniform(*RADII)))
+    direction = draw.normal(size=3)
+    wrong = np.append(offset * direction / np.linalg.norm(direction), np.log(draw.uniform(*FACTORS)))
+    return torch.from_numpy(true).float(), torch.from_numpy(true + wrong).float()
+
+
+def _ball(numbers: Float[Tensor, "4"]) -> Solid:
+    return ball(numbers[3].exp()).moved(numbers[:3])
+
+
+def _observe(solid: Solid, resolution: int, draw: np.random.Generator) -> Observation:
+    """Exact depth and silhouette, from a camera that is drawn."""
+    sampler = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), resolution)
+    camera = sampler.camera(draw.uniform(*sampler.azimuth), draw.uniform(*sampler.elevation))
+    first = solid.trace(camera.double().rays().flat())
+    mask = first.hit.view(camera.height, camera.width)
+    depth = camera.depth(first.distance.view_as(mask).float()) * mask
+    return Observation(camera, depth, mask, mask)
+
+
+def _surface(numbers: Float[Tensor, "4"], draw: np.random.Generator) -> Float[Tensor, "n 3"]:
+    """Points on the true ball, evenly over its area."""
+    directions = torch.nn.functional.normalize(torch.from_numpy(draw.normal(size=(SURFACE_SAMPLES, 3))).float(), dim=-1)
+    return numbers[3].exp() * directions + numbers[:3]
+
+
+def _normal(given: Observation, draw: np.random.Generator) -> Float[Tensor, "height width"]:
+    return torch.from_numpy(draw.normal(size=given.depth.shape)).float()
+
+
+def _drawn(given: Observation, share: float, draw: np.random.Generator) -> Bool[Tensor, "height width"]:
+    return torch.from_numpy(draw.uniform(size=given.depth.shape) < share)
+
+
+def _failure(course: Course, error: float, criteria: Criteria) -> Failure:
+    if course.status is RunStatus.NAN or error != error:
+        return Failure.NAN
+    if course.status is RunStatus.DIVERGED:
+        return Failure.DIVERGED
+    return Failure.NONE if error <= criteria.surface_error else Failure.NOT_REACHED

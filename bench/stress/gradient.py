@@ -1,0 +1,68 @@
+"""Is the gradient of what a renderer finds true? Against that of the closed-form distances, in float64."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bench.limits import Limits
+from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.tasks.problem import Unsupported
+from datasets.stress import Exam
+from renderers.rendering import Renderer
+
+SUMS = 8  # random sums of distances whose gradients make the vectors that are compared
+SEED = 0
+DEFINITIONS = {
+    "gradient_cosine": "cosine between the gradients of 8 random sums of distances towards the scene's parameters, and "
+    "the true ones, over rays that truly hit and were found",
+    "gradient_scale": "length of that gradient along the true one, over the length of the true one",
+    "found": "share of the true hits that were found",
+}
+
+
+def judge_gradient(
+    exam: Exam, renderer: Renderer, criteria: Criteria, *, limits: Limits, device: torch.device
+) -> Outcome:
+    """Renders an exam with gradient, and compares that with the truth's.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+        LimitReached: where it takes more than it may.
+    """
+    if not renderer.capabilities.field_gradient:
+        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+    if exam.solid is None or exam.parameters is None:
+        raise ValueError("task.stress.scene has no parameters: choose grazing_plane for measure=gradient")
+    free = exam.parameters.float().to(device).requires_grad_()
+    found = renderer.render(limits.watch(exam.solid(free).field, device), exam.camera.rays().to(device))
+    exact = exam.parameters.double().requires_grad_()
+    first = exam.solid(exact).trace(exam.camera.double().rays().flat())
+    compared = first.hit & found.hit.flatten().cpu()
+    share = float(compared.sum() / first.hit.sum().clamp_min(1))
+    if share < 0.5 or not found.distance.requires_grad:
+        return Outcome(Failure.LOST, {"found": share})
+    signs = torch.randn(SUMS, int(compared.sum()), generator=torch.Generator().manual_seed(SEED), dtype=torch.float64)
+    mine = _gradients(found.distance.flatten()[compared.to(device)].double(), free, signs.to(device)).cpu()
+    true = _gradients(first.distance[compared], exact, signs)
+    cosine = float((mine * true).sum() / (mine.norm() * true.norm()).clamp_min(torch.finfo(mine.dtype).tiny))
+    scale = float((mine * true).sum() / true.square().sum())
+    numbers = {"gradient_cosine": cosine, "gradient_scale": scale, "found": share}
+    return Outcome(_failure(cosine, scale, criteria), numbers)
+
+
+def _gradients(
+    distance: Float[Tensor, "n"], parameters: Float[Tensor, "m"], signs: Float[Tensor, "sums n"]
+) -> Float[Tensor, "sums m"]:
+    sums = (signs * distance).sum(dim=1)
+    rows = [torch.autograd.grad(one, parameters, retain_graph=True)[0] for one in sums]
+    return torch.stack(rows).double()
+
+
+def _failure(cosine: float, scale: float, criteria: Criteria) -> Failure:
+    if cosine != cosine:
+        return Failure.NAN
+    if cosine <= 0:
+        return Failure.SIGN
+    if cosine < criteria.cosine:
+        return Failure.DIRECTION
+    return Failure.SCALE if abs(scale - 1) > criteria.scale else Failure.NONE

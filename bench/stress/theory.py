@@ -1,0 +1,140 @@
+"""Where theory has a renderer fail, in the severities of conf/stress: a few lines each, from its own settings.
+
+A renderer that lacks the settings that a formula is made of has no prediction.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import asin, degrees, log, radians, sin, sqrt, tan
+from typing import Any
+
+from bench.stress.outcome import Criteria
+from datasets.stress import scenes
+from renderers.field import STEEPEST_MARGIN
+
+FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
+SIDE = 1 / sqrt(3)  # cosine of the angle of incidence on the cube's sides, seen towards its corner
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A severity from which on a renderer should fail, and the formula that says so."""
+
+    severity: float
+    formula: str
+
+
+Theory = Callable[[Any, int, Criteria], list[Prediction]]
+
+
+def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """What the first long step overshoots; or DVR's spacing (Eq. 9) on the longest ray."""
+    if hasattr(renderer, "refinement"):
+        return [Prediction(2 * FRONT / (renderer.samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
+    if not hasattr(renderer, "alpha"):
+        return []
+    extra = max(_alpha(renderer) - 1, 0.0)
+    reach = min(FRONT, renderer.step_clamp or FRONT)
+    overshoot = min(extra * reach, renderer.extra_step_cap or extra * reach)
+    if renderer.step_back or overshoot == 0:
+        return []
+    return [Prediction(overshoot, "overshoot (alpha - 1) d of a step, within its cap or clamp")]
+
+
+def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """The angle at which the steps of Eq. 8 are all that there are."""
+    if not hasattr(renderer, "steps"):
+        return []
+    alpha, steps = _alpha(renderer), renderer.steps
+    published = degrees(asin((1 - (renderer.epsilon / FRONT) ** (1 / steps)) / alpha))
+    angle = published
+    for _ in range(50):  # the field there is not d but d sin(theta)
+        shrunk = min(renderer.epsilon / FRONT / sin(radians(angle)), 1.0)
+        angle = degrees(asin(min((1 - shrunk ** (1 / steps)) / alpha, 1.0)))
+    return [
+        Prediction(angle, "as many steps as Eq. 8 asks for, with the field's value d sin(theta) for d"),
+        Prediction(published, "as many steps as DIST, Eq. 8, asks for"),
+    ]
+
+
+def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Where DIST's scale alpha K sin(theta) leaves its tolerance, the slope falls below its least, or Eq. 8 ends."""
+    lost = grazing_plane(renderer, resolution, criteria)[:1]
+    if hasattr(renderer, "alpha"):
+        shrunk = (1 - criteria.scale) / (renderer.alpha * renderer.samples)
+        lost.append(Prediction(degrees(asin(min(shrunk, 1.0))), "scale alpha K sin(theta) of Eq. 4"))
+    elif hasattr(renderer, "least_slope"):
+        share = 1 - criteria.scale if getattr(renderer, "keep_slope_sign", True) else 1.0
+        lost.append(Prediction(degrees(asin(share * renderer.least_slope)), "slope sin(theta) below least_slope"))
+    return sorted(lost, key=lambda prediction: -prediction.severity)
+
+
+def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """The ring by which epsilon widens a cube's outline, a regular hexagon; and Eq. 10."""
+    around = scenes.CUBE * 2 * sqrt(2 / 3)  # radius through the hexagon's corners
+    focal = resolution / 2 / tan(radians(scenes.CUBE_VIEW / 2))
+    nearest = scenes.DISTANCE - scenes.CUBE * sqrt(3)
+    return [
+        Prediction(criteria.false_hits * sqrt(3) / 4 * around, "a ring as wide as epsilon has 1 % of the cube's area"),
+        Prediction(nearest / (2 * focal), "half a pixel: DIST, Eq. 10, at theta = 0"),
+    ]
+
+
+def within_epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """What comes nearer than epsilon counts as a surface."""
+    return [Prediction(renderer.epsilon, "epsilon")] if hasattr(renderer, "epsilon") else []
+
+
+def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """The way to the cube in steps of the truncated value, and what Eq. 8 asks for behind them."""
+    if not hasattr(renderer, "steps"):
+        return []
+    alpha, way = _alpha(renderer), FRONT
+    left = renderer.steps - log(renderer.epsilon / 0.01) / log(abs(1 - alpha * SIDE))
+    return [Prediction(way / alpha / left, "way over alpha k, less the steps of Eq. 8")] if left > 0 else []
+
+
+def few_steps(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Eq. 8 at the cube's sides."""
+    if not hasattr(renderer, "epsilon"):
+        return []
+    needed = log(renderer.epsilon / FRONT) / log(abs(1 - _alpha(renderer) * SIDE))
+    return [Prediction(needed, "DIST, Eq. 8, at the cube's sides")]
+
+
+def weak_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Eq. 8 at the cube's sides, with steps shortened by the factor."""
+    if not hasattr(renderer, "steps"):
+        return []
+    shrunk = 1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)
+    return [Prediction(shrunk / _alpha(renderer) / SIDE, "as many steps as DIST, Eq. 8, asks for at the cube's sides")]
+
+
+def strong_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Steps of alpha times factor times the cosine over 2 do not converge."""
+    if not hasattr(renderer, "steps"):
+        return []
+    return [Prediction(2 / _alpha(renderer) / SIDE, "alpha times factor times cos(theta) over 2 does not converge")]
+
+
+def gap(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Rays as near to a side of the slit as its depth over the steps are lost: two of them a slit."""
+    if not hasattr(renderer, "steps"):
+        return []
+    lost = 2 * scenes.SLIT_DEPTH / renderer.steps / _alpha(renderer)
+    return [Prediction(lost / scenes.SLIT_SHARE / (1 - criteria.hits), "rays within depth / k of a side are lost")]
+
+
+def _alpha(renderer: Any) -> float:
+    """The factor of a step, with what a slope bound, found on a true distance, takes off it."""
+    bounded = getattr(renderer, "slope_samples", 0)
+    return getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0)
+
+
+THEORIES: dict[str, Theory] = {
+    function.__name__: function
+    for function in (
+        thin_plate, grazing_plane, grazing_gradient, epsilon, within_epsilon, truncated, few_steps, weak_distance,
+        strong_distance, gap,
+    )
+}  # fmt: skip

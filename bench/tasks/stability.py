@@ -1,0 +1,152 @@
+"""Where a renderer breaks: trials of growing severity, and the one at which half of them fail."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.breakdown import Search, SearchSettings
+from bench.limits import Limits
+from bench.records import RunStatus, plain
+from bench.stage import Cell
+from bench.stress import fit, gradient, rendering
+from bench.stress.fit import FitSettings
+from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.picture import draw_failure
+from bench.stress.stress import Conditions, Stress
+from renderers.checks import check_at_least
+
+DEFINITIONS = {
+    "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of what "
+    "the trials leave possible, for a logistic curve with a lapse of 2 %; none where it is not in the sweep",
+    "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is not in the sweep",
+    "level, level_low, level_high": "the same from 0, the mild end of the sweep, to 1, the severe one, and beyond",
+    "trials": "renderings, gradients or fits that were judged",
+    "grid_trials": "what a full grid of task.search.levels and repeats would take",
+    "mild_successes, mild_trials, severe_successes, severe_trials": "at the two ends of the sweep",
+    "failed_...": "trials that failed in that way; each counts once, as its most frequent kind",
+    "evaluations_per_ray": "field values a ray; median of the trials at the mild end",
+    "predicted": "severity at which theory has the renderer fail, by the first of its formulas",
+}
+MEASURED = {
+    "rendering": rendering.DEFINITIONS,
+    "gradient": gradient.DEFINITIONS,
+    "fit": fit.DEFINITIONS,
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial of a search: where it was made, and what it came to."""
+
+    level: int
+    severity: float
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Finds the breakdown of a renderer under one stress, by an adaptive search.
+
+    Args:
+        stress: what is made worse.
+        search: how finely, and for how long.
+        fit_search: the same for measure=fit, whose trials take more.
+        criteria: what counts as success.
+        fit: the fit of measure=fit.
+        resolution: pixels a side of a rendering.
+        limits: on each trial.
+    """
+
+    stress: Stress | None
+    search: SearchSettings
+    fit_search: SearchSettings
+    criteria: Criteria
+    fit: FitSettings
+    resolution: int
+    limits: Limits
+
+    def __post_init__(self) -> None:
+        if self.stress is None:
+            raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stress")
+        check_at_least("task.resolution", self.resolution, 8, "64 shows thin parts")
+
+    def execute(self, cell: Cell) -> None:
+        """Searches, and fills the record, curve.jsonl with a line a trial, and the picture of the mildest failure."""
+        record, renderer = cell.record, cell.stage.renderer
+        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, cell.stage.device)
+        record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
+        record.scene = self.stress.scene.replace("_", " ")
+        self.stress.stressed(renderer, self.stress.sweep.mild)  # unsupported before the first trial
+        search, trials = Search(self._settings), _Trials()
+        with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
+            while (level := search.next()) is not None:
+                at = float(search.levels[level])
+                outcome = self.stress.trial(renderer, at, search.counts(level)[1], conditions)
+                search.note(level, outcome.success)
+                trials.note(Trial(level, self.stress.sweep.severity(at), outcome))
+                curve.write(json.dumps(plain(trials.line()), allow_nan=False) + "\n")
+                cell.progress("searching", len(trials.all), self._settings.most, None)
+        record.metrics = self._metrics(search, trials)
+        for place, prediction in enumerate(self.stress.predicted(renderer, conditions)):
+            name = f"predicted_{place}" if place else "predicted"
+            record.metrics[name] = prediction.severity
+            record.definitions[name] = prediction.formula
+        record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"], "trials": len(trials.all)}
+        record.status, record.reason = RunStatus.OK, ""
+        if trials.first_failure is not None:
+            draw_failure(cell.folder, trials.first_failure, title=f"{record.name}, {record.scene}", unit=self._unit)
+
+    @property
+    def _settings(self) -> SearchSettings:
+        return self.fit_search if self.stress.measure == "fit" else self.search
+
+    @property
+    def _unit(self) -> str:
+        return self.stress.sweep.unit
+
+    def _metrics(self, search: Search, trials: "_Trials") -> dict[str, float | None]:
+        found, last = search.result(), self._settings.levels - 1
+        levels = {"": found.level, "_low": found.low, "_high": found.high}
+        within = {end: self.stress.sweep.severity(level) if 0 <= level <= 1 else None for end, level in levels.items()}
+        (mild, milds), (severe, severes) = search.counts(0), search.counts(last)
+        failed = Counter(trial.outcome.failure for trial in trials.all)
+        return {
+            **{f"breakdown{end}": severity for end, severity in within.items()},
+            **{f"level{end}": level for end, level in levels.items()},
+            "trials": len(trials.all),
+            "grid_trials": self._settings.grid,
+            "mild_successes": mild,
+            "mild_trials": milds,
+            "severe_successes": severe,
+            "severe_trials": severes,
+            "evaluations_per_ray": trials.spent(),
+            **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
+        }
+
+
+@dataclass
+class _Trials:
+    """All trials of a search, and the mildest that failed."""
+
+    all: list[Trial] = field(default_factory=list)
+    first_failure: Trial | None = None
+
+    def note(self, trial: Trial) -> None:
+        """Keeps a trial, without its images but for the mildest failure's."""
+        if not trial.outcome.success and (self.first_failure is None or trial.level < self.first_failure.level):
+            self.first_failure = trial
+        self.all.append(Trial(trial.level, trial.severity, Outcome(trial.outcome.failure, trial.outcome.numbers)))
+
+    def line(self) -> dict[str, object]:
+        """The last trial as a line of the curve."""
+        last = self.all[-1]
+        told = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
+        return {"trial": len(self.all) - 1, **told, "failure": str(last.outcome.failure), **last.outcome.numbers}
+
+    def spent(self) -> float | None:
+        """Field values a ray at the mild end, the median."""
+        costs = [trial.outcome.numbers.get("evaluations_per_ray") for trial in self.all if trial.level == 0]
+        known = [cost for cost in costs if cost is not None]
+        return float(np.median(known)) if known else None

@@ -1,0 +1,239 @@
+"""Scenes that are swept from easy to impossible: each makes an exam of a severity, in the unit sphere.
+
+Severities are in the units that conf/stress states. What is drawn (turns, places) depends on the generator alone, so
+that every renderer sits the same exams.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import atan, degrees, sin
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from datasets.stress import distortions
+from datasets.stress.judged import Judged
+from datasets.stress.solids import FirstHit, Solid, ball, box, half_space, rod
+from datasets.views import ViewSampler
+from renderers.camera import Camera, Rays
+from renderers.field import Field, Kind
+from renderers.fields.analytic import Shape
+
+DISTANCE = 2.5  # of the camera from the origin, scene units
+ALL_AROUND = (0.0, 360.0)
+CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
+CUBE = 0.5  # half its side length
+CUBE_VIEW = 44.0  # degrees: it fills the picture
+SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the picture is wide
+
+
+@runtime_checkable
+class Truth(Protocol):
+    """What knows its own first hits."""
+
+    def trace(self, rays: Rays) -> FirstHit: ...
+
+    def cosines(self, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]: ...
+
+
+@dataclass(frozen=True)
+class Exam:
+    """One rendering with its truth.
+
+    Args:
+        field: what the renderer is given; it may lie about its kind on purpose.
+        camera: of the rendering.
+        truth: of the scene; where the field is distorted, of what it was before.
+        solid: makes the truth of parameters, where the exam asks for gradients towards them; else None.
+        parameters: where these gradients are taken.
+    """
+
+    field: Field
+    camera: Camera
+    truth: Truth
+    solid: Callable[[Tensor], Solid] | None = None
+    parameters: Float[Tensor, "n"] | None = None
+
+
+Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, draws, and pixels a side
+
+
+def thin_plate(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A plate of a thickness, wider than the picture, seen within 5 degrees of its normal."""
+    plate = box((0.6, 0.6, severity / 2))
+    return _seen(plate, draw, resolution, azimuth=(-5, 5), elevation=(-5, 5), field_of_view=20.0)
+
+
+def wires(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """Seven parallel wires of a radius."""
+    fence = rod(severity, 0.6).moved((-0.54, 0.0, 0.0))
+    for place in range(1, 7):
+        fence |= rod(severity, 0.6).moved((0.18 * place - 0.54, 0.0, 0.0))
+    tilted = fence.turned(_about_z(draw.uniform(-45, 45)))
+    return _seen(tilted, draw, resolution, azimuth=(-20, 20), elevation=(-20, 20))
+
+
+def nested_shells(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """Three boxes whose walls have a thickness, one in the other, without the corner towards the camera."""
+    shells = box((0.15,) * 3) - box((0.15 - severity,) * 3)
+    for half in (0.32, 0.5):
+        shells |= box((half,) * 3) - box((half - severity,) * 3)
+    return _seen(shells - box((0.5,) * 3).moved((0.5, 0.5, 0.5)), draw, resolution, **CORNER)
+
+
+def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A wavy sheet, 0.03 high, of a frequency in radians a scene unit; its slope makes its distance wrong."""
+
+    def value(points: Tensor) -> Tensor:
+        return points[..., 2] - 0.03 * torch.sin(severity * points[..., :2]).prod(dim=-1)
+
+    wavy = Shape(value, Kind.DISTANCE)
+    slope = (1 + (0.03 * severity) ** 2) ** 0.5  # the product of two sines has a slope of at most its frequency
+    camera = _camera(draw, resolution, azimuth=(-20, 20), elevation=(-20, 20), field_of_view=20.0)
+    return Exam(wavy, camera, Judged(wavy, lipschitz=slope, thinnest=min(0.01, 0.2 / severity)))
+
+
+def tiny_object(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube of half a side length somewhere in the picture, whose pixels are 0.036 wide at 64 pixels a side."""
+    return _seen(box((severity,) * 3).moved(draw.uniform(-0.3, 0.3, 3)), draw, resolution, **CORNER)
+
+
+def gap(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A slit of a width between two blocks 0.1 deep, with a wall behind; the picture is three slits wide."""
+    blocks = [box((0.3, 0.5, SLIT_DEPTH / 2)).moved((side * (0.3 + severity / 2), 0.0, 0.0)) for side in (-1, 1)]
+    scene = blocks[0] | blocks[1] | box((0.6, 0.5, 0.05)).moved((0.0, 0.0, -0.2))
+    distance = 8.0  # so that few rays meet the sides of the slit
+    field_of_view = 2 * degrees(atan(0.5 * SLIT_SHARE * severity / distance))
+    aside = scene.moved((severity * draw.uniform(-0.2, 0.2), 0.0, 0.0))
+    return _seen(
+        aside, draw, resolution, azimuth=(0, 0), elevation=(0, 0), distance=distance, field_of_view=field_of_view
+    )
+
+
+def csg_difference(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """Three walls of a thickness: a cube without another one, whose field is only a bound; from within or without."""
+    walls = box((0.4,) * 3) - box((0.4,) * 3).moved((severity,) * 3)
+    side = 180.0 * draw.integers(2)
+    azimuth, elevation = CORNER["azimuth"], CORNER["elevation"]
+    if side:
+        elevation = (-elevation[1], -elevation[0])
+    return _seen(walls, draw, resolution, azimuth=(azimuth[0] + side, azimuth[1] + side), elevation=elevation)
+
+
+def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A plane seen at an angle, in degrees, as much of it at any. Its parameters: an offset and two tilts."""
+
+    def solid(parameters: Tensor) -> Solid:
+        offset, right, forward = parameters
+        return half_space(torch.stack([right, torch.ones_like(right), forward]), offset)
+
+    field_of_view = 2 * degrees(atan(0.1 * sin(np.radians(severity))))
+    camera = _camera(draw, resolution, elevation=(severity, severity), field_of_view=field_of_view)
+    none = torch.zeros(3, dtype=torch.float64)
+    return Exam(solid(none).field, camera, solid(none), solid, none)
+
+
+def near_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A ball from a camera at a distance from its surface; below 0.5 it stands within the unit sphere."""
+    return _seen(ball(0.5), draw, resolution, distance=0.5 + severity, field_of_view=20.0)
+
+
+def far_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube from a distance, through a lens as long."""
+    return _cube(draw, resolution, distance=severity, field_of_view=2 * degrees(atan(1.0 / severity)))
+
+
+def camera_inside(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A camera within a ball, at a depth below its surface: no ray has a first hit."""
+    return _seen(ball(0.5), draw, resolution, distance=0.5 - severity, field_of_view=60.0)
+
+
+def wide_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube from just outside the unit sphere, through a lens of an angle in degrees."""
+    return _cube(draw, resolution, distance=1.2, field_of_view=severity)
+
+
+def narrow_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube through a lens of an angle in degrees: pixels become small."""
+    return _cube(draw, resolution, field_of_view=severity)
+
+
+def empty_scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A field that comes as near to zero as this, on a sheet across the view, and has no surface."""
+    sheet = half_space((0.0, 0.0, 1.0), 0.0)
+    field = Shape(lambda points: sheet.field(points).abs() + severity, Kind.BOUND)
+    camera = _camera(draw, resolution, azimuth=(-30, 30), elevation=(-30, 30))
+    return Exam(field, camera, ball(0.0))
+
+
+def _distorted(distortion: distortions.Distortion) -> Scene:
+    """A cube through a distorted field, judged by what they are."""
+
+    def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+        exam = _cube(draw, resolution)
+        return Exam(distortion(exam.field, severity, draw), exam.camera, exam.truth)
+
+    scene.__doc__ = distortion.__doc__
+    return scene
+
+
+def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube behind a ball of a radius in which the field is not a number."""
+    exam = _cube(draw, resolution)
+    center = 0.75 * torch.nn.functional.normalize(exam.camera.center, dim=0)
+    hole = ball(severity).moved(center).field
+
+    def value(points: Tensor) -> Tensor:
+        return torch.where(hole(points) < 0, torch.nan, exam.field(points))
+
+    return Exam(Shape(value, Kind.DISTANCE), exam.camera, exam.truth)
+
+
+def cube(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A cube as it is, for a severity that is the renderer's own."""
+    return _cube(draw, resolution)
+
+
+SCENES: dict[str, Scene] = {
+    scene.__name__: scene
+    for scene in (
+        thin_plate, wires, nested_shells, bumps, tiny_object, gap, csg_difference, grazing_plane, near_camera,
+        far_camera, camera_inside, wide_view, narrow_view, empty_scene, nan_region, cube,
+    )
+} | {name: _distorted(distortion) for name, distortion in distortions.DISTORTIONS.items()}  # fmt: skip
+
+
+def _cube(draw: np.random.Generator, resolution: int, **view: float) -> Exam:
+    return _seen(box((CUBE,) * 3), draw, resolution, **{**CORNER, "field_of_view": CUBE_VIEW, **view})
+
+
+def _seen(solid: Solid, draw: np.random.Generator, resolution: int, **view) -> Exam:
+    return Exam(solid.field, _camera(draw, resolution, **view), solid)
+
+
+def _camera(
+    draw: np.random.Generator,
+    resolution: int,
+    *,
+    azimuth: tuple[float, float] = ALL_AROUND,
+    elevation: tuple[float, float] = (-35.0, 35.0),
+    distance: float = DISTANCE,
+    field_of_view: float = 50.0,
+) -> Camera:
+    sampler = ViewSampler(distance, field_of_view, azimuth, elevation, resolution)
+    return sampler.camera(draw.uniform(*azimuth), draw.uniform(*elevation))
+
+
+def _about_z(angle: float) -> Float[Tensor, "3 3"]:
+    turn = torch.tensor(np.radians(angle), dtype=torch.float64)
+    c, s, zero, one = turn.cos(), turn.sin(), turn * 0, turn * 0 + 1
+    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one]).view(3, 3)
+
+
+def random_rotation(draw: np.random.Generator) -> Float[Tensor, "3 3"]:
+    """A rotation, in float64, all alike."""
+    orthogonal, _ = torch.linalg.qr(torch.from_numpy(draw.normal(size=(3, 3))))
+    return orthogonal * torch.linalg.det(orthogonal).sign()

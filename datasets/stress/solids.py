@@ -1,0 +1,169 @@
+"""Solids with closed-form ray intersections beside their fields, so that a rendering can be judged without another.
+
+A solid knows the spans of a ray that lie within it; union, intersection and difference are those of the spans.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Rays, sphere_span
+from renderers.field import autograd_normals
+from renderers.fields import analytic
+from renderers.fields.analytic import Shape
+
+Spans = Float[Tensor, "n spans 2"]  # entry and exit along each ray; a span that is not there has its exit first
+
+
+@dataclass(frozen=True)
+class FirstHit:
+    """The truth of n rays: where each first meets the surface within the sphere; distances only where `hit`."""
+
+    distance: Float[Tensor, "n"]
+    hit: Bool[Tensor, "n"]
+    inside: Bool[Tensor, "n"]  # the ray begins within the solid, so that it has no first hit
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A shape, and the spans of each line [n] that lie within it. `|`, `&`, `-` as for shapes."""
+
+    field: Shape
+    spans: Callable[[Rays], Spans]
+
+    def __or__(self, other: "Solid") -> "Solid":
+        return Solid(self.field | other.field, lambda rays: torch.cat([self.spans(rays), other.spans(rays)], dim=1))
+
+    def __and__(self, other: "Solid") -> "Solid":
+        return Solid(self.field & other.field, lambda rays: _shared(self.spans(rays), other.spans(rays)))
+
+    def __sub__(self, other: "Solid") -> "Solid":
+        return Solid(self.field - other.field, lambda rays: _without(self.spans(rays), other.spans(rays)))
+
+    def turned(self, rotation: Float[Tensor, "3 3"]) -> "Solid":
+        """The solid turned about the origin: a point x goes to `rotation @ x`."""
+
+        def back(rays: Rays) -> Rays:
+            turn = rotation.to(rays.origins)
+            return Rays(rays.origins @ turn, rays.directions @ turn)
+
+        return Solid(self.field.rotate(rotation), lambda rays: self.spans(back(rays)))
+
+    def moved(self, offset: analytic.Numbers) -> "Solid":
+        """The solid moved by `offset` [3]."""
+
+        def back(rays: Rays) -> Rays:
+            return Rays(rays.origins - torch.as_tensor(offset).to(rays.origins), rays.directions)
+
+        return Solid(self.field.translate(offset), lambda rays: self.spans(back(rays)))
+
+    def trace(self, rays: Rays, *, radius: float = 1.0) -> FirstHit:
+        """The first hits of flat rays [n] within the sphere of `radius`; differentiable in rays and parameters."""
+        entry, leave, meets = sphere_span(rays, radius)
+        spans = self.spans(rays)
+        near, far = spans.unbind(-1)
+        there = far > near
+        start = entry[:, None]
+        inside = (there & (near <= start) & (far > start)).any(dim=1) & meets
+        ahead = there & (near > start) & (near <= leave[:, None])
+        distance = torch.where(ahead, near, torch.inf).amin(dim=1)
+        hit = meets & ~inside & distance.isfinite()
+        return FirstHit(torch.where(hit, distance, leave), hit, inside)
+
+    def cosines(self, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]:
+        """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
+        normals = autograd_normals(self.field, rays.at(first.distance.detach()))
+        cosine = (normals * rays.directions).sum(-1).abs()
+        return torch.where(first.hit, cosine, 1.0)
+
+
+def ball(radius: analytic.Numbers) -> Solid:
+    """A ball about the origin."""
+
+    def spans(rays: Rays) -> Spans:
+        approach = -(rays.origins * rays.directions).sum(-1)
+        beyond = rays.origins + approach[:, None] * rays.directions
+        half_squared = torch.as_tensor(radius).to(beyond) ** 2 - beyond.square().sum(-1)
+        crosses = half_squared > 0
+        half = torch.where(crosses, half_squared, 1.0).sqrt()
+        return _span(approach - half, approach + half, crosses)
+
+    return Solid(analytic.sphere(radius), spans)
+
+
+def box(half_sizes: analytic.Numbers) -> Solid:
+    """An axis-aligned box about the origin, of half the side lengths [3]."""
+
+    def spans(rays: Rays) -> Spans:
+        half = torch.as_tensor(half_sizes).to(rays.origins)
+        tiny = torch.finfo(half.dtype).tiny
+        along = torch.where(rays.directions.abs() < tiny, tiny, rays.directions)
+        ends = torch.stack([(-half - rays.origins) / along, (half - rays.origins) / along])
+        near, far = ends.amin(dim=0).amax(dim=-1), ends.amax(dim=0).amin(dim=-1)
+        return _span(near, far, far > near)
+
+    return Solid(analytic.box(half_sizes), spans)
+
+
+def half_space(normal: analytic.Numbers, offset: analytic.Numbers) -> Solid:
+    """All points x with normal . x below `offset`; the normal [3], of any length, points out of it."""
+
+    def spans(rays: Rays) -> Spans:
+        n = torch.as_tensor(normal).to(rays.origins)
+        slope = rays.directions @ n
+        above = rays.origins @ n - torch.as_tensor(offset).to(n)
+        crossing = -above / torch.where(slope == 0, torch.finfo(n.dtype).tiny, slope)
+        far = torch.full_like(crossing, torch.inf)
+        near = torch.where(slope < 0, crossing, -far)
+        return _span(near, torch.where(slope < 0, far, crossing), torch.ones_like(slope, dtype=torch.bool))
+
+    return Solid(analytic.plane(normal, offset), spans)
+
+
+def rod(radius: analytic.Numbers, half_height: analytic.Numbers) -> Solid:
+    """A cylinder about the y axis with flat ends."""
+
+    def spans(rays: Rays) -> Spans:
+        o, d = rays.origins, rays.directions
+        across, start = d[:, [0, 2]], o[:, [0, 2]]
+        tiny = torch.finfo(o.dtype).tiny
+        a = across.square().sum(-1).clamp_min(tiny)
+        b, c = (across * start).sum(-1), start.square().sum(-1) - torch.as_tensor(radius).to(o) ** 2
+        inner = b.square() - a * c
+        crosses = inner > 0
+        root = torch.where(crosses, inner, 1.0).sqrt()
+        rise = torch.where(d[:, 1].abs() < tiny, tiny, d[:, 1])
+        height = torch.as_tensor(half_height).to(o)
+        ends = torch.stack([(-height - o[:, 1]) / rise, (height - o[:, 1]) / rise])
+        near = torch.maximum((-b - root) / a, ends.amin(dim=0))
+        far = torch.minimum((-b + root) / a, ends.amax(dim=0))
+        return _span(near, far, crosses & (far > near))
+
+    return Solid(analytic.cylinder(radius, half_height), spans)
+
+
+def _span(near: Tensor, far: Tensor, there: Tensor) -> Spans:
+    """One span a ray; where it is not there its exit comes first, and no gradient flows."""
+    nowhere = torch.full_like(near, torch.inf)
+    return torch.stack([torch.where(there, near, nowhere), torch.where(there, far, -nowhere)], dim=-1)[:, None]
+
+
+def _shared(first: Spans, second: Spans) -> Spans:
+    """What lies in a span of both."""
+    near = torch.maximum(first[:, :, None, 0], second[:, None, :, 0])
+    far = torch.minimum(first[:, :, None, 1], second[:, None, :, 1])
+    return torch.stack([near, far], dim=-1).flatten(1, 2)
+
+
+def _without(first: Spans, second: Spans) -> Spans:
+    """What lies in a span of the first and in none of the second."""
+    left = first
+    for near, far in (span.unbind(-1) for span in second.unbind(1)):
+        there = (far > near)[:, None]
+        before = torch.where(there, torch.minimum(left[..., 1], near[:, None]), left[..., 1])
+        after = torch.where(there, torch.maximum(left[..., 0], far[:, None]), torch.inf)
+        left = torch.cat([torch.stack([left[..., 0], before], -1), torch.stack([after, left[..., 1]], -1)], dim=1)
+    return left
