@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-
 STEEPEST_MARGIN = 1.2  # over the steepest gradient that was found: steeper ones lie between the points
 
 
