@@ -13,7 +13,7 @@ from datasets.stress import scenes
 from renderers.field import STEEPEST_MARGIN
 
 FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
-SIDE = 1 / sqrt(3)  # cosine of the angle of incidence on the cube's sides, seen towards its corner
+FLATTEST, STEEPEST = 0.29, 0.64  # cosines of incidence on the cube's sides: of 1 % of the hits less, of 1 % more
 
 
 @dataclass(frozen=True)
@@ -90,15 +90,18 @@ def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Predic
     if not hasattr(renderer, "steps"):
         return []
     alpha, way = _alpha(renderer), FRONT
-    left = renderer.steps - log(renderer.epsilon / 0.01) / log(abs(1 - alpha * SIDE))
-    return [Prediction(way / alpha / left, "way over alpha k, less the steps of Eq. 8")] if left > 0 else []
+    left = renderer.steps
+    for _ in range(20):  # what is truncated further away, Eq. 8 takes over
+        cut = way / alpha / left
+        left = max(renderer.steps - log(renderer.epsilon / cut) / log(abs(1 - alpha * FLATTEST)), 1.0)
+    return [Prediction(way / alpha / left, "way over alpha k, less the steps of DIST, Eq. 8, from there on")]
 
 
 def few_steps(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Eq. 8 at the cube's sides."""
     if not hasattr(renderer, "epsilon"):
         return []
-    needed = log(renderer.epsilon / FRONT) / log(abs(1 - _alpha(renderer) * SIDE))
+    needed = log(renderer.epsilon / FRONT) / log(abs(1 - _alpha(renderer) * FLATTEST))
     return [Prediction(needed, "DIST, Eq. 8, at the cube's sides")]
 
 
@@ -107,14 +110,23 @@ def weak_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Pr
     if not hasattr(renderer, "steps"):
         return []
     shrunk = 1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)
-    return [Prediction(shrunk / _alpha(renderer) / SIDE, "as many steps as DIST, Eq. 8, asks for at the cube's sides")]
+    return [
+        Prediction(shrunk / _alpha(renderer) / FLATTEST, "as many steps as DIST, Eq. 8, asks for at the cube's sides")
+    ]
 
 
 def strong_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Steps of alpha times factor times the cosine over 2 do not converge."""
     if not hasattr(renderer, "steps"):
         return []
-    return [Prediction(2 / _alpha(renderer) / SIDE, "alpha times factor times cos(theta) over 2 does not converge")]
+    return [Prediction(2 / _alpha(renderer) / STEEPEST, "alpha times factor times cos(theta) over 2 does not converge")]
+
+
+def float_spacing(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """Where neighbouring float32 numbers of the camera's distance lie further apart than epsilon."""
+    return (
+        [Prediction(renderer.epsilon * 2**24, "float32's spacing is epsilon")] if hasattr(renderer, "epsilon") else []
+    )
 
 
 def gap(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
@@ -135,6 +147,6 @@ THEORIES: dict[str, Theory] = {
     function.__name__: function
     for function in (
         thin_plate, grazing_plane, grazing_gradient, epsilon, within_epsilon, truncated, few_steps, weak_distance,
-        strong_distance, gap,
+        strong_distance, float_spacing, gap,
     )
 }  # fmt: skip

@@ -98,7 +98,7 @@ def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 
 def tiny_object(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     """A cube of half a side length somewhere in the picture, whose pixels are 0.036 wide at 64 pixels a side."""
-    return _seen(box((severity,) * 3).moved(draw.uniform(-0.3, 0.3, 3)), draw, resolution, **CORNER)
+    return _seen(box((severity,) * 3).moved(tuple(draw.uniform(-0.3, 0.3, 3))), draw, resolution, **CORNER)
 
 
 def gap(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -152,8 +152,8 @@ def camera_inside(severity: float, draw: np.random.Generator, resolution: int) -
 
 
 def wide_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube from just outside the unit sphere, through a lens of an angle in degrees."""
-    return _cube(draw, resolution, distance=1.2, field_of_view=severity)
+    """A cube from nearby, through a lens of an angle in degrees."""
+    return _cube(draw, resolution, distance=1.8, field_of_view=severity)
 
 
 def narrow_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:

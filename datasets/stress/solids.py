@@ -15,7 +15,7 @@ from renderers.field import autograd_normals
 from renderers.fields import analytic
 from renderers.fields.analytic import Shape
 
-Spans = Float[Tensor, "n spans 2"]  # entry and exit along each ray; a span that is not there has its exit first
+Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; a span that is not there has its exit first
 
 
 @dataclass(frozen=True)
