@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import CONF, nearest, register
 from bench.plan import Refused, Sweep
 
+CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
 USAGE = 2  # exit status of a command line that asks for what there is not
 FAILED = 1
 EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
@@ -123,10 +124,11 @@ def _choices(group: str) -> list[str]:
 
 
 def _known_keys() -> list[str]:
-    """Every dotted key of the default configuration."""
+    """Every dotted key of the configuration with the choices of the command line, as far as these are known."""
+    chosen = [a for a in sys.argv[1:] if (found := CHOICE.fullmatch(a)) and found[2] in _choices(found[1])]
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return list(_dotted(compose("config")))
+        return list(_dotted(compose("config", chosen)))
 
 
 def _dotted(node: DictConfig, prefix: str = "") -> list[str]:

@@ -176,7 +176,8 @@ def load(group: str, name: str, **arguments: Any) -> Any:
 
 def nearest(word: str, known: list[str]) -> str:
     """A hint at the end of an error message: the nearest known names, or all of them."""
-    close = get_close_matches(word, known, n=3, cutoff=0.5)
+    last = [name for name in known if "." not in word and name.rsplit(".", 1)[-1] == word]
+    close = last or [name for name in get_close_matches(word, known, n=3, cutoff=0.5) if name != word]
     return f": did you mean {' or '.join(close)}?" if close else f": it has {', '.join(sorted(known))}"
 
 

@@ -21,6 +21,11 @@ from bench.report.records import read_record
 
 SCHEMA = 1
 PLAN = "plan.json"
+TOLD = (  # metric, what it is called, factor
+    ("chamfer_l2", "Chamfer (x1000)", 1000.0),
+    ("rotation_error_deg", "rotation error (degrees)", 1.0),
+    ("breakdown", "breaks at", 1.0),
+)
 LOOK = 0.5  # seconds between two looks at what has ended
 
 
@@ -184,6 +189,6 @@ def line(folder: Path, record: dict[str, Any], own: str) -> str:
         ", ".join((record["task"], name, record["scene"] or record["dataset"])),
         seconds(loop),
     ]
-    if "chamfer_l2" in record["metrics"]:
-        parts.append(f"Chamfer (x1000) {number(record['metrics']['chamfer_l2'], 1000.0)}")
+    known = record["metrics"]
+    parts += [f"{told} {number(known[name], factor)}" for name, told, factor in TOLD if name in known]
     return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)

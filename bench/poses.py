@@ -66,6 +66,13 @@ class PoseStart:
         success = rotation <= self.success_degrees and translation <= self.success_distance
         return {"rotation_error_deg": rotation, "translation_error": translation, "success": float(success)}
 
+    def remarks(self, metrics: dict[str, float]) -> list[str]:
+        """What is to be said of the errors of a camera: that it was not found, if so. It changes no status."""
+        if metrics["success"]:
+            return []
+        rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
+        return [f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"]
+
     def judge(self, seen: View, true: View) -> dict[str, float]:
         """The numbers of `JUDGED`: the errors of a camera, and how what it sees differs from what is given."""
         images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())

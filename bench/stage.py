@@ -44,7 +44,7 @@ class Stage:
     @property
     def repairs(self) -> list[str]:
         """What was done to the scene's mesh, if it was made."""
-        return self.scene.mesh.repairs if "scene" in vars(self) else []
+        return list(self.scene.mesh.repairs) if "scene" in vars(self) else []
 
     @cached_property
     def prior(self) -> Prior:

@@ -22,6 +22,8 @@ ROWS = (  # metric, what it is called, factor, better when
     ("normal_consistency", "normal consistency", 1.0, "higher"),
     ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
     ("mask_iou", "mask IoU", 1.0, "higher"),
+    ("rotation_error_deg", "rotation error (degrees)", 1.0, "lower"),
+    ("translation_error", "translation error (x1000)", 1000.0, "lower"),
 )
 
 

@@ -67,7 +67,7 @@ class Photography:
         if (self.texture, self.shading) == ("plain", "unlit"):
             raise ValueError("a plain texture in no light has nothing to compare: set task.images.shading=lambertian")
         for name in ("noise", "blur", "exposure"):
-            check_at_least(f"task.images.{name}", getattr(self, name), 0, "0 switches it off")
+            check_at_least(f"task.images.{name}", getattr(self, name), 0, f"task.images.{name}=0 switches it off")
 
     def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Photograph]:
         """The photographs of a mesh.

@@ -28,7 +28,10 @@ KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset}
 TARGETS = {"prior": "bench.autodecoder.PriorSettings"}  # nodes whose class the code knows
 PARTS = ("task", "renderer", "dataset", "prior")
 # What a choice needs on the command line.
-NEEDS = {"custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))}
+NEEDS = {
+    "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
+    "stability": ("stress=wires",),
+}
 ADDED = ("strategy", "common", "method", "setting", "trial", "condition")  # not chosen by default
 DESK = {"scale": OmegaConf.load(CONF / "scale/desk.yaml")}
 
@@ -39,11 +42,18 @@ def swept(name: str) -> dict[str, str]:
     return {key: str(values) for key, values in (OmegaConf.select(config, SWEPT) or {}).items()}
 
 
+def values_of(key: str, values: str) -> list[str]:
+    """The values of a swept key, in its own words or by a glob over its group."""
+    if not values.startswith("glob(*"):
+        return values.split(",")
+    return sorted(n for group, n in YAMLS if group == key.removeprefix("+") and f"exclude={n}" not in values)
+
+
 SWEEPS = [
     (name, f"{key}={value}")
     for name in EXPERIMENTS
     for key, values in swept(name).items()
-    for value in (values.split(",") if values != "glob(*)" else sorted(n for group, n in YAMLS if f"+{group}" == key))
+    for value in values_of(key, values)
 ]
 
 
@@ -64,7 +74,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
         for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"), *CONF.glob("hydra/launcher/*.yaml"))
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    chosen = {"task", "renderer", "dataset", "prior", "scale", "tracker"}
+    chosen = {"task", "renderer", "dataset", "prior", "scale", "stress", "tracker"}
     assert {group for group, _ in YAMLS} == {*chosen, "experiment", *ADDED}
 
 
@@ -112,6 +122,8 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
     key, _, value = swept.removeprefix("+").partition("=")
     if key == "dataset":
         assert config.dataset.name == value
+    elif key == "stress":
+        assert build_part(config, "task").stress.scene == OmegaConf.load(CONF / f"stress/{value}.yaml").scene
     elif key in ("strategy", "renderer", "method", "setting", "trial", "condition"):
         alone = compose_config(swept)
         config = compose_config(*method, swept, f"+experiment={name}")  # a sweep has them so

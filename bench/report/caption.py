@@ -9,8 +9,8 @@ from bench.report.experiments import Experiment, setting
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 
 
-def setup(experiment: Experiment) -> str:
-    """Scenes, asked resolution, network, machine and threads, as one sentence."""
+def setup(experiment: Experiment, *, network: bool = True) -> str:
+    """Scenes, asked resolution, the prior's network where it has a part, machine and threads, as one sentence."""
     config, records = experiment.asked(), experiment.records
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in records))
     known = [scene for scene in scenes if scene] or [records[0]["dataset"]]
@@ -20,7 +20,7 @@ def setup(experiment: Experiment) -> str:
     parts = [
         f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",
         f"{resolution}×{resolution} pixels" if resolution else "",
-        _network(setting(config, "prior", "network") or setting(config, "scale", "network")),
+        _network(setting(config, "prior", "network") or setting(config, "scale", "network")) if network else "",
         machines[0] if len(machines) == 1 else "",
     ]
     return joined("; ".join(part for part in parts if part) + ".", _compared(experiment), _loaded(experiment))
@@ -73,7 +73,8 @@ def _loaded(experiment: Experiment) -> str:
     pairs = zip(experiment.names(), experiment.records, strict=True)
     doubtful = ("loaded machine", "missing synchronisation")
     names = [name for name, record in pairs if any(note.startswith(doubtful) for note in record["notes"])]
-    return f"Times in doubt, see the notes of the run: {_listed(names)}." if names else ""
+    told = "all rows" if len(names) == len(experiment.records) > 1 else _listed(names)
+    return f"Times in doubt, see the notes of the run: {told}." if names else ""
 
 
 def _machine(cpu: Any, device: Any, threads: Any) -> str:

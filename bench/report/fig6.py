@@ -26,7 +26,7 @@ from bench.report.tables import Result
 CAPTION = (
     "Share of runs that end within {degrees:g} degrees and {distance:g} scene units of the true pose, with Wilson's "
     "95 % interval, over the angle by which the camera is off at the start; it is shifted by {shift:g} besides. Each "
-    "run of a method has the shape, the view and the start of the others'; {scenes} differ in shape or view. A run "
+    "method has the same shapes, views and starts, {scenes} in all. Markers of one angle stand side by side. A run "
     "that did not end ok counts as not found. Starts take turns, and their trials are in the time; iterative closest "
     "points try each to its end. Times and evaluations are of the loop alone, of runs that ended ok."
 )
@@ -52,7 +52,7 @@ def make(experiment: Experiment) -> Result:
         name="fig6",
         title="Camera pose from a depth image and a silhouette of a known shape.",
         caption=joined(
-            setup(experiment),
+            setup(experiment, network=False),
             CAPTION.format(**settings, scenes=scenes),
             counted_outcome(experiment),
             omitted(experiment),
@@ -83,7 +83,8 @@ def draw(cells: Cells) -> Figure:
         if (seconds := _median(own, loop_seconds)) is not None:
             right.plot(seconds, 100 * _found(own) / len(own), **how)
     left.set(xlabel="camera off at the start (degrees)", ylabel="poses found (%)", ylim=(-3, 103))
-    right.set(xlabel="loop, median (seconds)", ylabel="poses found at all angles (%)", ylim=(-3, 103))
+    left.set_xticks(sorted({angle for _, angle in cells}))
+    right.set(xlabel="loop, median (seconds)", ylabel="poses found, all angles together (%)", ylim=(-3, 103))
     style.log_axis(right, "x", [_median(own, loop_seconds) for own in cells.values()])
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)

@@ -114,9 +114,12 @@ def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def log_axis(axes: Axes, letter: str, values: Any) -> None:
-    """Makes the axis "x" or "y" logarithmic, with plain numbers, where a value is positive; others are not drawn."""
+    """Makes the axis "x" or "y" logarithmic, with plain numbers, where a value is positive; others are not drawn.
+
+    Where the positive values are all about the same, within a factor of 2, it stays linear: its ticks say more.
+    """
     positive = [x for x in finite(values) if x > 0]
-    if not positive:
+    if not positive or 1 < max(positive) / min(positive) < 2:
         return
     getattr(axes, f"set_{letter}scale")("log", nonpositive="mask")
     ratio = max(positive) / min(positive)  # where it is small, decades alone would leave an axis without numbers

@@ -1,7 +1,7 @@
 """The mildest failure of a search as a picture, and as arrays for the report."""
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import matplotlib
 import numpy as np
@@ -18,6 +18,7 @@ KINDS = {"background": PAPER, "hit": BOTH, "lost": LOST, "false": FALSE, "wrong 
 IMAGES = "images.npz"
 
 
+@runtime_checkable
 class Failed(Protocol):
     """A trial that failed."""
 

@@ -23,6 +23,7 @@ from renderers.field import Field
 from renderers.rendering import Renderer, at_iteration
 
 LEAST_SCALE, MOST_SHIFT = 0.8, 0.2
+FAR_APART = 60.0  # degrees between two photographs that a note is made of
 SURE = 0.999  # of the weight of a pixel's neighbours must be on the shape for a depth between them
 
 
@@ -71,13 +72,14 @@ class Multiview:
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
         if self.neighbour % self.images.views == 0:
-            raise ValueError(f"task.neighbour={self.neighbour} compares each of {self.images.views} views with itself")
+            both = f"task.neighbour={self.neighbour} compares each of {self.images.views} views with itself"
+            raise ValueError(f"{both}: set task.neighbour=1")
         check_positive("task.visible", self.visible, "the paper uses 0.001")
-        check_positive("task.focal", self.focal, "from 1.07 on parts of a shape may leave the image")
+        check_positive("task.focal", self.focal, "1 is the scene's; from 1.07 on shapes may leave the image")
         check_positive("task.scale", self.scale, "1 is the true size")
         check_positive("task.photometric_weight", self.photometric_weight, "the paper uses 5")
         for name in ("start_scale", "coarse_blur", "degrees", "shift"):
-            check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches it off")
+            check_at_least(f"task.{name}", getattr(self, name), 0, f"task.{name}=0 is the least")
         if not (LEAST_SCALE <= self.scale <= 1 / LEAST_SCALE and self.shift <= MOST_SHIFT):
             raise ValueError(
                 f"task.scale must lie between {LEAST_SCALE} and {1 / LEAST_SCALE}, and task.shift be {MOST_SHIFT} at "
@@ -103,6 +105,10 @@ class Multiview:
 
     def execute(self, cell: Cell) -> None:
         """Optimises the code, and judges the shape before and after."""
+        apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
+        if apart > FAR_APART:
+            told = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
+            cell.record.notes = [*cell.record.notes, told]
         solve(self, cell)
 
     def problem(

@@ -104,6 +104,7 @@ class Pose:
         clock = time.perf_counter()
         record.metrics = self.start.judge(look(known, problem.camera(), stage), view)
         record.status, record.reason = verdict(course)
+        record.notes = [*record.notes, *self.start.remarks(record.metrics)]
         film.shoot(len(course.curve), known, problem.camera())
         if stage.evaluation.picture is not None:
             draw_curve(cell.folder / "curve.png", course.curve)

@@ -83,6 +83,7 @@ class PoseICP:
         record.metrics = self.start.judge(see(Truth(stage.scene.mesh), found), view)
         record.seconds["evaluation"] = time.perf_counter() - clock
         record.status, record.reason = RunStatus.OK, ""
+        record.notes = [*record.notes, *self.start.remarks(record.metrics)]
         if not np.isfinite(distance):
             record.status, record.reason = (
                 RunStatus.NOT_REACHED,

@@ -41,7 +41,7 @@ class OptimiserSettings:
 
     def __post_init__(self) -> None:
         check_at_least("task.iterations", self.iterations, 1, "the paper uses 100")
-        check_positive("task.learning_rate", self.learning_rate, "the paper uses 1e-2")
+        check_positive("task.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.schedule", self.schedule, ("constant", "cosine"))
 
     def rate(self, iteration: int) -> float:
