@@ -73,7 +73,7 @@ def draw(cells: dict[tuple[str, str, str, float], Interval]) -> Figure:
                 axis.fill_between(places, *ends, color=look.colour, alpha=0.15, lw=0)
             axis.set(xlabel=label, title=name)
         style.log_axis(line[0], "y", known)
-        line[0].set_ylabel("Chamfer × 1000")
+        line[0].set_ylabel("truth to prediction × 1000\n(scene units²)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure

@@ -121,10 +121,11 @@ def draw(experiment: Experiment, oracle: dict[str, float]) -> Figure:
             spread = place + np.linspace(-0.25, 0.25, len(own)) if len(own) > 1 else [place]
             look = style.look(row)
             axis.plot(starts, spread, ".", color="#b0b0b0", ms=3, label="start" if place == 0 else None)
-            axis.plot(ends, spread, look.marker, color=look.colour, ms=3.5, label="end" if place == 0 else None)
+            axis.plot(ends, spread, look.marker, color=look.colour, ms=3.5)
             lost = [where for where, end in zip(spread, ends, strict=True) if np.isnan(end)]
             axis.plot([0.99] * len(lost), lost, "x", color=look.colour, transform=axis.get_yaxis_transform())
             everything += [*starts, *ends]
+        axis.plot([], [], "D", color="#444444", ms=3.5, label="end")
         if name in oracle:
             axis.axvline(oracle[name], color="#777777", lw=0.9, label="oracle")
             axis.axvline(3 * oracle[name], color="#777777", lw=0.9, ls=":", label="3 times that")
