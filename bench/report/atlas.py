@@ -21,7 +21,8 @@ class Cell:
     @property
     def known(self) -> bool:
         """Whether its search came to an end."""
-        return self.record["status"] == "ok" and self.level is not None
+        sweep = setting(self.record["config"], "task", "stress", "sweep")
+        return self.record["status"] == "ok" and self.level is not None and isinstance(sweep, dict)
 
     @property
     def level(self) -> float | None:

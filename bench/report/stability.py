@@ -62,7 +62,8 @@ def draw(grid: Atlas) -> Figure:
         for column, row in enumerate(grid.rows):
             cell = grid.cells.get((axis, row))
             if cell is not None:
-                axes.text(column, line, cell.short(), ha="center", va="center", fontsize=5.5)
+                ink = "white" if cell.shade in (0.0, 1.0) else "black"
+                axes.text(column, line, cell.short(), ha="center", va="center", fontsize=5.5, color=ink)
     axes.set_xticks(range(len(grid.rows)), grid.rows, rotation=35, ha="left", rotation_mode="anchor")
     axes.xaxis.tick_top()
     axes.set_yticks(range(len(grid.axes)), [f"{title(axis)} ({grid.unit(axis)})" for axis in grid.axes])
@@ -91,7 +92,8 @@ def cost(experiment: Experiment) -> Result:
         caption=joined(
             "Over the axes that judge renderings and that all renderers have: on how many a renderer breaks at the "
             "mildest severity, on how many not even at the severest; the mean level of its breakdown, 0 the mild end "
-            "of a sweep and 1 the severe one; and the median over axes of the field values a ray at the mild end.",
+            "of a sweep and 1 the severe one, where a run that did not end ok counts as 0; and the median over axes of "
+            "the field values a ray at the mild end.",
             counted_outcome(experiment),
             omitted(experiment),
         ),
@@ -117,12 +119,7 @@ def draw_cost(rows: list[dict[str, Any]]) -> Figure:
 
 
 def _cost(grid: Atlas, row: str) -> dict[str, Any]:
-    shared = [
-        axis
-        for axis in grid.axes
-        if grid.measure(axis) == "rendering" and all(cell.known for _, cell in grid.on(axis))
-        and len(list(grid.on(axis))) == len(grid.rows)
-    ]  # fmt: skip
+    shared = [axis for axis in grid.axes if grid.measure(axis) == "rendering" and _by_all(grid, axis)]
     cells = [grid.cells[axis, row] for axis in shared]
     costs = [cost for cell in cells if (cost := measured(cell.record, "evaluations_per_ray")) is not None]
     return {
@@ -130,9 +127,15 @@ def _cost(grid: Atlas, row: str) -> dict[str, Any]:
         "axes": len(cells),
         "at_once": sum(cell.at_once for cell in cells),
         "never": sum(cell.never for cell in cells),
-        "level": float(np.mean([cell.shade for cell in cells])) if cells else math.nan,
+        "level": float(np.mean([cell.shade if cell.known else 0.0 for cell in cells])) if cells else math.nan,
         "cost": float(np.median(costs)) if costs else math.nan,
     }
+
+
+def _by_all(grid: Atlas, axis: str) -> bool:
+    """Whether all renderers could sit the trials of an axis."""
+    cells = [grid.cells.get((axis, row)) for row in grid.rows]
+    return all(cell is not None and cell.record["status"] != "unsupported" for cell in cells)
 
 
 def _told(grid: Atlas, axis: str, row: str) -> str:

@@ -10,18 +10,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.report import style
-from bench.report.atlas import Atlas, atlas, title
+from bench.report.atlas import Atlas, Cell, atlas, title
 from bench.report.caption import joined, omitted
-from bench.report.experiments import Experiment, measured
+from bench.report.experiments import Experiment, measured, setting
 from bench.report.statistics import wilson
 from bench.report.tables import Result
 
 COLUMNS = 4
-MOST_BARS = 4  # rows with bars of their intervals in a panel; with more they would hide each other
+WIDTHS = (0.003, 0.01, 0.03, 0.08, 0.2)  # of logistic curves, in levels: those that the search has
+LAPSE = 0.02
 CAPTION = (
-    "The share of trials that succeed over the severity, mild to severe from left to right, where the search made "
-    "them; bars are Wilson's 95 % intervals (in panels of at most {most} renderers; else the CSV has them). Lines lead "
-    "through each renderer's shares; a vertical dashed line of its colour is the severity at which theory has it break."
+    "The chance of success over the severity, mild to severe from left to right: the logistic curve through each "
+    "renderer's breakdown whose width makes its trials likeliest. Dots are shares of the trials at a severity, one to "
+    "ten; the CSV has them with Wilson's intervals. Bars about the middle are the 95 % intervals of the breakdowns. A "
+    "dashed line is the severity at which theory has the renderer of its colour break."
 )
 
 
@@ -37,7 +39,7 @@ def make(experiment: Experiment) -> Result:
     return Result(
         name="stability_curves",
         title="How success gives way.",
-        caption=joined(CAPTION.format(most=MOST_BARS), omitted(experiment)),
+        caption=joined(CAPTION, omitted(experiment)),
         data=pd.DataFrame(data, dtype=object),
         figure=draw(grid, shares),
     )
@@ -62,34 +64,48 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
     drawn = [(row, cell, shares[axis, row]) for row, cell in grid.on(axis) if len(shares.get((axis, row), ()))]
     for place, (row, cell, table) in enumerate(drawn):
         look = style.look(row)
-        beside = 1.5 * (place - (len(drawn) - 1) / 2)  # per cent, so that equal lines do not hide each other
-        share = 100 * table["share"] + beside
-        how: dict[str, Any] = {"color": look.colour, "marker": look.marker, "ms": 2.5, "lw": 0.9, "label": row}
-        if len(drawn) <= MOST_BARS:
-            bars = np.maximum([share - 100 * table["low"], 100 * table["high"] - share], 0)
-            panel.errorbar(table["severity"], share, bars, elinewidth=0.5, **how)
-        else:
-            panel.plot(table["severity"], share, **how)
+        beside = 1.5 * (place - (len(drawn) - 1) / 2)  # per cent, so that equal curves do not hide each other
+        panel.plot(table["severity"], 100 * table["share"] + beside, look.marker, color=look.colour, ms=1.5, alpha=0.5)
+        levels = np.linspace(0, 1, 200)
+        along = [cell.severity(level) for level in levels]
+        panel.plot(along, 100 * _chance(levels, cell, table) + beside, color=look.colour, lw=1, ls=look.line, label=row)
+        ends = [measured(cell.record, f"level_{end}") for end in ("low", "high")]
+        if None not in ends:
+            low, high = (cell.severity(min(max(end, 0.0), 1.0)) for end in ends)
+            panel.plot([low, high], [50 + 2 * beside] * 2, color=look.colour, lw=2, solid_capstyle="butt")
         predicted = measured(cell.record, "predicted")
         if predicted is not None:
-            panel.axvline(predicted, color=look.colour, ls="--", lw=0.7)
+            panel.axvline(predicted, color=look.colour, ls="--", lw=0.6)
+    panel.set_title(title(axis), fontsize=7, pad=2)
     if not drawn:
+        style.bare(panel)
         panel.text(0.5, 0.5, "no run", ha="center", va="center", transform=panel.transAxes)
         return
     sweep = drawn[0][1]
     mild, severe = sweep.severity(0.0), sweep.severity(1.0)
-    if sweep.record["config"]["task"]["stress"]["sweep"]["log"]:
+    if setting(sweep.record["config"], "task", "stress", "sweep", "log"):
         panel.set_xscale("log")
         reach = (severe / mild) ** 0.05
         panel.set_xlim(mild / reach, severe * reach)
     else:
         panel.set_xlim(mild - 0.05 * (severe - mild), severe + 0.05 * (severe - mild))
-    panel.set_title(title(axis), fontsize=7, pad=2)
     panel.set_xlabel(grid.unit(axis), fontsize=5.5, labelpad=1)
     panel.set_ylim(-12, 112)
     panel.set_yticks([0, 50, 100])
     panel.tick_params(labelsize=5.5)
     panel.minorticks_off()
+
+
+def _chance(levels: np.ndarray, cell: Cell, table: pd.DataFrame) -> np.ndarray:
+    """The logistic curve through the breakdown, of the width under which the trials are likeliest."""
+    at = table["level"].to_numpy(dtype=float)
+    successes, n = (table[name].to_numpy(dtype=float) for name in ("successes", "trials"))
+
+    def curve(x: np.ndarray, width: float) -> np.ndarray:
+        return LAPSE + (1 - 2 * LAPSE) / (1 + np.exp(np.clip((x - (cell.level or 0.0)) / width, -50, 50)))
+
+    likelihoods = [successes @ np.log(curve(at, w)) + (n - successes) @ np.log(1 - curve(at, w)) for w in WIDTHS]
+    return curve(levels, WIDTHS[int(np.argmax(likelihoods))])
 
 
 def _shares(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:
@@ -107,10 +123,16 @@ def _shares(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:
             continue
         own[1] += bool(trial.get("success"))
         own[2] += 1
+    last = _last_level(record)
     rows = []
-    for _, (severity, successes, n) in sorted(counts.items()):
-        if not math.isfinite(severity):
-            continue
-        rate = wilson(successes, n)
-        rows.append([severity, successes, n, rate.value, rate.low, rate.high])
-    return pd.DataFrame(rows, columns=["severity", "successes", "trials", "share", "low", "high"])
+    for level, (severity, successes, n) in sorted(counts.items()):
+        if math.isfinite(severity):
+            rate = wilson(successes, n)
+            rows.append([level / last, severity, successes, n, rate.value, rate.low, rate.high])
+    return pd.DataFrame(rows, columns=["level", "severity", "successes", "trials", "share", "low", "high"])
+
+
+def _last_level(record: dict[str, Any]) -> int:
+    """The number of the severe end's level."""
+    name = "fit_search" if setting(record["config"], "task", "stress", "measure") == "fit" else "search"
+    return max(int(setting(record["config"], "task", name, "levels") or 2) - 1, 1)

@@ -1,5 +1,6 @@
 """The first failure of renderers as pictures, with the truth beside: what was lost, what is false, what is wrong."""
 
+import textwrap
 import zipfile
 from typing import Any
 
@@ -59,7 +60,8 @@ def draw(grid: Atlas, found: dict[str, tuple[str, Cell, Images]]) -> Figure:
         wrong.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
         true.imshow(images["true_distance"], cmap="Greys")
         wrong.set_title(f"{title(axis)}\n{row}", fontsize=6, loc="left", pad=2)
-        true.set_title(f"truth at\n{format.number(float(images['severity']))} {grid.unit(axis)}", fontsize=5.5, pad=2)
+        severity = textwrap.fill(f"truth at {format.number(float(images['severity']))} {grid.unit(axis)}", 26)
+        true.set_title(severity, fontsize=5.5, loc="left", pad=2)
     for spare in axes[2 * len(found) :]:
         spare.set_visible(False)
     patches = [Patch(facecolor=colour, edgecolor="#999999", label=name) for name, colour in KINDS.items()]

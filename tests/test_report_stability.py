@@ -1,0 +1,135 @@
+"""The stability atlas as tables and figures, made from run folders whose numbers are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.report import stability, stability_curves, stability_failures
+from bench.report.atlas import atlas
+from bench.report.experiments import choose
+from bench.report.paper import write_paper
+from bench.report.records import read_records
+from tests.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture
+
+SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
+
+
+def broke(results, axis, label, level, *, status="ok", measure="rendering", predicted=None, **metrics):
+    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials."""
+    within = {"breakdown": None if not 0 <= level <= 1 else 0.01**level}
+    ends = {"level": level, "level_low": level - 0.05, "level_high": level + 0.05}
+    within |= {f"breakdown{end}": 0.01 ** (level + by) for end, by in (("_low", -0.05), ("_high", 0.05))}
+    counts = {"trials": 10, "grid_trials": 40, "mild_trials": 5, "severe_trials": 5}
+    counts |= {"mild_successes": 5 * (level > 0), "severe_successes": 5 * (level > 1), "evaluations_per_ray": 4.0}
+    known = {**within, **ends, **counts, "failed_lost": 3, "failed_false": 1, **metrics}
+    known |= {} if predicted is None else {"predicted": predicted}
+    stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP}
+    search = {"levels": 11, "repeats": 4}
+    folder = write_run(
+        *(results, "stability", label),
+        task="stability",
+        dataset=axis,
+        status=status,
+        reason="" if status == "ok" else "why",
+        metrics=known if status == "ok" else {},
+        settings={"task": {"stress": stress, "search": search, "fit_search": search}, "stress": stress},
+    )
+    if status == "ok":
+        lines = [{"trial": i, "level": i, "severity": 0.01 ** (i / 10), "success": i / 10 < level} for i in range(11)]
+        (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def made(results, function):
+    return function(choose(read_records(results)[0], "stability", results))
+
+
+def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5, predicted=0.125)
+    table = made(tmp_path, stability.make)
+    assert table.table.loc[0, "Axis"] == "wires"
+    assert table.table.loc[0, "DIST"] == "0.100 [0.126, 0.0794]"
+    assert "Predicted, wires: DIST 0.125, measured 0.100 [0.126, 0.0794]." in table.notes
+    assert "DIST: worst on wires 0.100 [0.126, 0.0794] scene units. Failed trials: 3 lost, 1 false." in table.notes
+    assert "10 trials in all, 25 % of a full grid's" in table.caption
+
+
+def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
+    broke(tmp_path, "wires", "DIST", -0.1)
+    broke(tmp_path, "wires", "DVR", 1.1)
+    row = made(tmp_path, stability.make).table.iloc[0]
+    assert row["DIST"] == "at once (5 of 5 failed, 57-100 %)"
+    assert row["DVR"] == "none (0 of 5 failed, 0-43 %)"  # Wilson: 0 of 5 still allows 43 %
+
+
+def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    broke(tmp_path, "wires", "DVR", 0.5, status="crashed")
+    broke(tmp_path, "alpha", "DIST", 0.5)
+    broke(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
+    result = made(tmp_path, stability.make)
+    assert list(result.table["DVR"]) == ["crashed", "–"]
+    assert "2 of 4 runs did not end ok (1 crashed, 1 unsupported)" in result.caption
+    assert made(tmp_path, stability_curves.make).figure is not None
+
+
+def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
+    for label, level in (("DIST", 0.25), ("DVR", 0.75)):
+        broke(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
+        broke(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
+        broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
+    broke(tmp_path, "alpha", "DIST", 0.9)
+    broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
+    rows = made(tmp_path, stability.cost).data.set_index("row")
+    assert rows.loc["DIST", ["axes", "at_once", "never", "level", "cost"]].tolist() == [2, 1, 0, 0.125, 3.0]
+    assert rows.loc["DVR", ["axes", "at_once", "never", "level", "cost"]].tolist() == [2, 0, 1, 0.875, 47.0]
+
+
+def test_a_failed_run_never_leaves_a_better_mean(tmp_path):
+    for label in ("DIST", "DVR"):
+        broke(tmp_path, "wires", label, 0.5)
+    broke(tmp_path, "thin_plate", "DIST", 0.1, status="timeout")
+    broke(tmp_path, "thin_plate", "DVR", 0.1)
+    rows = made(tmp_path, stability.cost).data.set_index("row")
+    assert rows["level"].to_dict() == {"DIST": 0.25, "DVR": pytest.approx(0.3)}
+
+
+def test_axes_stand_in_their_groups(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    records = read_records(tmp_path)[0]
+    grid = atlas(choose(records, "stability", tmp_path))
+    assert (grid.axes, grid.rows, grid.group("wires")) == (["wires"], ["DIST"], "viewing")
+    assert grid.cells["wires", "DIST"].severity(0.5) == pytest.approx(0.1)
+
+
+def test_curves_have_a_row_a_level_with_its_interval(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.45)
+    data = made(tmp_path, stability_curves.make).data
+    assert len(data) == 11
+    assert data["successes"].sum() == 5
+    assert (data["low"] <= data["share"]).all() and (data["share"] <= data["high"]).all()
+    assert data["level"].iloc[-1] == 1.0
+
+
+def test_first_failures_are_drawn_with_the_truth_beside(tmp_path):
+    kinds = np.zeros((8, 8), dtype=np.uint8)
+    kinds[2:4] = 2
+    for label, level in (("DIST", 0.5), ("DVR", 0.2)):
+        folder = broke(tmp_path, "wires", label, level)
+        np.savez(folder / "images.npz", kinds=kinds, true_distance=np.ones((8, 8)), severity=0.3)
+    broke(tmp_path, "depth_noise", "DIST", 0.5, measure="fit")  # has no picture
+    result = made(tmp_path, stability_failures.make)
+    assert result.data[["axis", "row", "severity", "lost"]].to_numpy().tolist() == [["wires", "DVR", 0.3, 16]]
+
+
+def test_all_four_are_written(tmp_path):
+    folder = broke(tmp_path, "wires", "DIST", 0.5)
+    (folder / "curve.jsonl").write_text("not a line\n")
+    (folder / "images.npz").write_bytes(b"nothing")
+    written = write_paper(read_records(tmp_path)[0], tmp_path)
+    assert [path.stem for path in written] == [
+        "stability", "stability_cost", "stability_curves", "stability_failures",
+    ]  # fmt: skip
+    for path in written[:3]:
+        assert path.with_suffix(".png").stat().st_size > 1000
