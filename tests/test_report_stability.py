@@ -49,9 +49,9 @@ def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.5, predicted=0.125)
     table = made(tmp_path, stability.make)
     assert table.table.loc[0, "Axis"] == "wires"
-    assert table.table.loc[0, "DIST"] == "0.100 [0.126, 0.0794]"
-    assert "Predicted, wires: DIST 0.125, measured 0.100 [0.126, 0.0794]." in table.notes
-    assert "DIST: worst on wires 0.100 [0.126, 0.0794] scene units. Failed trials: 3 lost, 1 false." in table.notes
+    assert table.table.loc[0, "DIST"] == "0.100 (0.126 to 0.0794)"
+    assert "Predicted, wires: DIST 0.125, measured 0.100 (0.126 to 0.0794)." in table.notes
+    assert "DIST: worst on wires 0.100 (0.126 to 0.0794) scene units. Failed trials: 3 lost, 1 false." in table.notes
     assert "10 trials in all, 25 % of a full grid's" in table.caption
 
 

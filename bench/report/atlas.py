@@ -70,7 +70,7 @@ class Cell:
             return f"none ({self._count('severe')})"
         ends = [measured(self.record, f"breakdown_{end}") for end in ("low", "high")]
         told = [format.number(end) if end is not None else "beyond" for end in ends]
-        return f"{self.short()} [{', '.join(told)}]"
+        return f"{self.short()} ({' to '.join(told)})"
 
     def _count(self, end: str) -> str:
         """How many trials failed at an end of the sweep, with Wilson's interval."""

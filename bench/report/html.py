@@ -15,7 +15,7 @@ from bench.report.records import read_records
 # How a status is coloured; a status of no kind listed here is shown as bad.
 TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute", "not_run": "mute"}
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
-THUMBS = ("summary.png", "strip.png")
+THUMBS = ("summary.png", "strip.png", "failure.png")
 # Metrics with a column of their own, and those that say nothing new beside `chamfer_l2`: kept to the details.
 COLUMNS = ("accuracy", "completeness", "fscore", "normal_consistency", "depth_mae", "mask_iou")
 _NOT_OTHERS = ("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", *COLUMNS)

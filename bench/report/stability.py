@@ -15,12 +15,12 @@ from bench.report.experiments import Experiment, identity, measured
 from bench.report.tables import Result
 
 CAPTION = (
-    "The severity at which half of the trials succeed, with its 95 % interval, found by an adaptive search; {trials} "
-    "trials in all, {share:.0f} % of a full grid's. 'At once' breaks at the mildest severity, 'none' not at the "
-    "severest; behind either is how many trials failed there and Wilson's interval of their share. – is a renderer "
-    "without that setting. Success: 99 % of the true hits within the pixel's footprint and at most 1 % false hits; a "
-    "gradient whose cosine is over 0.99 and whose length is right within 10 %; a fit within 0.02 scene units of the "
-    "surface. Every renderer has the same trials."
+    "The severity at which half of the trials succeed, with its 95 % interval from the milder end, found by an adaptive "
+    "search; {trials} trials in all, {share:.0f} % of a full grid's. 'At once' breaks at the mildest severity, 'none' not "
+    "at the severest; behind either is how many trials failed there and Wilson's interval of their share. – is a "
+    "renderer without that setting. Success: 99 % of the true hits within the pixel's footprint and at most 1 % false "
+    "hits; a gradient whose cosine is over 0.99 and whose length is right within 10 %; a fit within 0.02 scene units of "
+    "the surface. Every renderer has the same trials."
 )
 WORST = 3
 
