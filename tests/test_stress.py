@@ -57,7 +57,6 @@ SOLIDS = {
     "half space": half_space((0.0, 2.0, 0.0), 0.1),
     "rod": rod(0.2, 0.5),
     "union": ball(0.3).moved((0.2, 0.0, 0.0)) | box((0.2,) * 3),
-    "shared": ball(0.4) & box((0.35, 0.2, 0.5)),
     "difference": box((0.4,) * 3) - ball(0.5),
     "shell without a corner": (ball(0.5) - ball(0.4)) - box((0.5,) * 3).moved((0.5, 0.5, 0.5)),
     "turned": (rod(0.1, 0.4) | rod(0.1, 0.4).moved((0.3, 0, 0))).turned(
@@ -170,7 +169,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
 def test_a_disturbed_fit_ends_further_off(scene):
     renderer = load("renderer", "dist")
     outcomes = [
-        judge_fit(FitTrial.of(scene, FIT, severity, drawn()), renderer, CRITERIA, limits=LIMITS, device=CPU)
+        judge_fit(FitTrial(scene, FIT, severity, drawn()), renderer, CRITERIA, limits=LIMITS, device=CPU)
         for severity in (1e-6, 0.5 if scene != "wrong_pose" else 60.0)
     ]
     assert outcomes[0].success

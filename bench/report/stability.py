@@ -11,16 +11,16 @@ from matplotlib.figure import Figure
 from bench.report import format, style
 from bench.report.atlas import Atlas, Cell, atlas, title
 from bench.report.caption import counted_outcome, joined, omitted
-from bench.report.experiments import Experiment, identity, measured
+from bench.report.experiments import Experiment, identity, measured, setting
 from bench.report.tables import Result
 
 CAPTION = (
-    "The severity at which half of the trials succeed, with its 95 % interval from the milder end, found by an adaptive "
-    "search; {trials} trials in all, {share:.0f} % of a full grid's. 'At once' breaks at the mildest severity, 'none' not "
-    "at the severest; behind either is how many trials failed there and Wilson's interval of their share. – is a "
-    "renderer without that setting. Success: 99 % of the true hits within the pixel's footprint and at most 1 % false "
-    "hits; a gradient whose cosine is over 0.99 and whose length is right within 10 %; a fit within 0.02 scene units of "
-    "the surface. Every renderer has the same trials."
+    "The severity at which half of the trials succeed, with its 95 % interval from the milder end, by an adaptive "
+    "search; {trials} trials in all, {share:.0f} % of a full grid's. 'At once' breaks at the mildest severity, 'none' "
+    "not at the severest; behind either is how many trials failed there and Wilson's interval of their share. – is a "
+    "renderer without that setting. Success: {hits:g} of the true hits within the pixel's footprint and false hits of "
+    "at most {false_hits:g} of them; a gradient whose cosine is at least {cosine:g} and whose length is right within "
+    "{scale:g}; a fit within {surface_error:g} scene units of the surface. Every renderer has the same trials."
 )
 WORST = 3
 
@@ -35,7 +35,7 @@ def make(experiment: Experiment) -> Result:
         name="stability",
         title="Where each renderer breaks.",
         caption=joined(
-            CAPTION.format(trials=int(trials), share=100 * trials / max(full, 1)),
+            CAPTION.format(trials=int(trials), share=100 * trials / max(full, 1), **_criteria(experiment)),
             counted_outcome(experiment),
             omitted(experiment),
         ),
@@ -136,6 +136,12 @@ def _by_all(grid: Atlas, axis: str) -> bool:
     """Whether all renderers could sit the trials of an axis."""
     cells = [grid.cells.get((axis, row)) for row in grid.rows]
     return all(cell is not None and cell.record["status"] != "unsupported" for cell in cells)
+
+
+def _criteria(experiment: Experiment) -> dict[str, float]:
+    """What counts as success, as the runs were asked."""
+    names = ("hits", "false_hits", "cosine", "scale", "surface_error")
+    return {name: float(setting(experiment.asked(), "task", "criteria", name) or math.nan) for name in names}
 
 
 def _told(grid: Atlas, axis: str, row: str) -> str:

@@ -23,7 +23,8 @@ CAPTION = (
     "The chance of success over the severity, mild to severe from left to right: the logistic curve through each "
     "renderer's breakdown whose width makes its trials likeliest. Dots are shares of the trials at a severity, one to "
     "ten; the CSV has them with Wilson's intervals. Bars about the middle are the 95 % intervals of the breakdowns. A "
-    "dashed line is the severity at which theory has the renderer of its colour break."
+    "dashed line is the severity at which theory has the renderer of its colour break, a dotted one that of a second "
+    "formula, as published: DIST, Eqs. 8 and 10."
 )
 
 
@@ -73,9 +74,9 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
         if None not in ends:
             low, high = (cell.severity(min(max(end, 0.0), 1.0)) for end in ends)
             panel.plot([low, high], [50 + 2 * beside] * 2, color=look.colour, lw=2, solid_capstyle="butt")
-        predicted = measured(cell.record, "predicted")
-        if predicted is not None:
-            panel.axvline(predicted, color=look.colour, ls="--", lw=0.6)
+        for name, line in (("predicted", "--"), ("predicted_1", ":")):
+            if (predicted := measured(cell.record, name)) is not None:
+                panel.axvline(predicted, color=look.colour, ls=line, lw=0.6)
     panel.set_title(title(axis), fontsize=7, pad=2)
     if not drawn:
         style.bare(panel)

@@ -82,7 +82,7 @@ def judge_fit(
     """
     if not renderer.capabilities.field_gradient:
         raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
-    fit, draw = trial.fit, trial.draw
+    fit, draw = trial.settings(), trial.draw
     true, start = _balls(draw, fit.offset)
     given = trial.disturbed(_observe(_ball(true), fit.resolution, draw))
     view = View(given.camera, given.depth, torch.zeros(*given.depth.shape, 3), given.mask)
@@ -99,21 +99,23 @@ def judge_fit(
 
 @dataclass(frozen=True)
 class FitTrial:
-    """A fit, what is wrong with it, and how much: what is given, or the fit's own settings."""
+    """A fit of a name in `FITS`, how severe it is, and what it may draw."""
 
+    name: str
     fit: FitSettings
-    disturb: "Disturb"
     severity: float
     draw: np.random.Generator
 
-    @staticmethod
-    def of(scene: str, fit: FitSettings, severity: float, draw: np.random.Generator) -> "FitTrial":
-        """The trial of that name in `FITS`."""
-        return FitTrial(STARTS.get(scene, _as_is)(fit, severity), DISTURBANCES.get(scene, _undisturbed), severity, draw)
+    def settings(self) -> FitSettings:
+        """The fit's settings, with the one that the severity is."""
+        if self.name not in SETTINGS:
+            return self.fit
+        return replace(self.fit, **{SETTINGS[self.name]: self.severity})
 
     def disturbed(self, given: Observation) -> Observation:
-        """What is given in its place."""
-        return self.disturb(given, self.severity, self.draw)
+        """What is given in the place of the truth."""
+        disturb = DISTURBANCES.get(self.name)
+        return given if disturb is None else disturb(given, self.severity, self.draw)
 
 
 @dataclass
@@ -193,24 +195,6 @@ def wrong_pose(given: Observation, severity: float, draw: np.random.Generator) -
     return replace(given, camera=of_moved_object(given.camera, torch.cat([torch.zeros(3), turn])))
 
 
-def far_start(fit: FitSettings, severity: float) -> FitSettings:
-    """The ball begins off by a distance, in scene units."""
-    return replace(fit, offset=severity)
-
-
-def learning_rate(fit: FitSettings, severity: float) -> FitSettings:
-    """Adam's rate."""
-    return replace(fit, learning_rate=severity)
-
-
-def _as_is(fit: FitSettings, severity: float) -> FitSettings:
-    return fit
-
-
-def _undisturbed(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
-    return given
-
-
 DISTURBANCES: dict[str, Disturb] = {
     function.__name__: function
     for function in (
@@ -223,11 +207,8 @@ DISTURBANCES: dict[str, Disturb] = {
         wrong_pose,
     )
 }
-STARTS: dict[str, Callable[[FitSettings, float], FitSettings]] = {
-    "far_start": far_start,
-    "learning_rate": learning_rate,
-}
-FITS = (*DISTURBANCES, *STARTS, "a_ball")  # the last as it is, for a severity that is the renderer's own
+SETTINGS = {"far_start": "offset", "learning_rate": "learning_rate"}  # of the fit, that the severity is
+FITS = (*DISTURBANCES, *SETTINGS, "a_ball")  # the last as it is, for a severity that is the renderer's own
 
 
 def _balls(draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:

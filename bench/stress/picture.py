@@ -15,7 +15,6 @@ from bench.stress.outcome import Outcome
 
 WRONG = (0.95, 0.65, 0.0)
 KINDS = {"background": PAPER, "hit": BOTH, "lost": LOST, "false": FALSE, "wrong surface": WRONG}
-IMAGES = "images.npz"
 
 
 @runtime_checkable
@@ -34,7 +33,7 @@ def draw_failure(folder: Path, trial: Failed, *, title: str, unit: str) -> None:
     images = trial.outcome.images
     if not images:
         return
-    np.savez_compressed(folder / IMAGES, severity=trial.severity, **images)  # type: ignore[arg-type]
+    np.savez_compressed(folder / "images.npz", severity=trial.severity, **images)  # type: ignore[arg-type]
     matplotlib.use("Agg")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.2, 3.6), layout="constrained")

@@ -7,6 +7,7 @@ from torch import Tensor
 from bench.limits import Limits
 from bench.stress.outcome import Criteria, Failure, Outcome
 from datasets.stress import Exam, FirstHit
+from datasets.stress.solids import incidence_cosines
 from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.rendering import Renderer
@@ -63,7 +64,7 @@ def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, "n"]]:
     rays: Rays = camera.rays().flat()
     first = exam.truth.trace(rays)
     width = first.distance / camera.intrinsics[0, 0]
-    return first, width / exam.truth.cosines(rays, first).clamp_min(torch.finfo(width.dtype).tiny)
+    return first, width / incidence_cosines(exam.truth.field, rays, first).clamp_min(torch.finfo(width.dtype).tiny)
 
 
 def _failure(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failure:

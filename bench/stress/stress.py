@@ -20,6 +20,7 @@ from datasets.stress import SCENES
 from renderers.checks import check_choice
 from renderers.rendering import Renderer
 
+GROUPS = ("geometry", "viewing", "field", "observation", "optimisation")
 MEASURES = ("rendering", "gradient", "fit")
 
 
@@ -85,6 +86,7 @@ class Stress:
     theory: str | None = None
 
     def __post_init__(self) -> None:
+        check_choice("task.stress.group", self.group, GROUPS)
         check_choice("task.stress.measure", self.measure, MEASURES)
         check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else tuple(SCENES))
         if self.theory is not None:
@@ -119,7 +121,7 @@ class Stress:
         try:
             if self.measure == "fit":
                 return judge_fit(
-                    FitTrial.of(self.scene, conditions.fit, severity, draw), stressed, conditions.criteria, **common
+                    FitTrial(self.scene, conditions.fit, severity, draw), stressed, conditions.criteria, **common
                 )
             exam = SCENES[self.scene](severity, draw, conditions.resolution)
             judge = judge_rendering if self.measure == "rendering" else judge_gradient

@@ -5,6 +5,7 @@ A renderer that lacks the settings that a formula is made of has no prediction.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from math import asin, degrees, log, radians, sin, sqrt, tan
 from typing import Any
 
@@ -13,7 +14,8 @@ from datasets.stress import scenes
 from renderers.field import STEEPEST_MARGIN
 
 FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
-FLATTEST, STEEPEST = 0.29, 0.64  # cosines of incidence on the cube's sides: of 1 % of the hits less, of 1 % more
+# Of the cosines of incidence on the cube's sides 1 % are below the first, and 1 % above the second.
+FLATTEST, STEEPEST = 0.29, 0.64
 
 
 @dataclass(frozen=True)
@@ -25,26 +27,47 @@ class Prediction:
 
 
 Theory = Callable[[Any, int, Criteria], list[Prediction]]
+THEORIES: dict[str, Theory] = {}
 
 
+def needs(*settings: str) -> Callable[[Theory], Theory]:
+    """Makes a function a theory of renderers that have these settings; of others it predicts nothing.
+
+    Nor does it where its formula has no answer, such as a sine above 1.
+    """
+
+    def known(theory: Theory) -> Theory:
+        @wraps(theory)
+        def predict(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+            if not all(hasattr(renderer, name) for name in settings):
+                return []
+            try:
+                return theory(renderer, resolution, criteria)
+            except (ValueError, ZeroDivisionError, OverflowError):
+                return []
+
+        THEORIES[theory.__name__] = predict
+        return predict
+
+    return known
+
+
+@needs()
 def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """What the first long step overshoots; or DVR's spacing (Eq. 9) on the longest ray."""
     if hasattr(renderer, "refinement"):
         return [Prediction(2 * FRONT / (renderer.samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
-    if not hasattr(renderer, "alpha"):
-        return []
-    extra = max(_alpha(renderer) - 1, 0.0)
-    reach = min(FRONT, renderer.step_clamp or FRONT)
-    overshoot = min(extra * reach, renderer.extra_step_cap or extra * reach)
-    if renderer.step_back or overshoot == 0:
+    extra = _alpha(renderer) - 1
+    reach = min(FRONT, getattr(renderer, "step_clamp", None) or FRONT)
+    overshoot = min(extra * reach, getattr(renderer, "extra_step_cap", None) or extra * reach)
+    if getattr(renderer, "step_back", False) or overshoot <= 0:
         return []
     return [Prediction(overshoot, "overshoot (alpha - 1) d of a step, within its cap or clamp")]
 
 
+@needs("steps", "epsilon")
 def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """The angle at which the steps of Eq. 8 are all that there are."""
-    if not hasattr(renderer, "steps"):
-        return []
     alpha, steps = _alpha(renderer), renderer.steps
     published = degrees(asin((1 - (renderer.epsilon / FRONT) ** (1 / steps)) / alpha))
     angle = published
@@ -57,11 +80,12 @@ def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Pr
     ]
 
 
+@needs()
 def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Where DIST's scale alpha K sin(theta) leaves its tolerance, the slope falls below its least, or Eq. 8 ends."""
     lost = grazing_plane(renderer, resolution, criteria)[:1]
     if hasattr(renderer, "alpha"):
-        shrunk = (1 - criteria.scale) / (renderer.alpha * renderer.samples)
+        shrunk = (1 - criteria.scale) / (renderer.alpha * getattr(renderer, "samples", 1))
         lost.append(Prediction(degrees(asin(min(shrunk, 1.0))), "scale alpha K sin(theta) of Eq. 4"))
     elif hasattr(renderer, "least_slope"):
         share = 1 - criteria.scale if getattr(renderer, "keep_slope_sign", True) else 1.0
@@ -69,6 +93,7 @@ def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list
     return sorted(lost, key=lambda prediction: -prediction.severity)
 
 
+@needs("epsilon")
 def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """The ring by which epsilon widens a cube's outline, a regular hexagon; and Eq. 10."""
     around = scenes.CUBE * 2 * sqrt(2 / 3)  # radius through the hexagon's corners
@@ -80,15 +105,15 @@ def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Predicti
     ]
 
 
+@needs("epsilon")
 def within_epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """What comes nearer than epsilon counts as a surface."""
-    return [Prediction(renderer.epsilon, "epsilon")] if hasattr(renderer, "epsilon") else []
+    return [Prediction(renderer.epsilon, "epsilon")]
 
 
+@needs("steps", "epsilon")
 def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """The way to the cube in steps of the truncated value, and what Eq. 8 asks for behind them."""
-    if not hasattr(renderer, "steps"):
-        return []
     alpha, way = _alpha(renderer), FRONT
     left = renderer.steps
     for _ in range(20):  # what is truncated further away, Eq. 8 takes over
@@ -97,42 +122,37 @@ def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Predic
     return [Prediction(way / alpha / left, "way over alpha k, less the steps of DIST, Eq. 8, from there on")]
 
 
+@needs("steps", "epsilon")
 def few_steps(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Eq. 8 at the cube's sides."""
-    if not hasattr(renderer, "epsilon"):
-        return []
     needed = log(renderer.epsilon / FRONT) / log(abs(1 - _alpha(renderer) * FLATTEST))
     return [Prediction(needed, "DIST, Eq. 8, at the cube's sides")]
 
 
+@needs("steps", "epsilon")
 def weak_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Eq. 8 at the cube's sides, with steps shortened by the factor."""
-    if not hasattr(renderer, "steps"):
-        return []
     shrunk = 1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)
     return [
         Prediction(shrunk / _alpha(renderer) / FLATTEST, "as many steps as DIST, Eq. 8, asks for at the cube's sides")
     ]
 
 
+@needs("steps")
 def strong_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Steps of alpha times factor times the cosine over 2 do not converge."""
-    if not hasattr(renderer, "steps"):
-        return []
-    return [Prediction(2 / _alpha(renderer) / STEEPEST, "alpha times factor times cos(theta) over 2 does not converge")]
+    """Steps do not converge where alpha times factor times cos(theta) exceeds 2."""
+    return [Prediction(2 / _alpha(renderer) / STEEPEST, "alpha times factor times cos(theta) is 2: no convergence")]
 
 
+@needs("epsilon")
 def float_spacing(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Where neighbouring float32 numbers of the camera's distance lie further apart than epsilon."""
-    return (
-        [Prediction(renderer.epsilon * 2**24, "float32's spacing is epsilon")] if hasattr(renderer, "epsilon") else []
-    )
+    return [Prediction(renderer.epsilon * 2**24, "float32's spacing is epsilon")]
 
 
+@needs("steps")
 def gap(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Rays as near to a side of the slit as its depth over the steps are lost: two of them a slit."""
-    if not hasattr(renderer, "steps"):
-        return []
     lost = 2 * scenes.SLIT_DEPTH / renderer.steps / _alpha(renderer)
     return [Prediction(lost / scenes.SLIT_SHARE / (1 - criteria.hits), "rays within depth / k of a side are lost")]
 
@@ -141,12 +161,3 @@ def _alpha(renderer: Any) -> float:
     """The factor of a step, with what a slope bound, found on a true distance, takes off it."""
     bounded = getattr(renderer, "slope_samples", 0)
     return getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0)
-
-
-THEORIES: dict[str, Theory] = {
-    function.__name__: function
-    for function in (
-        thin_plate, grazing_plane, grazing_gradient, epsilon, within_epsilon, truncated, few_steps, weak_distance,
-        strong_distance, float_spacing, gap,
-    )
-}  # fmt: skip

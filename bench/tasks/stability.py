@@ -77,7 +77,7 @@ class Stability:
         record, renderer = cell.record, cell.stage.renderer
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, cell.stage.device)
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
-        record.scene = self.stress.scene.replace("_", " ")
+        record.scene = record.dataset.replace("_", " ")
         self.stress.stressed(renderer, self.stress.sweep.mild)  # unsupported before the first trial
         search, trials = Search(self._settings), _Trials()
         with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
@@ -93,7 +93,7 @@ class Stability:
             name = f"predicted_{place}" if place else "predicted"
             record.metrics[name] = prediction.severity
             record.definitions[name] = prediction.formula
-        record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"], "trials": len(trials.all)}
+        record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = RunStatus.OK, ""
         if trials.first_failure is not None:
             draw_failure(cell.folder, trials.first_failure, title=f"{record.name}, {record.scene}", unit=self._unit)

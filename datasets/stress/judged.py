@@ -1,15 +1,11 @@
-"""Truth of a field that no closed form intersects: the slow float64 judge, sure down to a stated thickness."""
+"""First hits of a field that no closed form intersects, by the slow float64 reference, sure down to a thickness."""
 
 from dataclasses import dataclass
-
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from datasets.stress.solids import FirstHit
 from renderers import reference
 from renderers.camera import Rays
-from renderers.field import Field, autograd_normals
+from renderers.field import Field
 from renderers.rendering import Status
 
 
@@ -31,8 +27,3 @@ class Judged:
         """The first hits of flat rays [n]; without gradient."""
         found = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
         return FirstHit(found.distance, found.hit, found.status == Status.STARTED_INSIDE)
-
-    def cosines(self, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]:
-        """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
-        normals = autograd_normals(self.field, rays.at(first.distance))
-        return torch.where(first.hit, (normals * rays.directions).sum(-1).abs(), 1.0)

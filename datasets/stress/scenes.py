@@ -6,7 +6,7 @@ that every renderer sits the same exams.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import atan, degrees, sin
+from math import atan, cos, degrees, radians, sin
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -32,11 +32,12 @@ SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the 
 
 @runtime_checkable
 class Truth(Protocol):
-    """What knows its own first hits."""
+    """A field that knows its own first hits."""
+
+    @property
+    def field(self) -> Field: ...
 
     def trace(self, rays: Rays) -> FirstHit: ...
-
-    def cosines(self, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]: ...
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -
         offset, right, forward = parameters
         return half_space(torch.stack([right, torch.ones_like(right), forward]), offset)
 
-    field_of_view = 2 * degrees(atan(0.1 * sin(np.radians(severity))))
+    field_of_view = 2 * degrees(atan(0.1 * sin(radians(severity))))
     camera = _camera(draw, resolution, elevation=(severity, severity), field_of_view=field_of_view)
     none = torch.zeros(3, dtype=torch.float64)
     return Exam(solid(none).field, camera, solid(none), solid, none)
@@ -170,13 +171,12 @@ def empty_scene(severity: float, draw: np.random.Generator, resolution: int) -> 
 
 
 def _distorted(distortion: distortions.Distortion) -> Scene:
-    """A cube through a distorted field, judged by what they are."""
+    """The cube through a distorted field, judged by the undistorted cube."""
 
     def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
         exam = _cube(draw, resolution)
         return Exam(distortion(exam.field, severity, draw), exam.camera, exam.truth)
 
-    scene.__doc__ = distortion.__doc__
     return scene
 
 
@@ -228,12 +228,6 @@ def _camera(
 
 
 def _about_z(angle: float) -> Float[Tensor, "3 3"]:
-    turn = torch.tensor(np.radians(angle), dtype=torch.float64)
-    c, s, zero, one = turn.cos(), turn.sin(), turn * 0, turn * 0 + 1
-    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one]).view(3, 3)
-
-
-def random_rotation(draw: np.random.Generator) -> Float[Tensor, "3 3"]:
-    """A rotation, in float64, all alike."""
-    orthogonal, _ = torch.linalg.qr(torch.from_numpy(draw.normal(size=(3, 3))))
-    return orthogonal * torch.linalg.det(orthogonal).sign()
+    """A rotation about the z axis by an angle in degrees."""
+    c, s = cos(radians(angle)), sin(radians(angle))
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -1,6 +1,6 @@
 """Solids with closed-form ray intersections beside their fields, so that a rendering can be judged without another.
 
-A solid knows the spans of a ray that lie within it; union, intersection and difference are those of the spans.
+A solid knows the spans of a ray that lie within it; union and difference are those of the spans.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
-from renderers.field import autograd_normals
+from renderers.field import Field, autograd_normals
 from renderers.fields import analytic
 from renderers.fields.analytic import Shape
 
@@ -29,16 +29,13 @@ class FirstHit:
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape, and the spans of each line [n] that lie within it. `|`, `&`, `-` as for shapes."""
+    """A shape, and the spans of each line [n] that lie within it. `|` and `-` as for shapes."""
 
     field: Shape
     spans: Callable[[Rays], Spans]
 
     def __or__(self, other: "Solid") -> "Solid":
         return Solid(self.field | other.field, lambda rays: torch.cat([self.spans(rays), other.spans(rays)], dim=1))
-
-    def __and__(self, other: "Solid") -> "Solid":
-        return Solid(self.field & other.field, lambda rays: _shared(self.spans(rays), other.spans(rays)))
 
     def __sub__(self, other: "Solid") -> "Solid":
         return Solid(self.field - other.field, lambda rays: _without(self.spans(rays), other.spans(rays)))
@@ -60,9 +57,9 @@ class Solid:
 
         return Solid(self.field.translate(offset), lambda rays: self.spans(back(rays)))
 
-    def trace(self, rays: Rays, *, radius: float = 1.0) -> FirstHit:
-        """The first hits of flat rays [n] within the sphere of `radius`; differentiable in rays and parameters."""
-        entry, leave, meets = sphere_span(rays, radius)
+    def trace(self, rays: Rays) -> FirstHit:
+        """The first hits of flat rays [n] within the unit sphere; differentiable in rays and parameters."""
+        entry, leave, meets = sphere_span(rays)
         spans = self.spans(rays)
         near, far = spans.unbind(-1)
         there = far > near
@@ -73,11 +70,11 @@ class Solid:
         hit = meets & ~inside & distance.isfinite()
         return FirstHit(torch.where(hit, distance, leave), hit, inside)
 
-    def cosines(self, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]:
-        """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
-        normals = autograd_normals(self.field, rays.at(first.distance.detach()))
-        cosine = (normals * rays.directions).sum(-1).abs()
-        return torch.where(first.hit, cosine, 1.0)
+
+def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]:
+    """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
+    normals = autograd_normals(field, rays.at(first.distance.detach()))
+    return torch.where(first.hit, (normals * rays.directions).sum(-1).abs(), 1.0)
 
 
 def ball(radius: analytic.Numbers) -> Solid:
@@ -149,13 +146,6 @@ def _span(near: Tensor, far: Tensor, there: Tensor) -> Spans:
     """One span a ray; where it is not there its exit comes first, and no gradient flows."""
     nowhere = torch.full_like(near, torch.inf)
     return torch.stack([torch.where(there, near, nowhere), torch.where(there, far, -nowhere)], dim=-1)[:, None]
-
-
-def _shared(first: Spans, second: Spans) -> Spans:
-    """What lies in a span of both."""
-    near = torch.maximum(first[:, :, None, 0], second[:, None, :, 0])
-    far = torch.minimum(first[:, :, None, 1], second[:, None, :, 1])
-    return torch.stack([near, far], dim=-1).flatten(1, 2)
 
 
 def _without(first: Spans, second: Spans) -> Spans:
