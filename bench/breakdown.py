@@ -48,11 +48,12 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Breakdown:
-    """The level at which half of the trials succeed, and the ends of its interval; not in the sweep beyond 0 or 1."""
+    """The level at which half of the trials succeed, with its interval; below 0 or above 1 it is beyond the sweep."""
 
     level: float
     low: float
     high: float
+    width: float  # of the logistic curve, the most probable
 
 
 class Search:
@@ -64,7 +65,7 @@ class Search:
         step = 1.0 / (settings.levels - 1) / FINENESS
         self.middles = np.arange(-BEYOND, 1.0 + BEYOND + step / 2, step)
         self.known = np.full((len(self.middles), len(WIDTHS)), 1.0 / len(self.middles) / len(WIDTHS))
-        self.trials: list[tuple[int, bool]] = []
+        self.trials: list[tuple[int, bool]] = []  # the index of the level, and whether it succeeded
 
     @cached_property
     def _success(self) -> np.ndarray:
@@ -73,14 +74,14 @@ class Search:
         return LAPSE + (1 - 2 * LAPSE) / (1 + np.exp(-np.clip(apart, -50, 50)))
 
     def next(self) -> int | None:
-        """The number of the level of the next trial; None where enough is known, or enough was tried.
+        """The index of the level of the next trial; None where enough is known, or enough was tried.
 
         The two ends come first. An end at or beyond which the breakdown lies is tried `repeats` times at least, so that
         what is said of it has a count behind it.
         """
         if len(self.trials) >= self.settings.most:
             return None
-        tried = [level for level, _ in self.trials]
+        tried = [index for index, _ in self.trials]
         last = self.settings.levels - 1
         for end in (0, last):
             if tried.count(end) < 1:
@@ -93,10 +94,10 @@ class Search:
             return wanting[0] if wanting else None
         return self._telling()
 
-    def note(self, level: int, success: bool) -> None:
-        """Learns from a trial at a level."""
-        self.trials.append((level, success))
-        chance = self._success[level]
+    def note(self, index: int, success: bool) -> None:
+        """Learns from a trial at the level of an index."""
+        self.trials.append((index, success))
+        chance = self._success[index]
         self.known = self.known * (chance if success else 1 - chance)
         self.known /= self.known.sum()
 
@@ -105,11 +106,11 @@ class Search:
         below = self.known.sum(axis=1).cumsum()
         ends = [(1 - CERTAIN) / 2, 0.5, (1 + CERTAIN) / 2]
         low, middle, high = (float(self.middles[min(int(np.searchsorted(below, e)), len(below) - 1)]) for e in ends)
-        return Breakdown(middle, low, high)
+        return Breakdown(middle, low, high, WIDTHS[int(self.known.sum(axis=0).argmax())])
 
-    def counts(self, level: int) -> tuple[int, int]:
-        """How many trials at a level succeeded, and how many there were."""
-        own = [success for at, success in self.trials if at == level]
+    def counts(self, index: int) -> tuple[int, int]:
+        """How many trials at the level of an index succeeded, and how many there were."""
+        own = [success for at, success in self.trials if at == index]
         return sum(own), len(own)
 
     def _needed(self, end: int, found: Breakdown) -> bool:

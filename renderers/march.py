@@ -16,6 +16,7 @@ from renderers.rendering import Status
 
 PYRAMID = (4, 2)  # pixels a side of a coarse ray's block, at the first levels (DIST, Sec. 3.2)
 PYRAMID_STEPS = 3  # steps at each of these levels
+TOUCHING = 1.0001  # times the radii of two empty balls: a wall that is met head-on makes them touch
 CAREFUL = 2.0  # careful_split: the closest sample is not the closest point, so "closer" allows for twice the distance
 
 
@@ -32,7 +33,8 @@ class Stepping:
         careful_split: a ray goes on not from where its coarse ray is, but from where that came closest to the surface,
             if it came about as close as the two rays lie apart there. Else rays beside an edge begin behind it.
         step_back: a step beyond the value is taken back where the empty balls about its two ends do not meet, and the
-            value itself is gone instead (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1).
+            value itself is gone instead (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1); so is it where the
+            step would leave the sphere. Later steps go beyond the value again.
         least_step: forward steps are at least this long, in scene units, but for one that turns back from behind the
             surface, else a ray would never come to rest there; 0 for none.
         slope: bound on the length of the field's gradient, by which values are divided before a step is made of them.
@@ -184,7 +186,9 @@ def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], s
     length = torch.where(onward, length.clamp_min(stepping.least_step), length)
     step = torch.where(converged, value, torch.where(inside, 0.0, length))
     if stepping.step_back:
-        step, apart = _taken_back(front, asked, value / stepping.slope, step)
+        reach = value / stepping.slope
+        over = (distance + step > front.leave[asked]) & (distance + reach <= front.leave[asked])
+        step, apart = _taken_back(front, asked, reach, torch.where(over, reach, step))
         converged &= ~apart
     moved = distance + step
     left = ~converged & (moved > front.leave[asked])
@@ -209,7 +213,7 @@ def _taken_back(
 ) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"]]:
     """The step, or that back to where the last value reached, where the last two empty balls lie apart; and where."""
     safe, gone = front.safe[asked], front.gone[asked]
-    apart = (gone > safe) & (gone > safe + reach.abs())
+    apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
     back = torch.where(apart, safe - gone, step)
     front.safe[asked] = torch.where(apart, torch.inf, reach.clamp_min(0))  # what was gone back to is sure
     front.gone[asked] = back

@@ -382,3 +382,52 @@ def test_naive_asks_every_ray_that_meets_the_sphere_at_every_step():
     meter = Meter(WALL)
     replace(NAIVE, steps=17).render(meter, THREE)
     assert meter.counts == Counts(value=2 * 17)
+
+
+def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> Front:
+    front = Front.on_sphere(rays, radius=1.0, samples=1)
+    march(field, rays, front, stepping, steps)
+    return front
+
+
+def plate(at: float, thickness: float) -> Shape:
+    """A plate across z."""
+    return plane((0, 0, -1), thickness / 2 - at) & plane((0, 0, 1), thickness / 2 + at)
+
+
+@pytest.mark.parametrize("at", [0.0, -0.5, 0.85], ids=["middle", "near", "before the exit"])
+def test_a_step_over_a_plate_is_taken_back(at):
+    rays, thin = beam((0, 0, -2)), plate(at, 0.04)
+    assert marched(thin, rays, AGGRESSIVE).status.item() == Status.MISS
+    kept = marched(thin, rays, replace(AGGRESSIVE, step_back=True))
+    assert kept.status.item() == Status.HIT
+    assert kept.distance.item() == pytest.approx(2 + at - 0.02, abs=1e-4)
+
+
+def test_a_step_that_jumped_nothing_is_not_taken_back():
+    rays, counts = beam((0, 0, -2)), [0, 0]
+    for place, stepping in enumerate((AGGRESSIVE, replace(AGGRESSIVE, step_back=True))):
+        shape = Meter(plate(0.0, 1.9))  # thick: what overshoots lands within, and the balls of both ends meet
+        assert marched(shape, rays, stepping).status.item() == Status.HIT
+        counts[place] = shape.counts.value
+    assert counts[0] == counts[1]
+
+
+def test_a_least_step_brings_a_grazing_ray_to_its_surface():
+    direction = torch.nn.functional.normalize(vector((1.0, -0.05, 0.0)), dim=-1)
+    origin = -1.5 * direction
+    rays = Rays(origin[None], direction[None])  # meets the plane y = 0 at the origin, at 2.9 degrees
+    ground = plane((0, 1, 0), 0.0)
+    assert marched(ground, rays, PLAIN).status.item() == Status.OUT_OF_STEPS
+    floored = marched(ground, rays, replace(PLAIN, least_step=0.05))
+    assert floored.status.item() == Status.HIT
+    assert floored.distance.item() == pytest.approx(1.5, abs=2e-3)
+
+
+def test_values_are_divided_by_the_slope_before_a_step_is_made_of_them():
+    rays = beam((0, 0, -2))
+    steep = Shape(lambda points: 4 * sphere(0.5)(points))
+    front = marched(steep, rays, replace(PLAIN, slope=4.0))
+    assert front.status.item() == Status.HIT
+    assert front.distance.item() == pytest.approx(1.5, abs=1e-4)
+    assert marched(steep, rays, PLAIN).status.item() != Status.HIT

@@ -15,11 +15,14 @@ from tests.test_report_paper import coarse_pictures, write_run  # noqa: F401, a 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
-def broke(results, axis, label, level, *, status="ok", measure="rendering", predicted=None, **metrics):
+def broke(results, axis, label, level, *, status="ok", measure="rendering", predicted=None, criteria=None, **metrics):
     """A run of the atlas whose breakdown lies at a level; with a curve of ten trials."""
     within = {"breakdown": None if not 0 <= level <= 1 else 0.01**level}
     ends = {"level": level, "level_low": level - 0.05, "level_high": level + 0.05}
-    within |= {f"breakdown{end}": 0.01 ** (level + by) for end, by in (("_low", -0.05), ("_high", 0.05))}
+    within |= {
+        f"breakdown{end}": 0.01 ** (level + by) if 0 <= level + by <= 1 else None
+        for end, by in (("_low", -0.05), ("_high", 0.05))
+    }
     counts = {"trials": 10, "grid_trials": 40, "mild_trials": 5, "severe_trials": 5}
     counts |= {"mild_successes": 5 * (level > 0), "severe_successes": 5 * (level > 1), "evaluations_per_ray": 4.0}
     known = {**within, **ends, **counts, "failed_lost": 3, "failed_false": 1, **metrics}
@@ -33,10 +36,15 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", pred
         status=status,
         reason="" if status == "ok" else "why",
         metrics=known if status == "ok" else {},
-        settings={"task": {"stress": stress, "search": search, "fit_search": search}, "stress": stress},
+        settings={
+            "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
+            "stress": stress,
+        },
     )
     if status == "ok":
-        lines = [{"trial": i, "level": i, "severity": 0.01 ** (i / 10), "success": i / 10 < level} for i in range(11)]
+        lines = [
+            {"trial": i, "level": i / 10, "severity": 0.01 ** (i / 10), "success": i / 10 < level} for i in range(11)
+        ]
         (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
 
@@ -78,21 +86,36 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
     for label, level in (("DIST", 0.25), ("DVR", 0.75)):
         broke(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
         broke(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
+        broke(tmp_path, "gap", label, 0.5)
         broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
     broke(tmp_path, "alpha", "DIST", 0.9)
     broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
     rows = made(tmp_path, stability.cost).data.set_index("row")
-    assert rows.loc["DIST", ["axes", "at_once", "never", "level", "cost"]].tolist() == [2, 1, 0, 0.125, 3.0]
-    assert rows.loc["DVR", ["axes", "at_once", "never", "level", "cost"]].tolist() == [2, 0, 1, 0.875, 47.0]
+    columns = ["axes", "at_once", "never", "cost"]
+    assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 4.0]
+    assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
+    assert rows["rank"].to_dict() == {"DIST": pytest.approx(5.5 / 3), "DVR": pytest.approx(3.5 / 3)}
 
 
-def test_a_failed_run_never_leaves_a_better_mean(tmp_path):
+@pytest.mark.parametrize("status", ["timeout", "missing"])
+def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
     for label in ("DIST", "DVR"):
         broke(tmp_path, "wires", label, 0.5)
-    broke(tmp_path, "thin_plate", "DIST", 0.1, status="timeout")
+    if status != "missing":
+        broke(tmp_path, "thin_plate", "DIST", 0.1, status=status)
     broke(tmp_path, "thin_plate", "DVR", 0.1)
     rows = made(tmp_path, stability.cost).data.set_index("row")
-    assert rows["level"].to_dict() == {"DIST": 0.25, "DVR": pytest.approx(0.3)}
+    assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
+    if status != "missing":
+        assert "DIST: worst on thin plate timeout" in " ".join(made(tmp_path, stability.make).notes)
+
+
+def test_rows_of_other_criteria_are_not_compared(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
+    broke(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
+    result = made(tmp_path, stability.make)
+    assert list(result.table.columns) == ["Axis", "Unit", "DVR"]
+    assert "Success: 0.99 of the true hits" in result.caption and "Not shown: 1 run" in result.caption
 
 
 def test_axes_stand_in_their_groups(tmp_path):
@@ -115,12 +138,12 @@ def test_curves_have_a_row_a_level_with_its_interval(tmp_path):
 def test_first_failures_are_drawn_with_the_truth_beside(tmp_path):
     kinds = np.zeros((8, 8), dtype=np.uint8)
     kinds[2:4] = 2
-    for label, level in (("DIST", 0.5), ("DVR", 0.2)):
+    for label, level, severity in (("DIST", 0.5, 0.3), ("DVR", 0.4, 0.2)):
         folder = broke(tmp_path, "wires", label, level)
-        np.savez(folder / "images.npz", kinds=kinds, true_distance=np.ones((8, 8)), severity=0.3)
+        np.savez(folder / "images.npz", kinds=kinds, true_distance=np.ones((8, 8)), severity=severity)
     broke(tmp_path, "depth_noise", "DIST", 0.5, measure="fit")  # has no picture
     result = made(tmp_path, stability_failures.make)
-    assert result.data[["axis", "row", "severity", "lost"]].to_numpy().tolist() == [["wires", "DVR", 0.3, 16]]
+    assert result.data[["axis", "row", "severity", "lost"]].to_numpy().tolist() == [["wires", "DIST", 0.3, 16]]
 
 
 def test_all_four_are_written(tmp_path):

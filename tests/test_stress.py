@@ -9,11 +9,12 @@ from omegaconf import OmegaConf
 
 from bench.config import CONF, build, load
 from bench.limits import Limits
-from bench.stress.fit import FITS, FitSettings, FitTrial, judge_fit
+from bench.stress.conditions import Conditions, Criteria, FitSettings
+from bench.stress.fit import FITS, FitTrial, judge_fit
 from bench.stress.gradient import judge_gradient
-from bench.stress.outcome import Criteria, Failure
+from bench.stress.outcome import Failure
 from bench.stress.rendering import judge_rendering, truth
-from bench.stress.stress import Conditions, Stress, Sweep
+from bench.stress.stress import Stress, Sweep
 from bench.tasks.problem import Unsupported
 from datasets.stress import SCENES
 from datasets.stress.solids import ball, box, half_space, rod
@@ -117,12 +118,12 @@ def test_severe_is_worse_than_mild(name):
 
 def test_pixels_are_counted_by_what_is_wrong_with_them():
     exam = SCENES["cube"](1.0, drawn(), 32)
-    good = judge_rendering(exam, load("renderer", "idr"), CRITERIA, limits=LIMITS, device=CPU)
+    good = judge_rendering(exam, load("renderer", "idr"), conditions())
     assert good.success and good.numbers["hits"] > 200
-    short = judge_rendering(exam, load("renderer", "idr", steps=3), CRITERIA, limits=LIMITS, device=CPU)
+    short = judge_rendering(exam, load("renderer", "idr", steps=3), conditions())
     assert short.failure is Failure.LOST
     assert short.numbers["lost"] == (short.images["kinds"] == 2).sum() > 200
-    wide = judge_rendering(exam, load("renderer", "idr", epsilon=0.05), CRITERIA, limits=LIMITS, device=CPU)
+    wide = judge_rendering(exam, load("renderer", "idr", epsilon=0.05), conditions())
     assert wide.failure is Failure.FALSE
     assert wide.numbers["false"] == (wide.images["kinds"] == 3).sum() > 20
 
@@ -137,10 +138,10 @@ def test_the_footprint_is_a_pixel_at_the_true_distance():
 
 def test_gradients_are_those_of_the_closed_form():
     exam = SCENES["grazing_plane"](30.0, drawn(), 24)
-    exact = judge_gradient(exam, load("renderer", "dvr"), CRITERIA, limits=LIMITS, device=CPU)
+    exact = judge_gradient(exam, load("renderer", "dvr"), conditions())
     assert exact.success
     assert exact.numbers["gradient_cosine"] == pytest.approx(1, abs=1e-6)
-    biased = judge_gradient(exam, load("renderer", "dist"), CRITERIA, limits=LIMITS, device=CPU)
+    biased = judge_gradient(exam, load("renderer", "dist"), conditions())
     assert biased.failure is Failure.SCALE
     assert biased.numbers["gradient_scale"] == pytest.approx(1.5 * np.sin(np.radians(30)), rel=0.05)  # alpha K cos
 
@@ -159,7 +160,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     assert stress_named("few_steps").stressed(load("renderer", "idr"), 12.4).steps == 12
     with pytest.raises(Unsupported, match="DVR has no setting epsilon"):
         epsilon.stressed(load("renderer", "dvr"), 0.01)
-    with pytest.raises(Unsupported, match="DVR has no setting epsilon"):
+    with pytest.raises(Unsupported, match="DVR has no setting alpha"):
         stress_named("gradient_samples").stressed(load("renderer", "dvr"), 3.0)
     with pytest.raises(Unsupported, match="DIST has no setting refinement"):
         stress_named("few_samples").stressed(load("renderer", "dist"), 3.0)
@@ -169,7 +170,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
 def test_a_disturbed_fit_ends_further_off(scene):
     renderer = load("renderer", "dist")
     outcomes = [
-        judge_fit(FitTrial(scene, FIT, severity, drawn()), renderer, CRITERIA, limits=LIMITS, device=CPU)
+        judge_fit(FitTrial(scene, FIT, severity, drawn()), renderer, conditions())
         for severity in (1e-6, 0.5 if scene != "wrong_pose" else 60.0)
     ]
     assert outcomes[0].success

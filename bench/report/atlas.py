@@ -25,6 +25,11 @@ class Cell:
         return self.record["status"] == "ok" and self.level is not None and isinstance(sweep, dict)
 
     @property
+    def unsupported(self) -> bool:
+        """Whether the renderer lacks what the axis asks for."""
+        return self.record["status"] == "unsupported"
+
+    @property
     def level(self) -> float | None:
         """The breakdown from 0, the mild end of the sweep, to 1, the severe one; below or above where it is beyond."""
         return measured(self.record, "level")
@@ -52,10 +57,17 @@ class Cell:
             return mild * (severe / mild) ** level
         return mild + level * (severe - mild)
 
+    def place(self, severity: float) -> float:
+        """The level of a severity."""
+        ends = self.severity(0.0), self.severity(1.0)
+        if setting(self.record["config"], "task", "stress", "sweep", "log"):
+            return math.log(severity / ends[0]) / math.log(ends[1] / ends[0])
+        return (severity - ends[0]) / (ends[1] - ends[0])
+
     def short(self) -> str:
         """The breakdown in a few characters."""
         if not self.known:
-            return self.record["status"] if self.record["status"] != "unsupported" else format.MISSING
+            return format.MISSING if self.unsupported else self.record["status"]
         if self.at_once or self.never:
             return "at once" if self.at_once else "none"
         return format.number(measured(self.record, "breakdown"))
@@ -64,12 +76,14 @@ class Cell:
         """The breakdown with its interval, or the count behind what is said of an end of the sweep."""
         if not self.known:
             return self.short()
+        low, high = (measured(self.record, f"breakdown_{end}") for end in ("low", "high"))
         if self.at_once:
-            return f"at once ({self._count('mild')})"
+            reach = f", up to {format.number(high)}" if high is not None else ""
+            return f"at once ({self._count('mild')}{reach})"
         if self.never:
-            return f"none ({self._count('severe')})"
-        ends = [measured(self.record, f"breakdown_{end}") for end in ("low", "high")]
-        told = [format.number(end) if end is not None else "beyond" for end in ends]
+            reach = f", from {format.number(low)}" if low is not None else ""
+            return f"none ({self._count('severe')}{reach})"
+        told = [format.number(end) if end is not None else "beyond" for end in (low, high)]
         return f"{self.short()} ({' to '.join(told)})"
 
     def _count(self, end: str) -> str:
@@ -125,8 +139,9 @@ class Atlas:
 
 
 def atlas(experiment: Experiment) -> Atlas:
-    """The grid of an experiment's records."""
-    cells = {(record["dataset"], row_name(record)): Cell(record) for record in experiment.records}
+    """The grid of an experiment's records, of the seed that was asked for last."""
+    records = experiment.of_newest_scene().records
+    cells = {(record["dataset"], row_name(record)): Cell(record) for record in records}
     rows = list(dict.fromkeys(row for _, row in cells))
     axes = list(dict.fromkeys(axis for axis, _ in cells))
     grid = Atlas(axes, rows, cells)

@@ -41,7 +41,7 @@ KINDS = {
     "fig5": Kind(("completion",)),
     "fig7": Kind(("ablation",)),
     "gradients": Kind(("gradients",)),
-    "stability": Kind(("stability",), ("stress", "task"), ("stress",)),
+    "stability": Kind(("stability",), ("stress",), ("stress",)),
     "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split")),
 }
 MACHINE = ("cpu", "device", "threads")
@@ -261,4 +261,7 @@ def _index(record: dict[str, Any]) -> Any:
 
 
 def _shared(record: dict[str, Any], kind: Kind) -> dict[str, Any]:
-    return {key: value for key, value in record["config"].items() if key not in {*NOT_SHARED, *kind.varies}}
+    shared = {key: value for key, value in record["config"].items() if key not in {*NOT_SHARED, *kind.varies}}
+    if isinstance(shared.get("task"), dict):
+        shared["task"] = {key: value for key, value in shared["task"].items() if key not in kind.cell}
+    return shared

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from bench.report import format, style
 from bench.report.atlas import Atlas, Cell, atlas, title
 from bench.report.caption import counted_outcome, joined, omitted
-from bench.report.experiments import Experiment, identity, measured, setting
+from bench.report.experiments import Experiment, identity, measured, median_of_known, setting
+from bench.report.statistics import rank
 from bench.report.tables import Result
 
 CAPTION = (
@@ -20,7 +21,8 @@ CAPTION = (
     "not at the severest; behind either is how many trials failed there and Wilson's interval of their share. – is a "
     "renderer without that setting. Success: {hits:g} of the true hits within the pixel's footprint and false hits of "
     "at most {false_hits:g} of them; a gradient whose cosine is at least {cosine:g} and whose length is right within "
-    "{scale:g}; a fit within {surface_error:g} scene units of the surface. Every renderer has the same trials."
+    "{scale:g}; a fit within {surface_error:g} scene units of the surface. Renderings have {resolution}×{resolution} "
+    "pixels. The trial of a number at a severity is the same for every renderer."
 )
 WORST = 3
 
@@ -30,12 +32,13 @@ def make(experiment: Experiment) -> Result:
     grid = atlas(experiment)
     header = ["Axis", "Unit", *grid.rows]
     lines = [[title(axis), grid.unit(axis), *(_told(grid, axis, row) for row in grid.rows)] for axis in grid.axes]
-    trials, full = (sum(measured(cell.record, name) or 0 for cell in grid.cells.values()) for name in _COUNTS)
+    cells = [cell.record for cell in grid.cells.values()]
+    trials, full = (sum(measured(record, name) or 0 for record in cells) for name in ("trials", "grid_trials"))
     return Result(
         name="stability",
         title="Where each renderer breaks.",
         caption=joined(
-            CAPTION.format(trials=int(trials), share=100 * trials / max(full, 1), **_criteria(experiment)),
+            CAPTION.format(trials=int(trials), share=100 * trials / max(full, 1), **_asked(experiment)),
             counted_outcome(experiment),
             omitted(experiment),
         ),
@@ -44,10 +47,6 @@ def make(experiment: Experiment) -> Result:
         notes=[*(_worst(grid, row) for row in grid.rows), *_theory(grid)],
         figure=draw(grid),
     )
-
-
-_COUNTS = ("trials", "grid_trials")
-_WHOLE = ("axes", "at_once", "never")
 
 
 @style.styled
@@ -79,69 +78,69 @@ def draw(grid: Atlas) -> Figure:
 
 
 def cost(experiment: Experiment) -> Result:
-    """What robustness costs: how far each renderer gets, over the field values that it asks."""
+    """What robustness costs: how each renderer ranks over the axes, and the field values that it asks."""
     grid = atlas(experiment)
-    rows = [_cost(grid, row) for row in grid.rows]
-    header = ["Renderer", "Axes", "At once", "None", "Mean level", "Field values a ray"]
-    told = []
-    for r in rows:
-        told.append([r["row"], *(str(r[name]) for name in _WHOLE), format.number(r["level"]), format.number(r["cost"])])
+    shared = [axis for axis in grid.axes if grid.measure(axis) == "rendering" and _can_all(grid, axis)]
+    ranks = rank({row: {axis: _error(grid, axis, row) for axis in shared} for row in grid.rows})
+    rows = [{**_cost(grid, row, shared), "rank": ranks[row]} for row in grid.rows]
+    told = [
+        [r["row"], format.number(r["rank"]), str(r["at_once"]), str(r["never"]), format.number(r["cost"])] for r in rows
+    ]
     return Result(
         name="stability_cost",
         title="What robustness costs.",
         caption=joined(
-            "Over the axes that judge renderings and that all renderers have: on how many a renderer breaks at the "
-            "mildest severity, on how many not even at the severest; the mean level of its breakdown, 0 the mild end "
-            "of a sweep and 1 the severe one, where a run that did not end ok counts as 0; and the median over axes of "
-            "the field values a ray at the mild end.",
+            f"Over the {len(shared)} axes that judge renderings and that every renderer has settings for: the mean "
+            "rank of the breakdowns, 1 the best, where equal ones share their mean rank and a run that did not end ok, "
+            "or is missing, has the worst; on how many axes it breaks at the mildest severity, and on how many not "
+            "even at the severest; the median over axes of the field values a ray at the mild end.",
             counted_outcome(experiment),
             omitted(experiment),
         ),
         data=pd.DataFrame(rows, dtype=object),
-        table=pd.DataFrame(told, columns=header),
+        table=pd.DataFrame(told, columns=["Renderer", "Mean rank", "At once", "None", "Field values a ray"]),
         figure=draw_cost(rows),
     )
 
 
 @style.styled
 def draw_cost(rows: list[dict[str, Any]]) -> Figure:
-    """The mean level over the field values a ray."""
+    """The mean rank over the field values a ray."""
     figure = Figure(figsize=(style.WIDTH, 3.2), layout="constrained")
     axes = figure.subplots()
     for row in rows:
         look = style.look(row["row"])
-        axes.plot(row["cost"], row["level"], marker=look.marker, color=look.colour, ls="none", label=row["row"], ms=7)
+        axes.plot(row["cost"], row["rank"], marker=look.marker, color=look.colour, ls="none", label=row["row"], ms=7)
     style.log_axis(axes, "x", [row["cost"] for row in rows])
-    axes.set(xlabel="field values a ray at the mild end, median over axes", ylabel="mean level of the breakdown")
-    axes.set_ylim(0, 1)
+    axes.set(xlabel="field values a ray at the mild end, median over axes", ylabel="mean rank over axes (1 is best)")
+    axes.set_ylim(len(rows) + 0.5, 0.5)
     figure.legend(loc="outside right upper")
     return figure
 
 
-def _cost(grid: Atlas, row: str) -> dict[str, Any]:
-    shared = [axis for axis in grid.axes if grid.measure(axis) == "rendering" and _by_all(grid, axis)]
-    cells = [grid.cells[axis, row] for axis in shared]
-    costs = [cost for cell in cells if (cost := measured(cell.record, "evaluations_per_ray")) is not None]
-    return {
-        "row": row,
-        "axes": len(cells),
-        "at_once": sum(cell.at_once for cell in cells),
-        "never": sum(cell.never for cell in cells),
-        "level": float(np.mean([cell.shade if cell.known else 0.0 for cell in cells])) if cells else math.nan,
-        "cost": float(np.median(costs)) if costs else math.nan,
-    }
+def _cost(grid: Atlas, row: str, axes: list[str]) -> dict[str, Any]:
+    cells = [cell for axis in axes if (cell := grid.cells.get((axis, row))) is not None]
+    cost = median_of_known(measured(cell.record, "evaluations_per_ray") for cell in cells)
+    ends = {"at_once": sum(cell.at_once for cell in cells), "never": sum(cell.never for cell in cells)}
+    return {"row": row, "axes": len(cells), **ends, "cost": math.nan if cost is None else cost}
 
 
-def _by_all(grid: Atlas, axis: str) -> bool:
-    """Whether all renderers could sit the trials of an axis."""
-    cells = [grid.cells.get((axis, row)) for row in grid.rows]
-    return all(cell is not None and cell.record["status"] != "unsupported" for cell in cells)
+def _can_all(grid: Atlas, axis: str) -> bool:
+    """Whether no renderer lacks what an axis asks for."""
+    return not any(cell.unsupported for _, cell in grid.on(axis))
 
 
-def _criteria(experiment: Experiment) -> dict[str, float]:
-    """What counts as success, as the runs were asked."""
+def _error(grid: Atlas, axis: str, row: str) -> float | None:
+    """What is ranked: how early it breaks; None where the run did not end ok, or is missing."""
+    cell = grid.cells.get((axis, row))
+    return None if cell is None or not cell.known else 1.0 - cell.shade
+
+
+def _asked(experiment: Experiment) -> dict[str, Any]:
+    """What counts as success, and the pixels of a rendering, as the runs were asked."""
     names = ("hits", "false_hits", "cosine", "scale", "surface_error")
-    return {name: float(setting(experiment.asked(), "task", "criteria", name) or math.nan) for name in names}
+    criteria = {name: float(setting(experiment.asked(), "task", "criteria", name) or math.nan) for name in names}
+    return {**criteria, "resolution": setting(experiment.asked(), "task", "resolution")}
 
 
 def _told(grid: Atlas, axis: str, row: str) -> str:
@@ -155,15 +154,15 @@ def _shade(grid: Atlas, axis: str, row: str) -> float:
 
 
 def _worst(grid: Atlas, row: str) -> str:
-    """A row's mildest breakdowns, and how its trials failed."""
-    known = [(cell.level, axis, cell) for axis in grid.axes if (cell := grid.cells.get((axis, row))) and cell.known]
-    worst = sorted(known, key=lambda item: (item[0], item[1]))[:WORST]
-    told = [f"{title(axis)} {cell.told()} {grid.unit(axis)}" for _, axis, cell in worst]
+    """A row's mildest breakdowns, runs that did not end ok first, and how its trials failed."""
+    cells = [(axis, cell) for axis in grid.axes if (cell := grid.cells.get((axis, row))) and not cell.unsupported]
+    worst = sorted(cells, key=lambda item: (item[1].level if item[1].known else -math.inf, item[0]))[:WORST]
+    told = [f"{title(axis)} {cell.told()}{' ' + grid.unit(axis) if cell.known else ''}" for axis, cell in worst]
     kinds: Counter[str] = Counter()
     for cell in grid.of(row):
         kinds.update(cell.failures())
     failed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-    return f"{row}: worst on {'; '.join(told)}. Failed trials: {failed or 'none'}."
+    return f"{row}: worst on {'; '.join(told) or 'no axis'}. Failed trials: {failed or 'none'}."
 
 
 def _theory(grid: Atlas) -> list[str]:

@@ -17,14 +17,13 @@ from bench.report.statistics import wilson
 from bench.report.tables import Result
 
 COLUMNS = 4
-WIDTHS = (0.003, 0.01, 0.03, 0.08, 0.2)  # of logistic curves, in levels: those that the search has
-LAPSE = 0.02
+LAPSE = 0.02  # that the search allows for: a trial that fails, or succeeds, whatever its level
 CAPTION = (
-    "The chance of success over the severity, mild to severe from left to right: the logistic curve through each "
-    "renderer's breakdown whose width makes its trials likeliest. Dots are shares of the trials at a severity, one to "
-    "ten; the CSV has them with Wilson's intervals. Bars about the middle are the 95 % intervals of the breakdowns. A "
-    "dashed line is the severity at which theory has the renderer of its colour break, a dotted one that of a second "
-    "formula, as published: DIST, Eqs. 8 and 10."
+    "The chance of success over the severity, mild to severe from left to right: the logistic curve of the most "
+    "probable breakdown and width. Dots are shares of the trials at a severity; the CSV has their number and Wilson's "
+    "intervals. Bars about the middle are the 95 % intervals of the breakdowns. Renderers stand a little above one "
+    "another, so that none hides another. A dashed line is the severity at which theory has the renderer of its colour "
+    "break, a dotted one that of a second formula, as published: DIST, Eqs. 8 and 10."
 )
 
 
@@ -69,7 +68,7 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
         panel.plot(table["severity"], 100 * table["share"] + beside, look.marker, color=look.colour, ms=1.5, alpha=0.5)
         levels = np.linspace(0, 1, 200)
         along = [cell.severity(level) for level in levels]
-        panel.plot(along, 100 * _chance(levels, cell, table) + beside, color=look.colour, lw=1, ls=look.line, label=row)
+        panel.plot(along, 100 * _chance(levels, cell) + beside, color=look.colour, lw=1, ls=look.line, label=row)
         ends = [measured(cell.record, f"level_{end}") for end in ("low", "high")]
         if None not in ends:
             low, high = (cell.severity(min(max(end, 0.0), 1.0)) for end in ends)
@@ -97,21 +96,15 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
     panel.minorticks_off()
 
 
-def _chance(levels: np.ndarray, cell: Cell, table: pd.DataFrame) -> np.ndarray:
-    """The logistic curve through the breakdown, of the width under which the trials are likeliest."""
-    at = table["level"].to_numpy(dtype=float)
-    successes, n = (table[name].to_numpy(dtype=float) for name in ("successes", "trials"))
-
-    def curve(x: np.ndarray, width: float) -> np.ndarray:
-        return LAPSE + (1 - 2 * LAPSE) / (1 + np.exp(np.clip((x - (cell.level or 0.0)) / width, -50, 50)))
-
-    likelihoods = [successes @ np.log(curve(at, w)) + (n - successes) @ np.log(1 - curve(at, w)) for w in WIDTHS]
-    return curve(levels, WIDTHS[int(np.argmax(likelihoods))])
+def _chance(levels: np.ndarray, cell: Cell) -> np.ndarray:
+    """The logistic curve through the breakdown, as the search has it."""
+    apart = (levels - (cell.level or 0.0)) / (measured(cell.record, "width") or 0.01)
+    return LAPSE + (1 - 2 * LAPSE) / (1 + np.exp(np.clip(apart, -50, 50)))
 
 
 def _shares(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:
     """Successes, trials, their share and its interval for each level that was tried, mild to severe."""
-    counts: dict[int, list[Any]] = {}
+    counts: dict[float, list[Any]] = {}
     try:
         text = (experiment.folder(record) / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -119,21 +112,14 @@ def _shares(experiment: Experiment, record: dict[str, Any]) -> pd.DataFrame:
     for line in text.splitlines():
         try:
             trial = json.loads(line)
-            own = counts.setdefault(int(trial["level"]), [float(trial["severity"]), 0, 0])
+            own = counts.setdefault(float(trial["level"]), [float(trial["severity"]), 0, 0])
         except (ValueError, KeyError, TypeError):
             continue
         own[1] += bool(trial.get("success"))
         own[2] += 1
-    last = _last_level(record)
     rows = []
     for level, (severity, successes, n) in sorted(counts.items()):
         if math.isfinite(severity):
             rate = wilson(successes, n)
-            rows.append([level / last, severity, successes, n, rate.value, rate.low, rate.high])
+            rows.append([level, severity, successes, n, rate.value, rate.low, rate.high])
     return pd.DataFrame(rows, columns=["level", "severity", "successes", "trials", "share", "low", "high"])
-
-
-def _last_level(record: dict[str, Any]) -> int:
-    """The number of the severe end's level."""
-    name = "fit_search" if setting(record["config"], "task", "stress", "measure") == "fit" else "search"
-    return max(int(setting(record["config"], "task", name, "levels") or 2) - 1, 1)

@@ -2,6 +2,7 @@
 
 import textwrap
 import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,9 @@ KINDS = {  # in the order of the numbers that a run's images.npz has
     "wrong surface": "#f2a600",
 }
 CAPTION = (
-    "For each axis, the mildest failure among all renderers' (the first of its search): left what is wrong with each "
-    "pixel, right the true distance (light is near). Each run's folder has the same of its own, as failure.png."
+    "For each axis that judges renderings, the failure at the mildest severity among the first failures of all "
+    "renderers: left what is wrong with each pixel, right the true distance (light is near). Each run's folder has the "
+    "same of its own, as failure.png."
 )
 Images = dict[str, np.ndarray]
 
@@ -70,19 +72,17 @@ def draw(grid: Atlas, found: dict[str, tuple[str, Cell, Images]]) -> Figure:
 
 
 def _first(experiment: Experiment, grid: Atlas, axis: str) -> tuple[str, Cell, Images] | None:
-    """The renderer with the mildest breakdown on an axis that has a picture of it, its cell and that picture."""
-    cells = [(cell.level, row, cell) for row, cell in grid.on(axis) if cell.known]
-    for _, row, cell in sorted(cells, key=lambda item: (item[0], item[1])):
-        if (images := _images(experiment, cell.record)) is not None:
-            return row, cell, images
-    return None
+    """The renderer that failed at the mildest severity of an axis, its cell and the picture of it."""
+    pairs = [(row, cell, _images(experiment, cell.record)) for row, cell in grid.on(axis) if cell.known]
+    shown = [(row, cell, images) for row, cell, images in pairs if images is not None]
+    return min(shown, key=lambda found: found[1].place(float(found[2]["severity"])), default=None)
 
 
 def _images(experiment: Experiment, record: dict[str, Any]) -> Images | None:
     try:
         with np.load(experiment.folder(record) / "images.npz") as file:
             images = {name: file[name] for name in ("kinds", "true_distance", "severity")}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         return None
     return images if images["kinds"].shape == images["true_distance"].shape and images["kinds"].ndim == 2 else None
 

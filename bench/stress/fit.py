@@ -3,6 +3,7 @@
 Its four numbers, the middle and the logarithm of the radius, are free. What is given is then made worse, or the start.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -13,16 +14,15 @@ from torch import Tensor
 
 from bench.limits import Limits
 from bench.optimise import Course, optimise
-from bench.poses import of_moved_object
 from bench.records import RunStatus
-from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.conditions import Conditions, FitSettings
+from bench.stress.outcome import Failure, Outcome
 from bench.tasks.completion import GivenView
 from bench.tasks.problem import OptimiserSettings, Unsupported
 from datasets.scene import View
 from datasets.stress.solids import Solid, ball
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer
 
@@ -32,30 +32,6 @@ DEFINITIONS = {
     "surface_error": "mean magnitude of the fitted ball's distance at points of the true surface, in scene units",
     "evaluations_per_ray": "field values computed, over rays times iterations",
 }
-
-
-@dataclass(frozen=True)
-class FitSettings:
-    """The fit whose end is judged.
-
-    Args:
-        resolution: pixels a side.
-        iterations, learning_rate: of Adam; the rate falls to zero along half a cosine.
-        depth_weight, silhouette_weight: as in completion.
-        offset: of the ball's middle at the start, in scene units.
-    """
-
-    resolution: int
-    iterations: int
-    learning_rate: float
-    depth_weight: float
-    silhouette_weight: float
-    offset: float
-
-    def __post_init__(self) -> None:
-        check_at_least("task.fit.resolution", self.resolution, 4, "32 suits a ball")
-        check_positive("task.fit.offset", self.offset, "0.1 is easily found back")
-        OptimiserSettings(self.iterations, self.learning_rate, "cosine")
 
 
 @dataclass(frozen=True)
@@ -71,14 +47,12 @@ class Observation:
 Disturb = Callable[[Observation, float, np.random.Generator], Observation]
 
 
-def judge_fit(
-    trial: "FitTrial", renderer: Renderer, criteria: Criteria, *, limits: Limits, device: torch.device
-) -> Outcome:
+def judge_fit(trial: "FitTrial", renderer: Renderer, conditions: Conditions) -> Outcome:
     """Fits the ball that a trial draws, under its disturbance.
 
     Raises:
         Unsupported: where the renderer has no gradient towards the field.
-        LimitReached: where a step takes more than it may.
+        LimitReached: where it takes more than it may.
     """
     if not renderer.capabilities.field_gradient:
         raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
@@ -86,15 +60,17 @@ def judge_fit(
     true, start = _balls(draw, fit.offset)
     given = trial.disturbed(_observe(_ball(true), fit.resolution, draw))
     view = View(given.camera, given.depth, torch.zeros(*given.depth.shape, 3), given.mask)
-    compared = GivenView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=device)
-    problem = BallProblem(start.to(device).requires_grad_(), compared, limits)
-    torch.manual_seed(int(draw.integers(2**31)))  # of losses that draw points
+    compared = GivenView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=conditions.device)
+    problem = BallProblem(start.to(conditions.device).requires_grad_(), compared, conditions.limits)
     course = Course()
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
-    optimise(problem, settings, device, course=course, on_step=lambda line: None)
-    error = float(problem.field()(_surface(true, draw).to(device)).abs().mean())
+    optimise(problem, settings, conditions.device, course=course, on_step=lambda line: None)
+    error = float(problem.field()(_surface(true, draw).to(conditions.device)).abs().mean())
     spent = course.counts.value / problem.rays_per_iteration / max(len(course.curve), 1)
-    return Outcome(_failure(course, error, criteria), {"surface_error": error, "evaluations_per_ray": spent})
+    return Outcome(
+        _failure(course, error, conditions.criteria.surface_error),
+        {"surface_error": error, "evaluations_per_ray": spent},
+    )
 
 
 @dataclass(frozen=True)
@@ -126,6 +102,7 @@ class BallProblem:
     given: GivenView
     limits: Limits
     counts: Counts = field(default_factory=Counts)
+    started: float = field(default_factory=time.perf_counter)
     photographs: None = None
 
     @property
@@ -146,6 +123,7 @@ class BallProblem:
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The terms and their sum."""
         shape = self.limits.watch(_ball(self.free).field, self.free.device)
+        shape.started = self.started  # the limit is on the whole fit
         terms = self.given.compare(Meter(shape, self.counts), iteration)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
@@ -189,10 +167,10 @@ def wrong_focal_length(given: Observation, severity: float, draw: np.random.Gene
 
 
 def wrong_pose(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
-    """The camera is thought to be turned about the object by an angle, in degrees."""
+    """The camera is thought to be turned about its own centre by an angle, in degrees."""
     axis = draw.normal(size=3)
     turn = torch.from_numpy(np.radians(severity) * axis / np.linalg.norm(axis)).float()
-    return replace(given, camera=of_moved_object(given.camera, torch.cat([torch.zeros(3), turn])))
+    return replace(given, camera=given.camera.moved(torch.cat([torch.zeros(3), turn])))
 
 
 DISTURBANCES: dict[str, Disturb] = {
@@ -247,9 +225,9 @@ def _drawn(given: Observation, share: float, draw: np.random.Generator) -> Bool[
     return torch.from_numpy(draw.uniform(size=given.depth.shape) < share)
 
 
-def _failure(course: Course, error: float, criteria: Criteria) -> Failure:
+def _failure(course: Course, error: float, largest: float) -> Failure:
     if course.status is RunStatus.NAN or error != error:
         return Failure.NAN
     if course.status is RunStatus.DIVERGED:
         return Failure.DIVERGED
-    return Failure.NONE if error <= criteria.surface_error else Failure.NOT_REACHED
+    return Failure.NONE if error <= largest else Failure.NOT_REACHED

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.limits import Limits
-from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.conditions import Conditions, Criteria
+from bench.stress.outcome import Failure, Outcome
 from bench.tasks.problem import Unsupported
 from datasets.stress import Exam
 from renderers.rendering import Renderer
@@ -20,9 +20,7 @@ DEFINITIONS = {
 }
 
 
-def judge_gradient(
-    exam: Exam, renderer: Renderer, criteria: Criteria, *, limits: Limits, device: torch.device
-) -> Outcome:
+def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Outcome:
     """Renders an exam with gradient, and compares that with the truth's.
 
     Raises:
@@ -33,13 +31,15 @@ def judge_gradient(
         raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
     if exam.solid is None or exam.parameters is None:
         raise ValueError("task.stress.scene has no parameters: choose grazing_plane for measure=gradient")
+    device = conditions.device
     free = exam.parameters.float().to(device).requires_grad_()
-    found = renderer.render(limits.watch(exam.solid(free).field, device), exam.camera.rays().to(device))
+    watched = conditions.limits.watch(exam.solid(free).field, device)
+    found = renderer.render(watched, exam.camera.rays().to(device))
     exact = exam.parameters.double().requires_grad_()
     first = exam.solid(exact).trace(exam.camera.double().rays().flat())
     compared = first.hit & found.hit.flatten().cpu()
     share = float(compared.sum() / first.hit.sum().clamp_min(1))
-    if share < 0.5 or not found.distance.requires_grad:
+    if share < conditions.criteria.hits or not found.distance.requires_grad:
         return Outcome(Failure.LOST, {"found": share})
     signs = torch.randn(SUMS, int(compared.sum()), generator=torch.Generator().manual_seed(SEED), dtype=torch.float64)
     mine = _gradients(found.distance.flatten()[compared.to(device)].double(), free, signs.to(device)).cpu()
@@ -47,7 +47,7 @@ def judge_gradient(
     cosine = float((mine * true).sum() / (mine.norm() * true.norm()).clamp_min(torch.finfo(mine.dtype).tiny))
     scale = float((mine * true).sum() / true.square().sum())
     numbers = {"gradient_cosine": cosine, "gradient_scale": scale, "found": share}
-    return Outcome(_failure(cosine, scale, criteria), numbers)
+    return Outcome(_failure(cosine, scale, conditions.criteria), numbers)
 
 
 def _gradients(
@@ -61,7 +61,7 @@ def _gradients(
 def _failure(cosine: float, scale: float, criteria: Criteria) -> Failure:
     if cosine != cosine:
         return Failure.NAN
-    if cosine <= 0:
+    if cosine < 0:
         return Failure.SIGN
     if cosine < criteria.cosine:
         return Failure.DIRECTION

@@ -1,38 +1,23 @@
 """The mildest failure of a search as a picture, and as arrays for the report."""
 
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from bench.pictures import BOTH, FALSE, LOST, PAPER, STYLE
-from bench.stress.outcome import Outcome
+from bench.pictures import BOTH, FALSE, LOST, PAPER, STYLE, bare
+from bench.stress.outcome import Trial
 
 WRONG = (0.95, 0.65, 0.0)
 KINDS = {"background": PAPER, "hit": BOTH, "lost": LOST, "false": FALSE, "wrong surface": WRONG}
 
 
-@runtime_checkable
-class Failed(Protocol):
-    """A trial that failed."""
-
-    @property
-    def severity(self) -> float: ...
-
-    @property
-    def outcome(self) -> Outcome: ...
-
-
-def draw_failure(folder: Path, trial: Failed, *, title: str, unit: str) -> None:
-    """Writes images.npz and failure.png: distances found and true, and what is wrong with each pixel; of renderings."""
+def draw_failure(folder: Path, trial: Trial, *, title: str, unit: str) -> None:
+    """Writes images.npz and failure.png: distances found and true, and what is wrong with each pixel."""
     images = trial.outcome.images
-    if not images:
-        return
     np.savez_compressed(folder / "images.npz", severity=trial.severity, **images)  # type: ignore[arg-type]
     matplotlib.use("Agg")
     with matplotlib.rc_context(STYLE):
@@ -44,18 +29,14 @@ def draw_failure(folder: Path, trial: Failed, *, title: str, unit: str) -> None:
         for axis, name, heading in ((found, "distance", "found"), (true, "true_distance", "truth")):
             shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
             axis.set_title(f"distance along the ray, {heading}")
-            _bare(axis)
+            bare(axis)
         figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
         kinds.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
         kinds.set_title("what is wrong")
-        _bare(kinds)
+        bare(kinds)
         there = [name for number, name in enumerate(KINDS) if (images["kinds"] == number).any()]
         patches = [Patch(facecolor=KINDS[name], edgecolor="#888888", label=name) for name in there]
         kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
         failure = trial.outcome.failure
         figure.suptitle(f"{title}: first failure ({failure}) at {trial.severity:.3g} {unit}")
         figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
-
-
-def _bare(axis: Axes) -> None:
-    axis.set(xticks=[], yticks=[])

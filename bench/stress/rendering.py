@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.limits import Limits
-from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.conditions import Conditions, Criteria
+from bench.stress.outcome import Failure, Outcome
 from datasets.stress import Exam, FirstHit
 from datasets.stress.solids import incidence_cosines
 from renderers.camera import Rays
@@ -23,9 +23,7 @@ DEFINITIONS = {
 
 
 @torch.no_grad()
-def judge_rendering(
-    exam: Exam, renderer: Renderer, criteria: Criteria, *, limits: Limits, device: torch.device
-) -> Outcome:
+def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> Outcome:
     """Renders an exam, and compares each ray with the truth in float64.
 
     Raises:
@@ -33,8 +31,8 @@ def judge_rendering(
     """
     camera = exam.camera
     true, footprint = truth(exam)
-    meter = Meter(limits.watch(exam.field, device))
-    rendering = renderer.render(meter, camera.rays().to(device))
+    meter = Meter(conditions.limits.watch(exam.field, conditions.device))
+    rendering = renderer.render(meter, camera.rays().to(conditions.device))
     hit = rendering.hit.flatten().cpu()
     distance = rendering.distance.flatten().cpu().double()
     finite = distance.isfinite()
@@ -55,7 +53,7 @@ def judge_rendering(
         "distance": torch.where(hit, distance, torch.nan).view(shape).float().numpy(),
         "true_distance": torch.where(true.hit, true.distance, torch.nan).view(shape).float().numpy(),
     }
-    return Outcome(_failure(numbers, hit.numel(), criteria), numbers, images)
+    return Outcome(_failure(numbers, hit.numel(), conditions.criteria), numbers, images)
 
 
 def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, "n"]]:

@@ -8,11 +8,12 @@ from zlib import crc32
 import numpy as np
 import torch
 
-from bench.limits import LimitReached, Limits
+from bench.limits import LimitReached
 from bench.records import RunStatus
-from bench.stress.fit import FITS, FitSettings, FitTrial, judge_fit
+from bench.stress.conditions import Conditions
+from bench.stress.fit import FITS, FitTrial, judge_fit
 from bench.stress.gradient import judge_gradient
-from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.outcome import Failure, Outcome
 from bench.stress.rendering import judge_rendering
 from bench.stress.theory import THEORIES, Prediction
 from bench.tasks.problem import Unsupported
@@ -50,17 +51,6 @@ class Sweep:
         if self.log:
             return exp(log(self.mild) + level * (log(self.severe) - log(self.mild)))
         return self.mild + level * (self.severe - self.mild)
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """Under what all trials are made: pixels a side of a rendering, the fit, what is a success, limits, the device."""
-
-    resolution: int
-    fit: FitSettings
-    criteria: Criteria
-    limits: Limits
-    device: torch.device
 
 
 @dataclass(frozen=True)
@@ -109,25 +99,30 @@ class Stress:
         return replace(renderer, **{self.setting: value})  # type: ignore[type-var]
 
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:
-        """The trial of that number at a level; every renderer has the same one.
+        """The trial of that number at a level; every renderer has the same one. Whatever it raises is its failure.
 
         Raises:
             Unsupported: where the renderer cannot do what is judged, or has no such setting.
         """
-        severity = self.sweep.severity(level)
-        stressed = self.stressed(renderer, severity)
-        draw = np.random.default_rng(crc32(f"{self.scene} {level:.6f} {repeat}".encode()))
-        common: dict[str, Any] = {"limits": conditions.limits, "device": conditions.device}
+        seed = crc32(f"{self.scene} {level:.6f} {repeat}".encode())
+        torch.manual_seed(seed)  # of renderers and losses that draw
         try:
-            if self.measure == "fit":
-                return judge_fit(
-                    FitTrial(self.scene, conditions.fit, severity, draw), stressed, conditions.criteria, **common
-                )
-            exam = SCENES[self.scene](severity, draw, conditions.resolution)
-            judge = judge_rendering if self.measure == "rendering" else judge_gradient
-            return judge(exam, stressed, conditions.criteria, **common)
+            return self._judge(renderer, self.sweep.severity(level), np.random.default_rng(seed), conditions)
+        except Unsupported:
+            raise
         except LimitReached as limit:
-            return Outcome(Failure.TIMEOUT if limit.status is RunStatus.TIMEOUT else Failure.OOM)
+            return Outcome(Failure.TIMEOUT if limit.status is RunStatus.TIMEOUT else Failure.OOM, message=str(limit))
+        except (MemoryError, torch.OutOfMemoryError) as error:
+            return Outcome(Failure.OOM, message=" ".join(str(error).split()))
+        except Exception as error:  # noqa: BLE001 - a trial that fails is data, and the search goes on
+            return Outcome(Failure.CRASHED, message=" ".join(f"{type(error).__name__}: {error}".split()))
+
+    def _judge(self, renderer: Renderer, severity: float, draw: np.random.Generator, conditions: Conditions) -> Outcome:
+        stressed = self.stressed(renderer, severity)
+        if self.measure == "fit":
+            return judge_fit(FitTrial(self.scene, conditions.fit, severity, draw), stressed, conditions)
+        exam = SCENES[self.scene](severity, draw, conditions.resolution)
+        return (judge_rendering if self.measure == "rendering" else judge_gradient)(exam, stressed, conditions)
 
     def predicted(self, renderer: Renderer, conditions: Conditions) -> list[Prediction]:
         """Where theory has the renderer fail; empty where there is none."""

@@ -6,16 +6,16 @@ A renderer that lacks the settings that a formula is made of has no prediction.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
-from math import asin, degrees, log, radians, sin, sqrt, tan
+from math import asin, degrees, log, radians, sqrt, tan
 from typing import Any
 
-from bench.stress.outcome import Criteria
+from bench.stress.conditions import Criteria
 from datasets.stress import scenes
 from renderers.field import STEEPEST_MARGIN
 
 FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
-# Of the cosines of incidence on the cube's sides 1 % are below the first, and 1 % above the second.
-FLATTEST, STEEPEST = 0.29, 0.64
+# Cosine of incidence on the cube's sides below which 1 % of the hits are.
+FLATTEST = 0.29
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ THEORIES: dict[str, Theory] = {}
 def needs(*settings: str) -> Callable[[Theory], Theory]:
     """Makes a function a theory of renderers that have these settings; of others it predicts nothing.
 
-    Nor does it where its formula has no answer, such as a sine above 1.
+    Nor does it where its formula has no answer, such as a sine above 1, or where a setting is not a number.
     """
 
     def known(theory: Theory) -> Theory:
@@ -43,7 +43,7 @@ def needs(*settings: str) -> Callable[[Theory], Theory]:
                 return []
             try:
                 return theory(renderer, resolution, criteria)
-            except (ValueError, ZeroDivisionError, OverflowError):
+            except (ValueError, ZeroDivisionError, OverflowError, TypeError, AttributeError):
                 return []
 
         THEORIES[theory.__name__] = predict
@@ -57,7 +57,8 @@ def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Predi
     """What the first long step overshoots; or DVR's spacing (Eq. 9) on the longest ray."""
     if hasattr(renderer, "refinement"):
         return [Prediction(2 * FRONT / (renderer.samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
-    extra = _alpha(renderer) - 1
+    bounded = getattr(renderer, "slope_samples", 0)
+    extra = getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0) - 1
     reach = min(FRONT, getattr(renderer, "step_clamp", None) or FRONT)
     overshoot = min(extra * reach, getattr(renderer, "extra_step_cap", None) or extra * reach)
     if getattr(renderer, "step_back", False) or overshoot <= 0:
@@ -68,15 +69,11 @@ def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Predi
 @needs("steps", "epsilon")
 def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """The angle at which the steps of Eq. 8 are all that there are."""
-    alpha, steps = _alpha(renderer), renderer.steps
-    published = degrees(asin((1 - (renderer.epsilon / FRONT) ** (1 / steps)) / alpha))
-    angle = published
-    for _ in range(50):  # the field there is not d but d sin(theta)
-        shrunk = min(renderer.epsilon / FRONT / sin(radians(angle)), 1.0)
-        angle = degrees(asin(min((1 - shrunk ** (1 / steps)) / alpha, 1.0)))
+    sine = _least(lambda sine: _queries(renderer, sine) <= renderer.steps)
+    published = (1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)) / _alpha(renderer)
     return [
-        Prediction(angle, "as many steps as Eq. 8 asks for, with the field's value d sin(theta) for d"),
-        Prediction(published, "as many steps as DIST, Eq. 8, asks for"),
+        Prediction(degrees(asin(sine)), "as many queries as Eq. 8 asks for, of a field d sin(theta)"),
+        Prediction(degrees(asin(published)), "as many steps as DIST, Eq. 8, asks for"),
     ]
 
 
@@ -111,43 +108,36 @@ def within_epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[P
     return [Prediction(renderer.epsilon, "epsilon")]
 
 
+@needs("epsilon", "steps")
+def sheet(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
+    """What comes nearer than epsilon counts as a surface, unless a step jumps over it."""
+    return [Prediction(renderer.epsilon, "epsilon")] if _alpha(renderer) == 1 else []
+
+
 @needs("steps", "epsilon")
 def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The way to the cube in steps of the truncated value, and what Eq. 8 asks for behind them."""
-    alpha, way = _alpha(renderer), FRONT
-    left = renderer.steps
-    for _ in range(20):  # what is truncated further away, Eq. 8 takes over
-        cut = way / alpha / left
-        left = max(renderer.steps - log(renderer.epsilon / cut) / log(abs(1 - alpha * FLATTEST)), 1.0)
-    return [Prediction(way / alpha / left, "way over alpha k, less the steps of DIST, Eq. 8, from there on")]
+    """The way to the cube in steps of the truncated value, and the queries of Eq. 8 from there on."""
+    cut = _least(lambda value: FRONT / _alpha(renderer) / value + _queries(renderer, FLATTEST, value) <= renderer.steps)
+    return [Prediction(cut, "way over alpha k, and the queries of DIST, Eq. 8, from there on")]
 
 
 @needs("steps", "epsilon")
 def few_steps(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Eq. 8 at the cube's sides."""
-    needed = log(renderer.epsilon / FRONT) / log(abs(1 - _alpha(renderer) * FLATTEST))
-    return [Prediction(needed, "DIST, Eq. 8, at the cube's sides")]
+    """Eq. 8 at the cube's flattest side."""
+    return [Prediction(_queries(renderer, FLATTEST), "the queries of DIST, Eq. 8, at the cube's flattest side")]
 
 
 @needs("steps", "epsilon")
 def weak_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Eq. 8 at the cube's sides, with steps shortened by the factor."""
-    shrunk = 1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)
-    return [
-        Prediction(shrunk / _alpha(renderer) / FLATTEST, "as many steps as DIST, Eq. 8, asks for at the cube's sides")
-    ]
-
-
-@needs("steps")
-def strong_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Steps do not converge where alpha times factor times cos(theta) exceeds 2."""
-    return [Prediction(2 / _alpha(renderer) / STEEPEST, "alpha times factor times cos(theta) is 2: no convergence")]
+    """Eq. 8 at the cube's flattest side, with values and steps shortened by the factor."""
+    factor = _least(lambda factor: _queries(renderer, factor * FLATTEST) <= renderer.steps)
+    return [Prediction(factor, "as many queries as DIST, Eq. 8, asks for at the cube's flattest side")]
 
 
 @needs("epsilon")
 def float_spacing(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Where neighbouring float32 numbers of the camera's distance lie further apart than epsilon."""
-    return [Prediction(renderer.epsilon * 2**24, "float32's spacing is epsilon")]
+    """Where neighbouring float32 numbers of the camera's distance lie one to two epsilon apart."""
+    return [Prediction(renderer.epsilon * 2**24, "float32's numbers there lie one to two epsilon apart")]
 
 
 @needs("steps")
@@ -158,6 +148,26 @@ def gap(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
 
 
 def _alpha(renderer: Any) -> float:
-    """The factor of a step, with what a slope bound, found on a true distance, takes off it."""
-    bounded = getattr(renderer, "slope_samples", 0)
-    return getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0)
+    """The factor of a step.
+
+    Raises:
+        ValueError: where a guard makes steps that no formula here knows.
+    """
+    if getattr(renderer, "slope_samples", 0) or getattr(renderer, "least_step", 0) or getattr(renderer, "step_back", 0):
+        raise ValueError("a guarded march has other steps")
+    return getattr(renderer, "alpha", 1.0)
+
+
+def _queries(renderer: Any, slope: float, distance: float = FRONT) -> float:
+    """Queries until a field of this slope along the ray is below epsilon, from a distance (DIST, Eqs. 7 and 8)."""
+    value, shrinks = slope * distance, abs(1 - _alpha(renderer) * slope)
+    return 1 + max(log(renderer.epsilon / value) / log(shrinks), 0.0)
+
+
+def _least(enough: Callable[[float], bool]) -> float:
+    """The least number from which on all are enough, up to 0.6: beyond, an alpha of 1.5 bounces and needs more."""
+    low, high = 1e-6, 0.6
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high

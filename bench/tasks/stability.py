@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,17 +11,20 @@ from bench.limits import Limits
 from bench.records import RunStatus, plain
 from bench.stage import Cell
 from bench.stress import fit, gradient, rendering
-from bench.stress.fit import FitSettings
-from bench.stress.outcome import Criteria, Failure, Outcome
+from bench.stress.conditions import Conditions, Criteria, FitSettings
+from bench.stress.outcome import Failure, Trial
 from bench.stress.picture import draw_failure
-from bench.stress.stress import Conditions, Stress
+from bench.stress.stress import Stress
+from bench.tasks.problem import Unsupported
 from renderers.checks import check_at_least
+from renderers.rendering import Renderer
 
 DEFINITIONS = {
     "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of what "
     "the trials leave possible, for a logistic curve with a lapse of 2 %; none where it is not in the sweep",
     "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is not in the sweep",
     "level, level_low, level_high": "the same from 0, the mild end of the sweep, to 1, the severe one, and beyond",
+    "width": "of the logistic curve, in levels; the most probable of five",
     "trials": "renderings, gradients or fits that were judged",
     "grid_trials": "what a full grid of task.search.levels and repeats would take",
     "mild_successes, mild_trials, severe_successes, severe_trials": "at the two ends of the sweep",
@@ -37,15 +40,6 @@ MEASURED = {
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One trial of a search: where it was made, and what it came to."""
-
-    level: int
-    severity: float
-    outcome: Outcome
-
-
-@dataclass(frozen=True)
 class Stability:
     """Finds the breakdown of a renderer under one stress, by an adaptive search.
 
@@ -56,7 +50,7 @@ class Stability:
         criteria: what counts as success.
         fit: the fit of measure=fit.
         resolution: pixels a side of a rendering.
-        limits: on each trial.
+        limits: on each trial; for a fit on all its steps together.
     """
 
     stress: Stress | None
@@ -78,14 +72,14 @@ class Stability:
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, cell.stage.device)
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
-        self.stress.stressed(renderer, self.stress.sweep.mild)  # unsupported before the first trial
+        self._check(renderer)
         search, trials = Search(self._settings), _Trials()
         with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
-            while (level := search.next()) is not None:
-                at = float(search.levels[level])
-                outcome = self.stress.trial(renderer, at, search.counts(level)[1], conditions)
-                search.note(level, outcome.success)
-                trials.note(Trial(level, self.stress.sweep.severity(at), outcome))
+            while (index := search.next()) is not None:
+                level = float(search.levels[index])
+                outcome = self.stress.trial(renderer, level, search.counts(index)[1], conditions)
+                search.note(index, outcome.success)
+                trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
                 curve.write(json.dumps(plain(trials.line()), allow_nan=False) + "\n")
                 cell.progress("searching", len(trials.all), self._settings.most, None)
         record.metrics = self._metrics(search, trials)
@@ -97,6 +91,13 @@ class Stability:
         record.status, record.reason = RunStatus.OK, ""
         if trials.first_failure is not None:
             draw_failure(cell.folder, trials.first_failure, title=f"{record.name}, {record.scene}", unit=self._unit)
+
+    def _check(self, renderer: Renderer) -> None:
+        """Raises Unsupported, before the first trial, where the renderer cannot be given the mild end's setting."""
+        try:
+            self.stress.stressed(renderer, self.stress.sweep.mild)
+        except (ValueError, TypeError) as error:
+            raise Unsupported(f"{type(renderer).__name__} refuses {self.stress.setting}: {error}") from None
 
     @property
     def _settings(self) -> SearchSettings:
@@ -115,6 +116,7 @@ class Stability:
         return {
             **{f"breakdown{end}": severity for end, severity in within.items()},
             **{f"level{end}": level for end, level in levels.items()},
+            "width": found.width,
             "trials": len(trials.all),
             "grid_trials": self._settings.grid,
             "mild_successes": mild,
@@ -128,22 +130,24 @@ class Stability:
 
 @dataclass
 class _Trials:
-    """All trials of a search, and the mildest that failed."""
+    """All trials of a search, and the mildest that failed and has images."""
 
     all: list[Trial] = field(default_factory=list)
     first_failure: Trial | None = None
 
     def note(self, trial: Trial) -> None:
         """Keeps a trial, without its images but for the mildest failure's."""
-        if not trial.outcome.success and (self.first_failure is None or trial.level < self.first_failure.level):
+        shown = bool(trial.outcome.images) and not trial.outcome.success
+        if shown and (self.first_failure is None or trial.level < self.first_failure.level):
             self.first_failure = trial
-        self.all.append(Trial(trial.level, trial.severity, Outcome(trial.outcome.failure, trial.outcome.numbers)))
+        self.all.append(replace(trial, outcome=replace(trial.outcome, images={})))
 
     def line(self) -> dict[str, object]:
         """The last trial as a line of the curve."""
         last = self.all[-1]
         told = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
-        return {"trial": len(self.all) - 1, **told, "failure": str(last.outcome.failure), **last.outcome.numbers}
+        failed = {"failure": str(last.outcome.failure), "message": last.outcome.message}
+        return {"trial": len(self.all) - 1, **told, **failed, **last.outcome.numbers}
 
     def spent(self) -> float | None:
         """Field values a ray at the mild end, the median."""

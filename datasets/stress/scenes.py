@@ -97,9 +97,16 @@ def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     return Exam(wavy, camera, Judged(wavy, lipschitz=slope, thinnest=min(0.01, 0.2 / severity)))
 
 
-def tiny_object(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube of half a side length somewhere in the picture, whose pixels are 0.036 wide at 64 pixels a side."""
-    return _seen(box((severity,) * 3).moved(tuple(draw.uniform(-0.3, 0.3, 3))), draw, resolution, **CORNER)
+def tiny_objects(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """49 cubes of half a side length, 0.16 apart; pixels are 0.036 wide at 64 pixels a side."""
+    row = box((severity,) * 3).moved((-0.48, 0.0, 0.0))
+    for place in range(1, 7):
+        row |= box((severity,) * 3).moved((0.16 * place - 0.48, 0.0, 0.0))
+    sheet = row.moved((0.0, -0.48, 0.0))
+    for place in range(1, 7):
+        sheet |= row.moved((0.0, 0.16 * place - 0.48, 0.0))
+    placed = sheet.turned(_about_z(draw.uniform(-45, 45))).moved(tuple(draw.uniform(-0.02, 0.02, 3)))
+    return _seen(placed, draw, resolution, azimuth=(-20, 20), elevation=(-20, 20))
 
 
 def gap(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -181,9 +188,10 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
 
 
 def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube behind a ball of a radius in which the field is not a number."""
-    exam = _cube(draw, resolution)
-    center = 0.75 * torch.nn.functional.normalize(exam.camera.center, dim=0)
+    """A small cube behind a ball of a radius, up to 0.2, in which the field is not a number."""
+    cube = box((0.3,) * 3)
+    exam = _seen(cube, draw, resolution, field_of_view=28.0, **CORNER)
+    center = 0.75 * torch.nn.functional.normalize(exam.camera.center, dim=0)  # the cube's corner lies at 0.52
     hole = ball(severity).moved(center).field
 
     def value(points: Tensor) -> Tensor:
@@ -200,7 +208,7 @@ def cube(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 SCENES: dict[str, Scene] = {
     scene.__name__: scene
     for scene in (
-        thin_plate, wires, nested_shells, bumps, tiny_object, gap, csg_difference, grazing_plane, near_camera,
+        thin_plate, wires, nested_shells, bumps, tiny_objects, gap, csg_difference, grazing_plane, near_camera,
         far_camera, camera_inside, wide_view, narrow_view, empty_scene, nan_region, cube,
     )
 } | {name: _distorted(distortion) for name, distortion in distortions.DISTORTIONS.items()}  # fmt: skip
