@@ -1,4 +1,4 @@
-"""Procedural families: seeded samplers of a few parameters over unions of primitives. World axes: y up."""
+"""Procedural shapes: seeded samplers of a few parameters over primitives and unions of them. World axes: y up."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -13,7 +13,7 @@ from datasets.dataset import Split, seed_of
 from datasets.extract import extract
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from renderers.checks import check_at_least, check_choice, check_share
-from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union
+from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
 VERSION = 1  # to be raised when a builder changes, so that no prior of the old shapes is taken for the new ones
 HALF_GRID = 1.5  # the sampled cube reaches from -1.5 to 1.5, wider than any shape before it is normalised
@@ -73,7 +73,7 @@ class Family:
         return {"version": VERSION, **asdict(self)}
 
 
-def _union(parts: list[Shape]) -> Shape:
+def _all_of(parts: list[Shape]) -> Shape:
     whole = parts[0]
     for part in parts[1:]:
         whole = whole | part
@@ -109,7 +109,7 @@ def _sofa(p: SimpleNamespace) -> Shape:
     arm = block(p.arm_width, p.arm_height, p.depth, (p.width / 2, floor + p.arm_height / 2, 0))
     leg = cylinder(0.045, floor / 2 + 0.05).translate((p.width / 2 - 0.08, floor / 2 + 0.05, p.depth / 2 - 0.1))
     legs = _mirror(leg, 0) | _mirror(leg.translate((0, 0, -p.depth + 0.2)), 0)
-    return _union([seat, back, _mirror(arm, 0), legs]).translate((0, -0.4, 0))
+    return _all_of([seat, back, _mirror(arm, 0), legs]).translate((0, -0.4, 0))
 
 
 def _plane(p: SimpleNamespace) -> Shape:
@@ -127,7 +127,7 @@ def _plane(p: SimpleNamespace) -> Shape:
     at = (p.engine_offset, -p.body_radius * 0.4 - p.engine_radius, p.wing_position + 0.1 - p.sweep * p.engine_offset)
     fuselage = smooth_union(body, wings, radius=0.06)
     parts = [fuselage, _mirror(tail.translate((0, 0.03, end)), 0), fin.translate((0, 0, end))]
-    return _union([*parts, _mirror(engine.translate(at), 0)])
+    return _all_of([*parts, _mirror(engine.translate(at), 0)])
 
 
 def _table(p: SimpleNamespace) -> Shape:
@@ -140,7 +140,7 @@ def _table(p: SimpleNamespace) -> Shape:
     apron = box((x, p.apron / 2, z)) - box((x - 0.03, p.apron, z - 0.03))
     shelf = rounded_box((x, p.shelf_thickness / 2, z), 0.01).translate((0, p.shelf_height * height, 0))
     apron = apron.translate((0, height - p.apron / 2, 0))
-    return _union([top, legs, apron, shelf]).translate((0, -height / 2, 0))
+    return _all_of([top, legs, apron, shelf]).translate((0, -height / 2, 0))
 
 
 def _car(p: SimpleNamespace) -> Shape:
@@ -156,14 +156,55 @@ def _car(p: SimpleNamespace) -> Shape:
     turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     wheel = cylinder(p.wheel_radius, p.wheel_width / 2).rotate(turn)
     side = p.width / 2 - p.wheel_width / 2 + 0.02
-    wheels = _union([_mirror(wheel.translate((side, p.wheel_radius, end * p.wheel_base / 2)), 0) for end in (-1, 1)])
+    wheels = _all_of([_mirror(wheel.translate((side, p.wheel_radius, end * p.wheel_base / 2)), 0) for end in (-1, 1)])
     body = smooth_union(lower, windscreen & rear, radius=0.08)
     return (body | wheels).translate((0, -0.35, 0))
 
 
-BUILDERS: dict[str, Callable[[SimpleNamespace], Shape]] = {
-    "sofa": _sofa,
-    "plane": _plane,
-    "table": _table,
-    "car": _car,
+def _sphere(p: SimpleNamespace) -> Shape:
+    return sphere(p.radius)
+
+
+def _ellipsoid(p: SimpleNamespace) -> Shape:
+    return sphere(1.0).stretch((p.half_x, p.half_y, p.half_z))
+
+
+def _box(p: SimpleNamespace) -> Shape:
+    return box((p.half_x, p.half_y, p.half_z))
+
+
+def _rounded_box(p: SimpleNamespace) -> Shape:
+    return rounded_box((p.half_x, p.half_y, p.half_z), p.rounding)
+
+
+def _capsule(p: SimpleNamespace) -> Shape:
+    return capsule((0, -p.length / 2, 0), (0, p.length / 2, 0), p.radius)
+
+
+def _cylinder(p: SimpleNamespace) -> Shape:
+    return cylinder(p.radius, p.half_height)
+
+
+def _torus(p: SimpleNamespace) -> Shape:
+    return torus(p.major, p.minor)
+
+
+def _union(p: SimpleNamespace) -> Shape:
+    left = box((p.half_x, p.half_y, p.half_z)).translate((-p.apart, 0, 0))
+    right = sphere(p.radius).translate((p.apart, 0, 0))
+    return left | right | capsule((0, -0.1, 0), (0, p.height, 0.2), p.thickness)
+
+
+Builder = Callable[[SimpleNamespace], Shape]
+FAMILIES: dict[str, Builder] = {"sofa": _sofa, "plane": _plane, "table": _table, "car": _car}  # priors are shipped
+PRIMITIVES: dict[str, Builder] = {
+    "sphere": _sphere,
+    "ellipsoid": _ellipsoid,
+    "box": _box,
+    "rounded_box": _rounded_box,
+    "capsule": _capsule,
+    "cylinder": _cylinder,
+    "torus": _torus,
+    "union": _union,
 }
+BUILDERS = FAMILIES | PRIMITIVES

@@ -17,7 +17,7 @@ from bench.prior_store import SHIPPED, find, make_prior, prior_for, prior_key, p
 from bench.stage import prior_settings
 from datasets.dataset import Split
 from datasets.extract import extract
-from datasets.families import BUILDERS
+from datasets.families import FAMILIES
 from datasets.mesh import Mesh
 
 CPU = torch.device("cpu")
@@ -197,7 +197,7 @@ def test_settings_that_cannot_be_are_refused(name):
         replace(SETTINGS, **{name: 0})
 
 
-@pytest.fixture(params=sorted(BUILDERS))
+@pytest.fixture(params=sorted(FAMILIES))
 def shipped(request):
     """A family as configured by default, its prior's settings, and the record of its shipped prior."""
     register()
@@ -245,4 +245,4 @@ def test_every_shipped_file_belongs_to_a_family():
     keys = {f"{record['dataset']['name']}-{record['key']}" for record in shipped_records()}
     names = {path.name for path in SHIPPED.iterdir()}
     assert names == {f"{key}.{suffix}" for key in keys for suffix in ("json", "safetensors")}
-    assert len(keys) == len(BUILDERS)
+    assert len(keys) == len(FAMILIES)
