@@ -84,6 +84,7 @@ class Config:
     scale: Any = MISSING
     tracker: Any = MISSING
     view: Any = MISSING
+    auto: Any = MISSING
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     split: str = MISSING
     index: int = MISSING

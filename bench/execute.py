@@ -41,7 +41,7 @@ def execute(
         if not isinstance(task, Task):
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
         stage = set_up(config, progress)
-        record.scene = stage.scene_name
+        record.scene, record.notes = stage.scene_name, [*record.notes, *stage.notes]
         record.environment |= environment.describe(stage.device)
         checkpoint(record)
         try:

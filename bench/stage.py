@@ -9,6 +9,7 @@ from typing import cast
 import torch
 from omegaconf import DictConfig
 
+from bench.auto import resolved
 from bench.autodecoder import Prior, PriorSettings
 from bench.config import EvaluationSettings, build
 from bench.environment import pick_device
@@ -34,6 +35,7 @@ class Stage:
     seed: int
     device: torch.device
     cache: Path  # where what is slow to make is kept
+    notes: tuple[str, ...] = ()  # what settings came to that follow from others
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
 
     @cached_property
@@ -83,12 +85,14 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         torch.set_num_threads(config.threads)
     device = pick_device(config.device)
     packages = list(config.packages)
-    renderer = build(config.renderer, "renderer", packages)
+    views = build(config.view, "view", target="datasets.views.ViewSampler")
+    auto = build(config.auto, "auto", target="bench.auto.AutoSettings")
+    node, notes = resolved(config.renderer, views, auto)
+    renderer = build(node, "renderer", packages)
     if not isinstance(renderer, Renderer):
         name = type(renderer).__name__
         raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
     dataset = cast(Dataset, build(config.dataset, "dataset", packages))
-    views = build(config.view, "view", target="datasets.views.ViewSampler")
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
     cache = Path(config.priors_dir)
@@ -111,6 +115,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         seed=config.seed,
         device=device,
         cache=cache,
+        notes=tuple(notes),
         trained=trained,
     )
 

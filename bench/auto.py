@@ -1,0 +1,68 @@
+"""Settings of a renderer that follow from the camera: no more precision than a pixel, no more steps than that takes.
+
+Each is a function of the view and of the renderer's other settings, with its equation: `renderer.epsilon=auto`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, log, radians, sin, tan
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from datasets.views import ViewSampler
+from renderers.checks import check_positive
+
+AUTO = "auto"
+RADIUS = 1.0  # of the unit sphere, which holds every shape
+
+
+@dataclass(frozen=True)
+class AutoSettings:
+    """What the equations leave open.
+
+    Args:
+        grazing: least angle between a ray and a surface, in degrees, at which a ray must still converge.
+    """
+
+    grazing: float
+
+    def __post_init__(self) -> None:
+        check_positive("auto.grazing", self.grazing, "10 is what DIST, A.1, reckons with")
+        if self.grazing > 90:
+            raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
+
+
+def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> float:
+    """Half a pixel where the shape may be nearest to the camera (DIST, Eq. 10, at theta = 0), in scene units."""
+    nearest = view.distance - RADIUS
+    check_positive("view.distance - 1", nearest, "renderer.epsilon=auto needs a camera outside of the unit sphere")
+    focal = view.resolution / 2 / tan(radians(view.field_of_view) / 2)  # f R / S, in pixels
+    return nearest / (2 * focal)
+
+
+def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+    """What a ray needs from a unit away to a surface at the grazing angle (DIST, Eq. 8)."""
+    alpha = float(renderer.get("alpha", 1.0))
+    shrinks = abs(1 - alpha * sin(radians(settings.grazing)))
+    return ceil(log(float(renderer.epsilon) / RADIUS) / log(shrinks))
+
+
+FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {"epsilon": epsilon, "steps": steps}
+
+
+def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) -> tuple[DictConfig, list[str]]:
+    """The renderer's node with a number for each `auto`, in the order of `FORMULAS`, and what they came to, in words.
+
+    Raises:
+        ValueError: for `auto` where there is no equation.
+    """
+    node, notes = OmegaConf.create(OmegaConf.to_container(renderer, resolve=True)), []
+    for name in [str(key) for key in renderer if renderer._get_node(key) is not None and renderer.get(key) == AUTO]:
+        if name not in FORMULAS:
+            raise ValueError(f"renderer.{name}=auto has no equation: only {' and '.join(FORMULAS)} have one")
+    for name, formula in FORMULAS.items():
+        if node.get(name) == AUTO:
+            node[name] = formula(view, node, settings)
+            notes.append(f"renderer.{name}=auto is {node[name]:.4g}")
+    return node, notes
