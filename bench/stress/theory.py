@@ -68,11 +68,13 @@ def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Predi
 
 @needs("steps", "epsilon")
 def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The angle at which the steps of Eq. 8 are all that there are."""
-    sine = _least(lambda sine: _queries(renderer, sine) <= renderer.steps)
+    """The angle at which the steps of Eq. 8 are all that there are, at the far edge of the picture."""
+    edge = 1 - scenes.GRAZING_SHARE  # of the middle's sine; rays there go as much further
+    way = FRONT + scenes.DISTANCE * (1 / edge - 1)
+    sine = _least(lambda sine: _queries(renderer, edge * sine, way) <= renderer.steps)
     published = (1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)) / _alpha(renderer)
     return [
-        Prediction(degrees(asin(sine)), "as many queries as Eq. 8 asks for, of a field d sin(theta)"),
+        Prediction(degrees(asin(sine)), "as many queries as Eq. 8 asks for at the far edge, of a field d sin(theta)"),
         Prediction(degrees(asin(published)), "as many steps as DIST, Eq. 8, asks for"),
     ]
 

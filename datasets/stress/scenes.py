@@ -27,6 +27,7 @@ ALL_AROUND = (0.0, 360.0)
 CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
 CUBE = 0.5  # half its side length
 CUBE_VIEW = 44.0  # degrees: it fills the picture
+GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, as a share of the sine
 SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the picture is wide
 
 
@@ -98,15 +99,16 @@ def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 
 
 def tiny_objects(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """49 cubes of half a side length, 0.16 apart; pixels are 0.036 wide at 64 pixels a side."""
-    row = box((severity,) * 3).moved((-0.48, 0.0, 0.0))
+    """49 cubes of half a side length, 0.16 apart, corners to the camera; pixels are 0.036 wide at 64 pixels a side."""
+    cube = box((severity,) * 3).turned(_corner_to_z())
+    row = cube.moved((-0.48, 0.0, 0.0))
     for place in range(1, 7):
-        row |= box((severity,) * 3).moved((0.16 * place - 0.48, 0.0, 0.0))
+        row |= cube.moved((0.16 * place - 0.48, 0.0, 0.0))
     sheet = row.moved((0.0, -0.48, 0.0))
     for place in range(1, 7):
         sheet |= row.moved((0.0, 0.16 * place - 0.48, 0.0))
     placed = sheet.turned(_about_z(draw.uniform(-45, 45))).moved(tuple(draw.uniform(-0.02, 0.02, 3)))
-    return _seen(placed, draw, resolution, azimuth=(-20, 20), elevation=(-20, 20))
+    return _seen(placed, draw, resolution, azimuth=(-8, 8), elevation=(-8, 8))
 
 
 def gap(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -138,7 +140,7 @@ def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -
         offset, right, forward = parameters
         return half_space(torch.stack([right, torch.ones_like(right), forward]), offset)
 
-    field_of_view = 2 * degrees(atan(0.1 * sin(radians(severity))))
+    field_of_view = 2 * degrees(atan(GRAZING_SHARE * sin(radians(severity))))
     camera = _camera(draw, resolution, elevation=(severity, severity), field_of_view=field_of_view)
     none = torch.zeros(3, dtype=torch.float64)
     return Exam(solid(none).field, camera, solid(none), solid, none)
@@ -188,10 +190,10 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
 
 
 def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A small cube behind a ball of a radius, up to 0.2, in which the field is not a number."""
-    cube = box((0.3,) * 3)
-    exam = _seen(cube, draw, resolution, field_of_view=28.0, **CORNER)
-    center = 0.75 * torch.nn.functional.normalize(exam.camera.center, dim=0)  # the cube's corner lies at 0.52
+    """A smaller cube behind a ball of a radius, up to 0.1, in which the field is not a number."""
+    cube = box((0.42,) * 3)
+    exam = _seen(cube, draw, resolution, field_of_view=38.0, **CORNER)
+    center = 0.87 * torch.nn.functional.normalize(exam.camera.center, dim=0)  # the cube's corner lies at 0.73
     hole = ball(severity).moved(center).field
 
     def value(points: Tensor) -> Tensor:
@@ -239,3 +241,10 @@ def _about_z(angle: float) -> Float[Tensor, "3 3"]:
     """A rotation about the z axis by an angle in degrees."""
     c, s = cos(radians(angle)), sin(radians(angle))
     return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def _corner_to_z() -> Float[Tensor, "3 3"]:
+    """A rotation that turns a cube's corner to the z axis."""
+    z = torch.ones(3, dtype=torch.float64) / 3**0.5
+    x = torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64) / 2**0.5
+    return torch.stack([x, torch.linalg.cross(z, x), z])
