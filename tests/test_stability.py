@@ -73,6 +73,7 @@ def test_the_grazing_plane_breaks_where_eq_8_runs_out_of_steps(tmp_path):
 def test_aggressive_marching_has_gradients_too_long_from_the_front_on(tmp_path):
     metrics = run(tmp_path, "grazing_gradient", load("renderer", "dist"))
     assert metrics["level"] < 0 and metrics["mild_successes"] == 0
+    assert metrics["predicted"] == 90
 
 
 def test_what_a_trial_raises_is_its_failure_and_the_search_goes_on(tmp_path):

@@ -84,8 +84,9 @@ def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list
     """Where DIST's scale alpha K sin(theta) leaves its tolerance, the slope falls below its least, or Eq. 8 ends."""
     lost = grazing_plane(renderer, resolution, criteria)[:1]
     if hasattr(renderer, "alpha"):
-        shrunk = (1 - criteria.scale) / (renderer.alpha * getattr(renderer, "samples", 1))
-        lost.append(Prediction(degrees(asin(min(shrunk, 1.0))), "scale alpha K sin(theta) of Eq. 4"))
+        longest = renderer.alpha * getattr(renderer, "samples", 1)
+        sine = 1.0 if longest > 1 + criteria.scale else min((1 - criteria.scale) / longest, 1.0)
+        lost.append(Prediction(degrees(asin(sine)), "scale alpha K sin(theta) of DIST's Eq. 4, too long or too short"))
     elif hasattr(renderer, "least_slope"):
         share = 1 - criteria.scale if getattr(renderer, "keep_slope_sign", True) else 1.0
         lost.append(Prediction(degrees(asin(share * renderer.least_slope)), "slope sin(theta) below least_slope"))
