@@ -60,9 +60,11 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     node, notes = OmegaConf.create(OmegaConf.to_container(renderer, resolve=True)), []
     for name in [str(key) for key in renderer if renderer._get_node(key) is not None and renderer.get(key) == AUTO]:
         if name not in FORMULAS:
-            raise ValueError(f"renderer.{name}=auto has no equation: only {' and '.join(FORMULAS)} have one")
+            known = " and ".join(FORMULAS)
+            raise ValueError(f"renderer.{name}=auto has no equation: only {known} have one; give a number")
     for name, formula in FORMULAS.items():
         if node.get(name) == AUTO:
             node[name] = formula(view, node, settings)
-            notes.append(f"renderer.{name}=auto is {node[name]:.4g}")
+            seen = f"{view.resolution} pixels from {view.distance:g} away (view)"
+            notes.append(f"renderer.{name}=auto is {node[name]:.4g}, for {seen}")
     return node, notes

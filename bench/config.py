@@ -119,6 +119,8 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError(f"evaluation.every must be {DOUBLING}, a number or null, not {config.evaluation.every!r}")
     if config.evaluation.film not in (None, "gif", "webp"):
         raise ValueError(f"evaluation.film must be gif, webp or null, not {config.evaluation.film!r}")
+    if config.stress is not None and "stress" not in config.task:
+        raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
     if config.evaluation.film is not None and config.evaluation.picture is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
     for name, least in LEAST.items():

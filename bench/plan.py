@@ -24,7 +24,6 @@ PLAN = "plan.json"
 TOLD = (  # metric, what it is called, factor
     ("chamfer_l2", "Chamfer (x1000)", 1000.0),
     ("rotation_error_deg", "rotation error (degrees)", 1.0),
-    ("breakdown", "breaks at", 1.0),
 )
 LOOK = 0.5  # seconds between two looks at what has ended
 
@@ -191,4 +190,14 @@ def line(folder: Path, record: dict[str, Any], own: str) -> str:
     ]
     known = record["metrics"]
     parts += [f"{told} {number(known[name], factor)}" for name, told, factor in TOLD if name in known]
+    if "level" in known:
+        parts.append(breakdown(record))
     return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)
+
+
+def breakdown(record: dict[str, Any]) -> str:
+    """Where a run of the stability task broke, in words."""
+    level, unit = record["metrics"]["level"], record["config"]["task"]["stress"]["sweep"]["unit"]
+    if level is None or 0 <= level <= 1:
+        return f"breaks at {number(record['metrics']['breakdown'])} {unit}"
+    return "breaks at once" if level < 0 else "does not break in the sweep"

@@ -33,7 +33,9 @@ def test_both_follow_each_other_and_are_told():
     node, notes = resolved(OmegaConf.create({"epsilon": "auto", "steps": "auto", "alpha": 1.5}), VIEW, TEN)
     assert node.epsilon == pytest.approx(1.5 / (2 * 137.25), rel=1e-3)
     assert node.steps == steps(VIEW, node, TEN) < 33
-    assert notes == [f"renderer.epsilon=auto is {node.epsilon:.4g}", f"renderer.steps=auto is {node.steps}"]
+    seen = "for 128 pixels from 2.5 away (view)"
+    told = {"epsilon": f"{node.epsilon:.4g}", "steps": str(node.steps)}
+    assert notes == [f"renderer.{name}=auto is {number}, {seen}" for name, number in told.items()]
 
 
 def test_what_has_no_equation_is_told():
@@ -49,7 +51,7 @@ def test_a_run_has_the_number_and_tells_of_it(compose_config):
     config = compose_config("renderer.epsilon=auto", "renderer.steps=auto", "view.resolution=128", "dataset=sphere")
     stage = set_up(config, silent)
     assert stage.renderer.epsilon == pytest.approx(0.005465, rel=1e-3)
-    assert stage.notes[0] == "renderer.epsilon=auto is 0.005465"
+    assert stage.notes[0].startswith("renderer.epsilon=auto is 0.005465, for 128 pixels")
 
 
 @pytest.mark.parametrize("name", ["dist", "idr", "naive"])

@@ -90,6 +90,26 @@ def test_what_a_trial_raises_is_its_failure_and_the_search_goes_on(tmp_path):
     assert {line["message"] for line in lines if not line["success"]} == {"RuntimeError: too far"}
 
 
+def test_a_renderer_that_always_raises_has_crashed(tmp_path):
+    class Broken(IDR):
+        def render(self, field, rays):
+            raise RuntimeError("no more")
+
+    cell = cell_of(tmp_path, Broken(**vars(load("renderer", "idr"))), ball_prior(), camera_of(8))
+    Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, SHORT, 16, Limits(60, 8)).execute(cell)
+    assert cell.record.status is RunStatus.CRASHED
+    assert cell.record.reason == "every trial raised an error: RuntimeError: no more"
+    assert "trials raised an error, the last: RuntimeError: no more" in cell.record.notes[0]
+
+
+def test_success_that_rises_with_severity_is_noted(tmp_path):
+    stress = stress_named("gap")
+    turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
+    cell = cell_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
+    Stability(turned, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(60, 8)).execute(cell)
+    assert any(note.startswith("success does not fall with severity") for note in cell.record.notes)
+
+
 def test_a_flipped_sign_in_the_clamp_shows_as_that(tmp_path, monkeypatch):
     before = run(tmp_path / "right", "grazing_gradient", load("renderer", "dvr", samples=32, doublings=[]))
     assert before["level"] > 0.7
@@ -158,7 +178,7 @@ def test_a_renderer_of_ones_own_is_judged_like_all(tmp_path):
 
 
 def test_what_a_renderer_lacks_is_told_before_the_first_trial(tmp_path):
-    with pytest.raises(Unsupported, match="IDR has no setting alpha"):
+    with pytest.raises(Unsupported, match="IDR is not a renderer with alpha"):
         run(tmp_path, "alpha", load("renderer", "idr"))
 
 

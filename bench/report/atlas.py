@@ -64,10 +64,29 @@ class Cell:
             return math.log(severity / ends[0]) / math.log(ends[1] / ends[0])
         return (severity - ends[0]) / (ends[1] - ends[0])
 
+    def covers(self, severity: float) -> bool:
+        """Whether a severity lies in the breakdown's interval, or as the breakdown beyond an end of the sweep."""
+        low, high = (measured(self.record, f"level_{end}") for end in ("low", "high"))
+        if low is None or high is None:
+            return False
+        level = self.place(severity)
+        return low <= level <= high or (self.at_once and level < 0) or (self.never and level > 1)
+
+    @property
+    def falls(self) -> bool:
+        """Whether no larger share of the trials succeeded at the severe end than at the mild one."""
+        shares = []
+        for end in ("mild", "severe"):
+            n = measured(self.record, f"{end}_trials") or 0
+            shares.append((measured(self.record, f"{end}_successes") or 0) / n if n else 0.0)
+        return shares[1] <= shares[0]
+
     def short(self) -> str:
         """The breakdown in a few characters."""
         if not self.known:
             return format.MISSING if self.unsupported else self.record["status"]
+        if not self.falls:
+            return "rises"
         if self.at_once or self.never:
             return "at once" if self.at_once else "none"
         return format.number(measured(self.record, "breakdown"))
@@ -76,6 +95,8 @@ class Cell:
         """The breakdown with its interval, or the count behind what is said of an end of the sweep."""
         if not self.known:
             return self.short()
+        if not self.falls:
+            return f"success rises with severity (mild: {self._count('mild')}; severe: {self._count('severe')})"
         low, high = (measured(self.record, f"breakdown_{end}") for end in ("low", "high"))
         if self.at_once:
             reach = f", up to {format.number(high)}" if high is not None else ""

@@ -120,7 +120,8 @@ def draw_cost(rows: list[dict[str, Any]]) -> Figure:
 
 def _cost(grid: Atlas, row: str, axes: list[str]) -> dict[str, Any]:
     cells = [cell for axis in axes if (cell := grid.cells.get((axis, row))) is not None]
-    cost = median_of_known(measured(cell.record, "evaluations_per_ray") for cell in cells)
+    right = [cell for cell in cells if not cell.at_once]  # what breaks there may be cheap because it finds nothing
+    cost = median_of_known(measured(cell.record, "evaluations_per_ray") for cell in right)
     ends = {"at_once": sum(cell.at_once for cell in cells), "never": sum(cell.never for cell in cells)}
     return {"row": row, "axes": len(cells), **ends, "cost": math.nan if cost is None else cost}
 
@@ -170,7 +171,7 @@ def _theory(grid: Atlas) -> list[str]:
     lines = []
     for axis in grid.axes:
         told = [
-            f"{row} {format.number(predicted)}, measured {cell.told()}"
+            f"{row} {format.number(predicted)}{'' if cell.covers(predicted) else ' (outside)'}, measured {cell.told()}"
             for row, cell in grid.on(axis)
             if cell.known and (predicted := measured(cell.record, "predicted")) is not None
         ]

@@ -64,7 +64,7 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
     drawn = [(row, cell, shares[axis, row]) for row, cell in grid.on(axis) if len(shares.get((axis, row), ()))]
     for place, (row, cell, table) in enumerate(drawn):
         look = style.look(row)
-        beside = 1.5 * (place - (len(drawn) - 1) / 2)  # per cent, so that equal curves do not hide each other
+        beside = 0.7 * (place - (len(drawn) - 1) / 2)  # per cent, so that equal curves do not hide each other
         panel.plot(table["severity"], 100 * table["share"] + beside, look.marker, color=look.colour, ms=1.5, alpha=0.5)
         levels = np.linspace(0, 1, 200)
         along = [cell.severity(level) for level in levels]
@@ -72,7 +72,7 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
         ends = [measured(cell.record, f"level_{end}") for end in ("low", "high")]
         if None not in ends:
             low, high = (cell.severity(min(max(end, 0.0), 1.0)) for end in ends)
-            panel.plot([low, high], [50 + 2 * beside] * 2, color=look.colour, lw=2, solid_capstyle="butt")
+            panel.plot([low, high], [50 + 4 * beside] * 2, color=look.colour, lw=2, solid_capstyle="butt")
         for name, line in (("predicted", "--"), ("predicted_1", ":")):
             if (predicted := measured(cell.record, name)) is not None:
                 panel.axvline(predicted, color=look.colour, ls=line, lw=0.6)
@@ -91,7 +91,7 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: dict[tuple[str, str], pd
         panel.set_xlim(mild - 0.05 * (severe - mild), severe + 0.05 * (severe - mild))
     panel.set_xlabel(grid.unit(axis), fontsize=5.5, labelpad=1)
     panel.set_ylim(-12, 112)
-    panel.set_yticks([0, 50, 100])
+    panel.set_yticks([0, 50, 100], ["0 %", "50 %", "100 %"])
     panel.tick_params(labelsize=5.5)
     panel.minorticks_off()
 

@@ -42,7 +42,8 @@ class Sweep:
 
     def __post_init__(self) -> None:
         if not (isfinite(self.mild) and isfinite(self.severe) and self.mild != self.severe):
-            raise ValueError(f"task.stress.sweep must have two ends, not {self.mild} and {self.severe}: 0.1 and 0.001")
+            ends = f"{self.mild} and {self.severe}"
+            raise ValueError(f"task.stress.sweep must have two finite ends that differ, not {ends}")
         if self.log and min(self.mild, self.severe) <= 0:
             raise ValueError("task.stress.sweep.log needs positive ends: set log=false")
 
@@ -91,9 +92,10 @@ class Stress:
         if self.setting is None:
             return renderer
         own = {f.name for f in fields(renderer)} if is_dataclass(renderer) else set()
-        for name in (self.setting, self.among or self.setting):
-            if name not in own:
-                raise Unsupported(f"{type(renderer).__name__} has no setting {name}")
+        wanted = sorted({self.setting, self.among or self.setting})
+        if not set(wanted) <= own:
+            names = " and ".join(wanted)
+            raise Unsupported(f"{type(renderer).__name__} is not a renderer with {names}: choose another")
         present: Any = getattr(renderer, self.setting)
         value = max(round(severity), 1) if isinstance(present, int) else severity
         return replace(renderer, **{self.setting: value})  # type: ignore[type-var]

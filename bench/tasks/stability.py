@@ -88,7 +88,8 @@ class Stability:
             record.metrics[name] = prediction.severity
             record.definitions[name] = prediction.formula
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
-        record.status, record.reason = RunStatus.OK, ""
+        record.status, record.reason = trials.verdict()
+        record.notes = [*record.notes, *trials.remarks()]
         if trials.first_failure is not None:
             draw_failure(cell.folder, trials.first_failure, title=f"{record.name}, {record.scene}", unit=self._unit)
 
@@ -141,6 +142,25 @@ class _Trials:
         if shown and (self.first_failure is None or trial.level < self.first_failure.level):
             self.first_failure = trial
         self.all.append(replace(trial, outcome=replace(trial.outcome, images={})))
+
+    def verdict(self) -> tuple[RunStatus, str]:
+        """A search of which each trial raised an error has found nothing."""
+        if all(trial.outcome.failure is Failure.CRASHED for trial in self.all):
+            return RunStatus.CRASHED, f"every trial raised an error: {self.all[-1].outcome.message}"
+        return RunStatus.OK, ""
+
+    def remarks(self) -> list[str]:
+        """What makes the breakdown doubtful: trials that raised errors, and success that grows with severity."""
+        raised = [trial.outcome.message for trial in self.all if trial.outcome.failure is Failure.CRASHED]
+        told = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
+        if not self.falls():
+            told.append("success does not fall with severity: there is more at the severe end than at the mild one")
+        return told
+
+    def falls(self) -> bool:
+        """Whether no larger share of the trials succeeds at the severe end than at the mild one."""
+        shares = [np.mean([t.outcome.success for t in self.all if t.level == end] or [0.0]) for end in (1.0, 0.0)]
+        return bool(shares[0] <= shares[1])
 
     def line(self) -> dict[str, object]:
         """The last trial as a line of the curve."""
