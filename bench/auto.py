@@ -5,7 +5,7 @@ Each is a function of the view and of the renderer's other settings, with its eq
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil, log, radians, sin, tan
+from math import ceil, log, radians, sin
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -37,8 +37,12 @@ def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> 
     """Half a pixel where the shape may be nearest to the camera (DIST, Eq. 10, at theta = 0), in scene units."""
     nearest = view.distance - RADIUS
     check_positive("view.distance - 1", nearest, "renderer.epsilon=auto needs a camera outside of the unit sphere")
-    focal = view.resolution / 2 / tan(radians(view.field_of_view) / 2)  # f R / S, in pixels
-    return nearest / (2 * focal)
+    return half_pixel(view, nearest)
+
+
+def half_pixel(view: ViewSampler, depth: float) -> float:
+    """Half a pixel's width at a depth, on the optical axis (DIST, Eq. 10, at theta = 0), in scene units."""
+    return depth / (2 * view.focal_length)
 
 
 def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
@@ -57,14 +61,15 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     Raises:
         ValueError: for `auto` where there is no equation.
     """
-    node, notes = OmegaConf.create(OmegaConf.to_container(renderer, resolve=True)), []
-    for name in [str(key) for key in renderer if renderer._get_node(key) is not None and renderer.get(key) == AUTO]:
+    settled: Any = OmegaConf.to_container(renderer, resolve=True)
+    asked = [name for name, value in settled.items() if value == AUTO]
+    for name in asked:
         if name not in FORMULAS:
             known = " and ".join(FORMULAS)
             raise ValueError(f"renderer.{name}=auto has no equation: only {known} have one; give a number")
-    for name, formula in FORMULAS.items():
-        if node.get(name) == AUTO:
-            node[name] = formula(view, node, settings)
-            seen = f"{view.resolution} pixels from {view.distance:g} away (view)"
-            notes.append(f"renderer.{name}=auto is {node[name]:.4g}, for {seen}")
+    node, notes = OmegaConf.create(settled), []
+    for name in [name for name in FORMULAS if name in asked]:
+        node[name] = FORMULAS[name](view, node, settings)
+        seen = f"{view.resolution} pixels from {view.distance:g} away (view)"
+        notes.append(f"renderer.{name}=auto is {node[name]:.4g}, for {seen}")
     return node, notes

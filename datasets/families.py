@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import reduce
 from math import inf
+from operator import or_
 from types import SimpleNamespace
 from typing import Any
 
@@ -74,10 +76,7 @@ class Family:
 
 
 def _all_of(parts: list[Shape]) -> Shape:
-    whole = parts[0]
-    for part in parts[1:]:
-        whole = whole | part
-    return whole
+    return reduce(or_, parts)
 
 
 def _mirror(part: Shape, axis: int) -> Shape:

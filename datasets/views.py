@@ -39,6 +39,11 @@ class ViewSampler:
         if not -90 < self.elevation[0] <= self.elevation[1] < 90:
             raise ValueError(f"elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
 
+    @property
+    def focal_length(self) -> float:
+        """In pixels: f R / S in DIST, Eq. 10."""
+        return self.resolution / 2 / tan(radians(self.field_of_view) / 2)
+
     def draw(self, seed: int) -> Camera:
         """Camera number `seed`; its draws are not those of the shape of the same number."""
         generator = np.random.default_rng([seed, 1])
@@ -49,7 +54,7 @@ class ViewSampler:
         across, up = radians(azimuth), radians(elevation)
         toward = [np.cos(up) * np.sin(across), np.sin(up), np.cos(up) * np.cos(across)]
         eye = self.distance * torch.tensor(toward, dtype=torch.float32)
-        focal = self.resolution / 2 / tan(radians(self.field_of_view) / 2)
+        focal = self.focal_length
         middle = self.resolution / 2
         intrinsics = torch.tensor([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
         return Camera(intrinsics, look_at(eye, torch.zeros(3)), self.resolution, self.resolution)

@@ -18,9 +18,10 @@ from bench.stress.stress import Stress, Sweep
 from bench.tasks.problem import Unsupported
 from datasets.stress import SCENES
 from datasets.stress.solids import ball, box, half_space, rod
-from renderers import IDR, reference
+from renderers import reference
 from renderers.camera import Rays
 from renderers.rendering import Status
+from tests.tiny import Blind
 
 CPU = torch.device("cpu")
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
@@ -35,10 +36,6 @@ def stress_named(name: str) -> Stress:
 
 def conditions(resolution: int = 32) -> Conditions:
     return Conditions(resolution, FIT, CRITERIA, LIMITS, CPU)
-
-
-class Blind(IDR):
-    capabilities = replace(IDR.capabilities, field_gradient=False)
 
 
 def drawn(seed: int = 0) -> np.random.Generator:
@@ -147,7 +144,7 @@ def test_gradients_are_those_of_the_closed_form():
 
 
 def test_a_renderer_without_a_gradient_is_unsupported():
-    blind = Blind(**vars(load("renderer", "idr")))
+    blind = Blind()
     with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
         stress_named("grazing_gradient").trial(blind, 0.0, 0, conditions())
     with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):

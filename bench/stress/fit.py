@@ -18,7 +18,7 @@ from bench.records import RunStatus
 from bench.stress.conditions import Conditions, FitSettings
 from bench.stress.outcome import Failure, Outcome
 from bench.tasks.completion import GivenView
-from bench.tasks.problem import OptimiserSettings, Unsupported
+from bench.tasks.problem import OptimiserSettings, check_field_gradient
 from datasets.scene import View
 from datasets.stress.solids import Solid, ball
 from datasets.views import ViewSampler
@@ -54,8 +54,7 @@ def judge_fit(trial: "FitTrial", renderer: Renderer, conditions: Conditions) -> 
         Unsupported: where the renderer has no gradient towards the field.
         LimitReached: where it takes more than it may.
     """
-    if not renderer.capabilities.field_gradient:
-        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+    check_field_gradient(renderer)
     fit, draw = trial.settings(), trial.draw
     true, start = _balls(draw, fit.offset)
     given = trial.disturbed(_observe(_ball(true), fit.resolution, draw))

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bench.stress.conditions import Conditions, Criteria
 from bench.stress.outcome import Failure, Outcome
-from bench.tasks.problem import Unsupported
+from bench.tasks.problem import check_field_gradient
 from datasets.stress import Exam
 from renderers.rendering import Renderer
 
@@ -27,8 +27,7 @@ def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Ou
         Unsupported: where the renderer has no gradient towards the field.
         LimitReached: where it takes more than it may.
     """
-    if not renderer.capabilities.field_gradient:
-        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+    check_field_gradient(renderer)
     if exam.solid is None or exam.parameters is None:
         raise ValueError("task.stress.scene has no parameters: choose grazing_plane for measure=gradient")
     device = conditions.device

@@ -6,11 +6,13 @@ A renderer that lacks the settings that a formula is made of has no prediction.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
-from math import asin, degrees, log, radians, sqrt, tan
+from math import asin, degrees, log, sqrt
 from typing import Any
 
+from bench.auto import half_pixel
 from bench.stress.conditions import Criteria
 from datasets.stress import scenes
+from datasets.views import ViewSampler
 from renderers.field import STEEPEST_MARGIN
 
 FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
@@ -97,11 +99,11 @@ def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list
 def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """The ring by which epsilon widens a cube's outline, a regular hexagon; and Eq. 10."""
     around = scenes.CUBE * 2 * sqrt(2 / 3)  # radius through the hexagon's corners
-    focal = resolution / 2 / tan(radians(scenes.CUBE_VIEW / 2))
+    view = ViewSampler(scenes.DISTANCE, scenes.CUBE_VIEW, **scenes.CORNER, resolution=resolution)
     nearest = scenes.DISTANCE - scenes.CUBE * sqrt(3)
     return [
         Prediction(criteria.false_hits * sqrt(3) / 4 * around, "a ring as wide as epsilon has 1 % of the cube's area"),
-        Prediction(nearest / (2 * focal), "half a pixel: DIST, Eq. 10, at theta = 0"),
+        Prediction(half_pixel(view, nearest), "half a pixel: DIST, Eq. 10, at theta = 0"),
     ]
 
 

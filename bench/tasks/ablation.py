@@ -16,7 +16,7 @@ from bench.pictures import draw_against
 from bench.records import RunStatus
 from bench.reference_store import Reference, reference_for
 from bench.stage import Cell, Stage
-from bench.tasks.problem import Unsupported, check_kind
+from bench.tasks.problem import check_field_gradient, check_kind
 from datasets.scene import View
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
@@ -173,8 +173,7 @@ class Workbench:
         self.mask = reference.hit.to(self.device)
         self.rendering: Rendering | None = None
         check_kind(self.renderer, self.decoder.at(self.code))
-        if not self.renderer.capabilities.field_gradient:
-            raise Unsupported(f"{type(self.renderer).__name__} has no gradient towards the field")
+        check_field_gradient(self.renderer)
         small = camera.resized(WARM_UP, WARM_UP)
         self._step(self.decoder.at(self.code), small.rays().to(self.device), torch.ones(WARM_UP, WARM_UP).bool())
 

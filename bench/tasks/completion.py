@@ -11,7 +11,7 @@ from bench.autodecoder import Prior
 from bench.solve import solve
 from bench.stage import Cell
 from bench.tasks.code import CodePenalty, CodeProblem, Terms, code_problem
-from bench.tasks.problem import OptimiserSettings, Unsupported
+from bench.tasks.problem import OptimiserSettings, check_field_gradient
 from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene, View
 from renderers.camera import Rays
@@ -65,8 +65,7 @@ class Completion:
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
         """The problem of a scene, from the mean shape, code zero."""
-        if not renderer.capabilities.field_gradient:
-            raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+        check_field_gradient(renderer)
         view = scene.view
         observed = observed_pixels(view, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None

@@ -11,7 +11,7 @@ from bench.jacobians import Differences, differences, image_differences
 from bench.records import RunStatus
 from bench.reference_store import RADIUS, Reference, in_float64, reference_for
 from bench.stage import Cell
-from bench.tasks.problem import Unsupported, check_kind
+from bench.tasks.problem import check_field_gradient, check_kind
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Meter, steepest
@@ -152,8 +152,7 @@ class Subject:
     def check(self) -> None:
         """Raises Unsupported where the renderer cannot do this."""
         check_kind(self.renderer, self.decoder.at(self.code))
-        if not self.renderer.capabilities.field_gradient:
-            raise Unsupported(f"{type(self.renderer).__name__} has no gradient towards the field")
+        check_field_gradient(self.renderer)
 
     def gradients(
         self, pixels: Int[Tensor, "m"]

@@ -12,7 +12,7 @@ from bench.solve import solve
 from bench.stage import Cell
 from bench.starts import StartSettings
 from bench.tasks.code import CodePenalty, CodeProblem, Terms, code_problem
-from bench.tasks.problem import NotReached, OptimiserSettings, Unsupported
+from bench.tasks.problem import NotReached, OptimiserSettings, check_field_gradient
 from bench.warp import project, sample
 from datasets.photographs import Photograph, Photography
 from datasets.scene import Scene
@@ -115,8 +115,7 @@ class Multiview:
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
         """The problem of a scene's mesh."""
-        if not renderer.capabilities.field_gradient:
-            raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+        check_field_gradient(renderer)
         own = scene.seed(seed)  # another texture and other codes for each shape
         generator = torch.Generator().manual_seed(own)
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=own)

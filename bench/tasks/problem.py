@@ -107,3 +107,9 @@ def check_kind(renderer: Renderer, field: Field) -> None:
     if field.kind not in needs:
         names = " or ".join(need.value for need in needs)
         raise Unsupported(f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field")
+
+
+def check_field_gradient(renderer: Renderer) -> None:
+    """Raises Unsupported where a renderer has no gradient towards the field's parameters."""
+    if not renderer.capabilities.field_gradient:
+        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")

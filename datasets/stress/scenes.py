@@ -6,7 +6,9 @@ that every renderer sits the same exams.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from math import atan, cos, degrees, radians, sin
+from operator import or_
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -71,9 +73,7 @@ def thin_plate(severity: float, draw: np.random.Generator, resolution: int) -> E
 
 def wires(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     """Seven parallel wires of a radius."""
-    fence = rod(severity, 0.6).moved((-0.54, 0.0, 0.0))
-    for place in range(1, 7):
-        fence |= rod(severity, 0.6).moved((0.18 * place - 0.54, 0.0, 0.0))
+    fence = _seven(lambda place: rod(severity, 0.6).moved((0.18 * place - 0.54, 0.0, 0.0)))
     tilted = fence.turned(_about_z(draw.uniform(-45, 45)))
     return _seen(tilted, draw, resolution, azimuth=(-20, 20), elevation=(-20, 20))
 
@@ -101,12 +101,8 @@ def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 def tiny_objects(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     """49 cubes of half a side length, 0.16 apart, corners to the camera; pixels are 0.036 wide at 64 pixels a side."""
     cube = box((severity,) * 3).turned(_corner_to_z())
-    row = cube.moved((-0.48, 0.0, 0.0))
-    for place in range(1, 7):
-        row |= cube.moved((0.16 * place - 0.48, 0.0, 0.0))
-    sheet = row.moved((0.0, -0.48, 0.0))
-    for place in range(1, 7):
-        sheet |= row.moved((0.0, 0.16 * place - 0.48, 0.0))
+    row = _seven(lambda place: cube.moved((0.16 * place - 0.48, 0.0, 0.0)))
+    sheet = _seven(lambda place: row.moved((0.0, 0.16 * place - 0.48, 0.0)))
     placed = sheet.turned(_about_z(draw.uniform(-45, 45))).moved(tuple(draw.uniform(-0.02, 0.02, 3)))
     return _seen(placed, draw, resolution, azimuth=(-8, 8), elevation=(-8, 8))
 
@@ -218,6 +214,11 @@ SCENES: dict[str, Scene] = {
 
 def _cube(draw: np.random.Generator, resolution: int, **view: float) -> Exam:
     return _seen(box((CUBE,) * 3), draw, resolution, **{**CORNER, "field_of_view": CUBE_VIEW, **view})
+
+
+def _seven(part: Callable[[int], Solid]) -> Solid:
+    """The union of the parts at places 0 to 6."""
+    return reduce(or_, map(part, range(7)))
 
 
 def _seen(solid: Solid, draw: np.random.Generator, resolution: int, **view) -> Exam:
