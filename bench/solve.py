@@ -98,9 +98,9 @@ def descend(
 
         def on_step(line: dict[str, Any]) -> None:
             line |= known.get(line["iteration"], {})
+            curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
             if course.status is RunStatus.OK and line["iteration"] + 1 in looks:
                 look(line["iteration"] + 1)
-            curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
             cell.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
 
         def judge_loss() -> None:
