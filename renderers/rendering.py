@@ -85,6 +85,24 @@ class Scheduled(Protocol):
         ...
 
 
+@runtime_checkable
+class Spaced(Renderer, Protocol):
+    """A renderer that searches among equally spaced samples of the field, from where a ray enters a sphere to its exit.
+
+    What is thinner along a ray than their spacing, at most 2 R / (n - 1) for n of them and the radius R, may be missed.
+    """
+
+    sphere_radius: float
+
+    def with_samples(self, samples: int) -> "Spaced":
+        """The renderer with that many samples a ray.
+
+        Raises:
+            ValueError: where another setting decides on the number as well.
+        """
+        ...
+
+
 def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
     """The renderer as it is at an iteration of an optimisation: itself, unless it has a schedule."""
     return renderer.at_iteration(iteration) if isinstance(renderer, Scheduled) else renderer

@@ -14,7 +14,7 @@ from renderers.field import Kind, Meter, occupancy_field
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.fields.occupancy import OccupancyNetwork
 from renderers.gradients import implicit
-from renderers.rendering import Rendering, Status, at_iteration
+from renderers.rendering import Rendering, Spaced, Status, at_iteration
 from tests.analytic_cases import CASES, Case, vector
 
 DVR = load("renderer", "dvr", mask_weight=1.0)
@@ -76,6 +76,14 @@ def test_samples_double_on_schedule_up_to_all():
     for wrong in ((3, 3), (5, 2), (-1,)):
         with pytest.raises(ValueError, match="doublings must be rising iterations from 0"):
             replace(renderer, doublings=wrong)
+
+
+def test_samples_set_from_outside_leave_no_doublings():
+    renderer = replace(DVR, doublings=())
+    assert isinstance(renderer, Spaced) and not isinstance(load("renderer", "dist"), Spaced)
+    assert renderer.with_samples(33) == replace(renderer, samples=33)
+    with pytest.raises(ValueError, match=r"doublings must be empty where n is set from outside, not \[10, 30, 50\]"):
+        DVR.with_samples(33)
 
 
 def test_any_level_set_will_do():
