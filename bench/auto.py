@@ -1,11 +1,12 @@
-"""Settings of a renderer that follow from the camera: no more precision than a pixel, no more steps than that takes.
+"""Settings of a renderer that follow from others: no more precision than a pixel, no more steps than that takes.
 
-Each is a function of the view and of the renderer's other settings, with its equation: `renderer.epsilon=auto`.
+Each is a function of the view and of the renderer's other settings, with its equation: `renderer.epsilon=auto`. The
+number of samples follows from the shape, so that it changes on the way: see `bench.thickness`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil, log, radians, sin
+from math import ceil, inf, log, radians, sin
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -15,6 +16,7 @@ from renderers.checks import check_positive
 
 AUTO = "auto"
 RADIUS = 1.0  # of the unit sphere, which holds every shape
+FEWEST, MOST = 16, 128  # samples a ray: the range of DVR, Sec. 3.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,30 @@ def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> in
     return ceil(log(float(renderer.epsilon) / RADIUS) / log(shrinks))
 
 
-FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {"epsilon": epsilon, "steps": steps}
+def samples(thinnest: float, radius: float) -> int:
+    """The least n that puts two samples into the thinnest part: 2 R / (n - 1) <= thinnest / 2, within DVR's own range.
+
+    2 R / (n - 1) is the spacing on the longest chord of the sphere (DVR, Eq. 9), so that on no ray it is wider.
+
+    Args:
+        thinnest: thickness of the thinnest part, in scene units; infinite where none is known.
+        radius: R, of the sphere that the samples lie in, in scene units.
+    """
+    wanted = ceil(min(4 * radius / thinnest, MOST)) + 1
+    return min(max(wanted, FEWEST), MOST)
+
+
+def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+    """The number of samples before any part of the shape has been seen."""
+    return samples(inf, RADIUS)
+
+
+FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
+    "epsilon": epsilon,
+    "steps": steps,
+    "samples": first_samples,
+}
+CHANGING = {"samples": ("begins with", "and follows the thinnest part that is seen")}
 
 
 def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) -> tuple[DictConfig, list[str]]:
@@ -65,11 +90,12 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     asked = [name for name, value in settled.items() if value == AUTO]
     for name in asked:
         if name not in FORMULAS:
-            known = " and ".join(FORMULAS)
+            known = ", ".join(FORMULAS)
             raise ValueError(f"renderer.{name}=auto has no equation: only {known} have one; give a number")
     node, notes = OmegaConf.create(settled), []
     for name in [name for name in FORMULAS if name in asked]:
         node[name] = FORMULAS[name](view, node, settings)
-        seen = f"{view.resolution} pixels from {view.distance:g} away (view)"
-        notes.append(f"renderer.{name}=auto is {node[name]:.4g}, for {seen}")
+        seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
+        verb, reason = CHANGING.get(name, ("is", seen))
+        notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
     return node, notes

@@ -47,7 +47,7 @@ def execute(
         try:
             task.execute(Cell(stage, folder, record, progress))
         finally:
-            record.notes = [*record.notes, *stage.repairs]
+            record.notes = [*record.notes, *stage.last_notes]
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
     except (MemoryError, torch.OutOfMemoryError) as error:

@@ -9,13 +9,14 @@ from typing import cast
 import torch
 from omegaconf import DictConfig
 
-from bench.auto import resolved
+from bench.auto import AUTO, resolved
 from bench.autodecoder import Prior, PriorSettings
 from bench.config import EvaluationSettings, build
 from bench.environment import pick_device
 from bench.prior_store import prior_for
 from bench.progress import Report
 from bench.records import Record
+from bench.thickness import follow
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
@@ -36,6 +37,7 @@ class Stage:
     device: torch.device
     cache: Path  # where what is slow to make is kept
     notes: tuple[str, ...] = ()  # what settings came to that follow from others
+    endings: tuple[Callable[[], str], ...] = ()  # what settings came to that change on the way, when it has ended
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
 
     @cached_property
@@ -44,9 +46,10 @@ class Stage:
         return self.make_scene()
 
     @property
-    def repairs(self) -> list[str]:
-        """What was done to the scene's mesh, if it was made."""
-        return list(self.scene.mesh.repairs) if "scene" in vars(self) else []
+    def last_notes(self) -> list[str]:
+        """What is known when a task has ended: repairs of the scene's mesh, if it was made, and the endings."""
+        repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
+        return [*repairs, *(ending() for ending in self.endings)]
 
     @cached_property
     def prior(self) -> Prior:
@@ -84,15 +87,9 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     device = pick_device(config.device)
-    packages = list(config.packages)
     views = build(config.view, "view", target="datasets.views.ViewSampler")
-    auto = build(config.auto, "auto", target="bench.auto.AutoSettings")
-    node, notes = resolved(config.renderer, views, auto)
-    renderer = build(node, "renderer", packages)
-    if not isinstance(renderer, Renderer):
-        name = type(renderer).__name__
-        raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
-    dataset = cast(Dataset, build(config.dataset, "dataset", packages))
+    chosen = _renderer(config, views)
+    dataset = cast(Dataset, build(config.dataset, "dataset", list(config.packages)))
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
     cache = Path(config.priors_dir)
@@ -106,7 +103,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         return prior_for(dataset, settings, cache, device, progress)
 
     return Stage(
-        renderer=renderer,
+        renderer=chosen.renderer,
         views=views,
         scene_name=scene_name(dataset, Split(config.split), config.index),
         make_scene=shape_and_view,
@@ -115,9 +112,35 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         seed=config.seed,
         device=device,
         cache=cache,
-        notes=tuple(notes),
+        notes=chosen.notes,
+        endings=chosen.endings,
         trained=trained,
     )
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """A renderer, and what is to be said of its settings; see Stage."""
+
+    renderer: Renderer
+    notes: tuple[str, ...]
+    endings: tuple[Callable[[], str], ...] = ()
+
+
+def _renderer(config: DictConfig, views: ViewSampler) -> _Chosen:
+    """The `renderer` node, built with a number for each `auto`."""
+    auto = build(config.auto, "auto", target="bench.auto.AutoSettings")
+    node, notes = resolved(config.renderer, views, auto)
+    renderer = build(node, "renderer", list(config.packages))
+    if not isinstance(renderer, Renderer):
+        name = type(renderer).__name__
+        raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
+    if config.renderer.get("samples") != AUTO:
+        return _Chosen(renderer, tuple(notes))
+    following = follow(renderer)
+    if "iterations" not in config.task:
+        raise ValueError("renderer.samples=auto follows an optimisation, and this task has none: give a number")
+    return _Chosen(following, tuple(notes), (following.ending,))
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

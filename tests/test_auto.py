@@ -39,7 +39,7 @@ def test_both_follow_each_other_and_are_told():
 
 
 def test_what_has_no_equation_is_told():
-    with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon and steps"):
+    with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps, samples"):
         resolved(OmegaConf.create({"alpha": "auto"}), VIEW, TEN)
     with pytest.raises(ValueError, match=r"view\.distance - 1 must be positive.*outside of the unit sphere"):
         epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), OmegaConf.create({}), TEN)

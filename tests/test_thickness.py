@@ -1,0 +1,175 @@
+"""Samples that follow the thinnest part of the shape: how thick it is, how many that takes, and what it must not do."""
+
+from dataclasses import replace
+from math import inf
+
+import pytest
+import torch
+
+from bench.auto import samples
+from bench.config import load
+from bench.execute import execute
+from bench.records import Record
+from bench.stage import set_up
+from bench.thickness import Following, Seen, follow, thickness, thinnest
+from renderers.field import Kind, Meter
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.rendering import Renderer, Scheduled, at_iteration
+from tests.analytic_cases import vector
+from tests.tiny import camera_of, silent
+
+DVR = load("renderer", "dvr", doublings=[])
+PLATE = box((0.5, 0.5, 0.025))
+RAYS = camera_of(32).rays()
+OBLIQUE = camera_of(32, angles=(30.0, 25.0)).rays()
+RUN = ("renderer=dvr", "renderer.samples=auto", "renderer.doublings=[]", "dataset=sphere", "scale=smoke")
+
+
+def hits_of(shape, rays, n=128):
+    return DVR.with_samples(n).render(shape, rays)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "radius", "n"),
+    [(inf, 1.0, 16), (0.5, 1.0, 16), (0.1, 1.0, 41), (0.1, 2.0, 81), (0.0625, 1.0, 65), (0.03, 1.0, 128)],
+)
+def test_two_samples_lie_in_the_thinnest_part(thickness, radius, n):
+    assert samples(thickness, radius) == n
+    if 16 < n < 128:
+        assert 2 * radius / (n - 1) <= thickness / 2 + 1e-12 < 2 * radius / (n - 2)
+
+
+def test_the_thickness_is_that_along_the_normal():
+    faces = torch.stack([vector((x, 0.1, 0.025)) for x in (0.0, 0.3, -0.45)])
+    assert thickness(PLATE, faces, radius=1.0).tolist() == pytest.approx([0.05] * 3, abs=1e-9)
+    side = vector((0.5, 0.0, 0.01))[None]
+    assert thickness(PLATE, side, radius=1.0).item() == pytest.approx(1.0, rel=0.05)
+    outline = torch.nn.functional.normalize(torch.stack([vector((1, 0, 0)), vector((0.99, 0, 0.14))]), dim=1) * 0.6
+    assert thickness(sphere(0.6), outline, radius=1.0).tolist() == pytest.approx([1.2, 1.2], rel=1e-6)
+
+
+def test_the_thickness_is_that_of_the_first_part_and_of_any_level_set():
+    shelf = box((0.5, 0.5, 0.03)).translate((0.0, 0.0, 0.3)) | box((0.5, 0.5, 0.2))
+    level = Shape(lambda p: torch.tanh(8 * shelf(p)), Kind.LEVEL, None)
+    for field, error in ((shelf, 1e-9), (level, 0.005)):
+        assert thickness(field, vector((0.1, 0.0, 0.33))[None], radius=1.0).item() == pytest.approx(0.06, abs=error)
+
+
+def test_what_is_thinner_than_the_finest_spacing_or_has_no_end_or_no_normal():
+    at = vector((0.0, 0.0, 0.0))[None]
+    sheet, everywhere = (
+        box((0.5, 0.5, 1e-3)).translate((0.0, 0.0, -1e-3)),
+        box((9.0, 9.0, 9.0)).translate((0.0, 0.0, -9.0)),
+    )
+    flat = Shape(lambda p: 0 * p.sum(-1) + 1, Kind.LEVEL, None)
+    assert thickness(sheet, at, radius=1.0).item() == pytest.approx(2 / 127)
+    assert thickness(everywhere, at, radius=1.0).item() == inf
+    assert thickness(flat, at, radius=1.0).item() == inf
+    assert thinnest(sphere(0.1), hits_of(sphere(0.1), RAYS.coarser(32)), radius=1.0) == pytest.approx(0.2, abs=1e-3)
+    assert thinnest(flat, hits_of(flat, RAYS), radius=1.0) == inf
+
+
+@pytest.mark.parametrize("rays", [RAYS, OBLIQUE], ids=["frontal", "oblique"])
+def test_a_plate_that_few_samples_lose_is_found_at_the_second_rendering(rays):
+    few, all_of_them = (hits_of(PLATE, rays, n).hit for n in (16, 128))
+    following = follow(DVR)
+    renderer = at_iteration(following, 0)
+    assert torch.equal(renderer.render(PLATE, rays).hit, few)
+    assert int((all_of_them & ~few).sum()) > 0.45 * int(all_of_them.sum())
+    found = renderer.render(PLATE, rays).hit
+    rim = 0 if rays is RAYS else 2  # pixels whose rays cross an edge, through less than the plate is thick
+    assert int((all_of_them & ~found).sum()) <= rim
+    assert following.samples in (81, 82)  # 4 R / 0.05 + 1
+
+
+def test_a_sphere_keeps_the_fewest_samples_whatever_grazes_it():
+    rays = camera_of(64).rays()
+    following = follow(DVR)
+    for iteration in range(3):
+        found = following.at_iteration(iteration).render(sphere(0.6), rays)
+    assert following.samples == 16
+    assert following.seen.thinnest == pytest.approx(1.2, rel=1e-3)
+    assert int((hits_of(sphere(0.6), rays).hit & ~found.hit).sum()) <= 0.02 * int(found.hit.sum())
+
+
+def test_a_shape_that_swells_keeps_the_samples_that_its_thinnest_part_took():
+    following = follow(DVR)
+    renderer = following.at_iteration(0)
+    for shape in (PLATE, sphere(0.6)):
+        renderer.render(shape, RAYS)
+    assert following.samples == 81
+
+
+def test_looks_are_counted_at_the_field_and_have_no_graph():
+    size = torch.tensor(0.6, requires_grad=True)
+    shape = sphere(size)
+    plain, looked = Meter(shape), Meter(shape)
+    before = DVR.with_samples(16).render(plain, RAYS)
+    after = follow(DVR).at_iteration(0).render(looked, RAYS)
+    assert torch.equal(before.distance, after.distance)
+    spent = looked.counts - plain.counts
+    assert (spent.value, spent.gradient) == (128 * 16, 128)  # 128 hits, 15 values and a normal each
+    for rendering in (before, after):
+        (rendering.distance[rendering.hit].sum()).backward()
+    assert looked.counts.gradient - 128 == plain.counts.gradient
+    assert size.grad is not None
+
+
+def test_what_judges_and_draws_changes_nothing():
+    following = follow(DVR)
+    assert torch.equal(following.render(PLATE, RAYS).distance, hits_of(PLATE, RAYS, 16).distance)
+    assert following.samples == 16
+    following.at_iteration(0).render(PLATE, RAYS)
+    assert torch.equal(following.render(PLATE, RAYS).distance, hits_of(PLATE, RAYS, 81).distance)
+
+
+def test_it_is_a_renderer_with_the_losses_and_the_schedule_of_its_own():
+    following = follow(DVR)
+    assert isinstance(following, Renderer) and isinstance(following, Scheduled)
+    assert following.capabilities == DVR.capabilities
+    rendering, mask = hits_of(PLATE, RAYS), torch.ones(32, 32, dtype=torch.bool)
+    losses = []
+    for renderer in (DVR, following):
+        torch.manual_seed(0)
+        losses.append(renderer.silhouette_loss(PLATE, RAYS, rendering, mask))
+    assert torch.equal(*losses)
+
+    class Turning(type(DVR)):
+        def at_iteration(self, iteration):
+            return replace(self, mask_weight=float(iteration))
+
+    turning = Following(Turning(**vars(DVR)), Seen())
+    assert turning.at_iteration(7).inner.mask_weight == 7.0
+
+
+def test_other_samples_and_other_schedules_are_refused(compose_config):
+    with pytest.raises(ValueError, match=r"spaced along the ray .*; in DIST, `samples` is something else: K, how many"):
+        set_up(compose_config("renderer=dist", "renderer.samples=auto"), silent)
+    with pytest.raises(ValueError, match=r"in Naive, `samples` is something else: .*Give a number"):
+        set_up(compose_config("renderer=naive", "renderer.samples=auto"), silent)
+    with pytest.raises(ValueError, match=r"doublings must be empty .*, not \[10, 30, 50\]: set doublings=\[\]"):
+        set_up(compose_config("renderer=dvr", "renderer.samples=auto"), silent)
+    with pytest.raises(ValueError, match=r"follows an optimisation, and this task has none"):
+        set_up(compose_config(*RUN, "task=ablation", "+common=fitted"), silent)
+
+
+def test_a_number_is_left_as_it_is(compose_config):
+    stage = set_up(compose_config("renderer=dvr"), silent)
+    assert (type(stage.renderer), stage.notes, stage.last_notes) == (type(DVR), (), [])
+
+
+def test_a_run_tells_how_it_began_and_what_it_came_to(compose_config, tmp_path):
+    config = compose_config(
+        *RUN, "task=pose", "task.shape=formula", "task.iterations=3", "view.resolution=16", "evaluation.picture=null",
+        "device=cpu",
+    )  # fmt: skip
+    record = Record("id", "pose", "dvr", "sphere", 0, {"label": None})
+    execute(config, tmp_path, record, progress=silent, checkpoint=lambda record: None)
+    assert record.status in ("ok", "not_reached"), record.reason
+    first, last = (note for note in record.notes if note.startswith("renderer.samples=auto"))
+    assert first == "renderer.samples=auto begins with 16, and follows the thinnest part that is seen"
+    assert last.startswith("renderer.samples=auto came to 16, for a part 1.") and last.endswith(" scene units thick")
+
+
+def test_a_run_without_renderings_says_so():
+    assert follow(DVR).ending() == "renderer.samples=auto stayed at 16: no optimisation saw how thick the shape is"
