@@ -7,7 +7,7 @@ number of samples follows from the shape, so that it changes on the way: see `be
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, inf, log, radians, sin
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -67,6 +67,14 @@ def samples(thinnest: float, radius: float) -> int:
     return min(max(wanted, FEWEST), MOST)
 
 
+def rays(most: int, least: int, footprint: float, error: float) -> int:
+    """How many pixels there are where half a pixel is the error that is left, out of `most` where it is `footprint`.
+
+    A pixel need be no finer than the error: DIST, Eq. 10, solved for the resolution R, whose square this goes with.
+    """
+    return min(max(ceil(most * (footprint / max(error, footprint)) ** 2), least), most)
+
+
 def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
     """The number of samples before any part of the shape has been seen."""
     return samples(inf, RADIUS)
@@ -77,6 +85,7 @@ FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
     "steps": steps,
     "samples": first_samples,
 }
+OF_A_PIXEL = ("epsilon", "steps")  # that follow from the camera alone
 CHANGING = {"samples": ("begins with", "and follows the thinnest part that is seen")}
 
 
@@ -99,3 +108,8 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
         verb, reason = CHANGING.get(name, ("is", seen))
         notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
     return node, notes
+
+
+def frugal(renderer: DictConfig) -> DictConfig:
+    """The renderer's node with `auto` for all that it has of `OF_A_PIXEL`."""
+    return cast(DictConfig, OmegaConf.merge(renderer, {name: AUTO for name in OF_A_PIXEL if name in renderer}))

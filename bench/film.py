@@ -27,15 +27,19 @@ LAST_SECONDS = 1.5  # the end stays for longer
 class Film:
     """Frames of a run; none are taken where pictures are off."""
 
-    def __init__(self, stage: Stage):
-        """For a run; the truth is seen by the scene's camera with the pixels of pictures."""
-        self.stage = stage
-        self.frames: dict[int, View] = {}
+    def __init__(self, stage: Stage, over: str = "after iterations"):
+        """For a run; the truth is seen by the scene's camera with the pixels of pictures.
 
-    def shoot(self, iteration: int, field: Field, camera: Camera) -> None:
-        """Takes the frame before an iteration, with the camera's view in the pixels of pictures."""
+        Args:
+            over: what the frames' names are.
+        """
+        self.stage, self.over = stage, over
+        self.frames: dict[int | str, View] = {}
+
+    def shoot(self, name: int | str, field: Field, camera: Camera) -> None:
+        """Takes a frame, before an iteration for example, with the camera's view in the pixels of pictures."""
         if self.stage.evaluation.picture is not None:
-            self.frames[iteration] = look(field, self._fine(camera), self.stage)
+            self.frames[name] = look(field, self._fine(camera), self.stage)
 
     def save(self, folder: Path, title: str) -> None:
         """Writes strip.png into a run folder, and film.gif or film.webp where one is asked for."""
@@ -44,25 +48,32 @@ class Film:
         truth = see(Truth(self.stage.scene.mesh), self._fine(self.stage.scene.view.camera))
         matplotlib.use("Agg")
         with matplotlib.rc_context(STYLE):
-            _strip(self.frames, truth, title).savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
+            _strip(self._shown(), truth, f"{title}; {self.over}").savefig(
+                folder / "strip.png", dpi=110, bbox_inches="tight"
+            )
         if self.stage.evaluation.film is not None:
             _animate(folder / f"film.{self.stage.evaluation.film}", list(self.frames.values()), truth)
+
+    def _shown(self) -> dict[int | str, View]:
+        """Some frames, evenly chosen; without the last look, where that is a step before the end."""
+        names = list(self.frames)
+        last = names[-2:]
+        if len(names) > 2 and all(isinstance(name, int) for name in last) and int(last[1]) - int(last[0]) == 1:
+            del names[-2]
+        places = np.unique(np.linspace(0, len(names) - 1, min(MOST, len(names))).round().astype(int))
+        return {names[place]: self.frames[names[place]] for place in places}
 
     def _fine(self, camera: Camera) -> Camera:
         size = self.stage.evaluation.picture
         return camera.resized(size, size)
 
 
-def _strip(frames: dict[int, View], truth: View, title: str) -> Figure:
-    """A column for each of some evenly chosen frames and for the truth: normals above, silhouette error below.
+def _strip(frames: dict[int | str, View], truth: View, title: str) -> Figure:
+    """A column for each frame and for the truth: normals above, silhouette error below.
 
     One picture on one axis: a figure of twenty axes takes a second to draw.
     """
-    known = list(frames.items())
-    if len(known) > 2 and known[-1][0] - known[-2][0] == 1:
-        del known[-2]  # the last look, a step before the end
-    places = np.unique(np.linspace(0, len(known) - 1, min(MOST, len(known))).round().astype(int))
-    shown = {str(known[place][0]): known[place][1] for place in places} | {"truth": truth}
+    shown = {str(name).replace("_", " "): view for name, view in frames.items()} | {"truth": truth}
     part = window([view.mask.numpy() for view in shown.values()])
     true = truth.mask.numpy()
     columns = [(_normals(view)[part], silhouette_image(view.mask.numpy(), true)[part]) for view in shown.values()]
@@ -74,7 +85,7 @@ def _strip(frames: dict[int, View], truth: View, title: str) -> Figure:
     axis.set_xticks([size * (place + 0.5) for place in range(len(shown))], list(shown))
     axis.set_yticks([size * 0.5, size * 1.5], ["normals", "silhouette error"], rotation=90, va="center")
     axis.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
-    figure.suptitle(f"{title}; after iterations (red lost, blue false)")
+    figure.suptitle(f"{title} (red lost, blue false)")
     return figure
 
 

@@ -12,7 +12,7 @@ from bench.records import RunStatus
 from bench.tasks.problem import OptimiserSettings, Problem
 from renderers.field import Counts
 
-DIVERGED = 100.0  # times its first value: a loss above that has diverged
+DIVERGED = 100.0  # times its first value, or what stands for it: a loss above that has diverged
 
 
 @dataclass
@@ -25,6 +25,7 @@ class Course:
     seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
+    least_reference: float = 0.0  # a first loss below that, of a start that is nearly right, counts as that
     objectives: list[float] = field(default_factory=list)  # the problem's own, before and after, where it has one
 
 
@@ -77,7 +78,7 @@ def optimise(
 
 def _failed(course: Course, problem: Problem) -> bool:
     """Notes in the course why it cannot go on, if so."""
-    loss, first = course.curve[-1]["total"], course.curve[0]["total"]
+    loss, first = course.curve[-1]["total"], max(course.curve[0]["total"], course.least_reference)
     iteration = course.curve[-1]["iteration"]
     finite = all(bool(parameter.isfinite().all()) for parameter in problem.parameters)
     if loss != loss or not finite:

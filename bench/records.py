@@ -49,7 +49,7 @@ class Record:
     started: str = field(default_factory=now)
     status: RunStatus = RunStatus.KILLED
     reason: str = "the run is under way, or was killed before it could say why"
-    metrics: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
     metrics_start: dict[str, float] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
     evaluations: dict[str, float] = field(default_factory=dict)

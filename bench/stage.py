@@ -9,7 +9,7 @@ from typing import cast
 import torch
 from omegaconf import DictConfig
 
-from bench.auto import AUTO, resolved
+from bench.auto import AUTO, frugal, resolved
 from bench.autodecoder import Prior, PriorSettings
 from bench.config import EvaluationSettings, build
 from bench.environment import pick_device
@@ -30,6 +30,7 @@ class Stage:
     renderer: Renderer
     views: ViewSampler
     scene_name: str
+    make_frugal: Callable[[], Renderer]
     make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
     evaluation: EvaluationSettings
@@ -44,6 +45,11 @@ class Stage:
     def scene(self) -> Scene:
         """The scene, made when it is first asked for: not every task needs one."""
         return self.make_scene()
+
+    @cached_property
+    def frugal(self) -> Renderer:
+        """The renderer with no more precision than a pixel, and no more steps than that takes."""
+        return self.make_frugal()
 
     @property
     def last_notes(self) -> list[str]:
@@ -88,7 +94,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         torch.set_num_threads(config.threads)
     device = pick_device(config.device)
     views = build(config.view, "view", target="datasets.views.ViewSampler")
-    chosen = _renderer(config, views)
+    chosen = _renderer(config, config.renderer, views)
     dataset = cast(Dataset, build(config.dataset, "dataset", list(config.packages)))
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
@@ -106,6 +112,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         renderer=chosen.renderer,
         views=views,
         scene_name=scene_name(dataset, Split(config.split), config.index),
+        make_frugal=lambda: _renderer(config, frugal(config.renderer), views).renderer,
         make_scene=shape_and_view,
         make_prior=make_prior,
         evaluation=evaluation,
@@ -127,19 +134,19 @@ class _Chosen:
     endings: tuple[Callable[[], str], ...] = ()
 
 
-def _renderer(config: DictConfig, views: ViewSampler) -> _Chosen:
-    """The `renderer` node, built with a number for each `auto`."""
+def _renderer(config: DictConfig, asked: DictConfig, views: ViewSampler) -> _Chosen:
+    """A `renderer` node, built with a number for each `auto`."""
     auto = build(config.auto, "auto", target="bench.auto.AutoSettings")
-    node, notes = resolved(config.renderer, views, auto)
+    node, notes = resolved(asked, views, auto)
     renderer = build(node, "renderer", list(config.packages))
     if not isinstance(renderer, Renderer):
         name = type(renderer).__name__
         raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
-    if config.renderer.get("samples") != AUTO:
+    if asked.get("samples") != AUTO:
         return _Chosen(renderer, tuple(notes))
+    if config.stress is not None:
+        raise ValueError("renderer.samples=auto follows one optimisation, and a stress has many trials: give a number")
     following = follow(renderer)
-    if "iterations" not in config.task:
-        raise ValueError("renderer.samples=auto follows an optimisation, and this task has none: give a number")
     return _Chosen(following, tuple(notes), (following.ending,))
 
 

@@ -12,6 +12,7 @@ from bench.plan import Plan
 from bench.records import Record, RunStatus
 from bench.report.format import count, number, seconds
 from bench.report.html import write_index
+from bench.report.ladder import Ladder
 from bench.report.planned import NOT_RUN
 
 ROWS = (  # metric, what it is called, factor, better when
@@ -39,6 +40,8 @@ def show(folder: Path, record: Record, index: Path) -> None:
             table.add_row(label, number(before, factor), number(after, factor), better)
     if table.row_count:
         console.print(table)
+    elif "recommended_field" in record.metrics:
+        console.print(_ladder(record))
     elif record.metrics:
         console.print(_measured(record))
     if "iterations" in record.evaluations:
@@ -68,6 +71,22 @@ def show_sweep(plan: Plan) -> list[str]:
     print(f"report: {write_index(plan.results_dir)}")
     print(plan.folder)
     return statuses
+
+
+def _ladder(record: Record) -> Table:
+    """What each rung of a capacity run came to; the recommended one is marked."""
+    ladder = Ladder.of(record.metrics)
+    title = f"{record.task}, {record.name}, {record.scene}; half a pixel is {number(1000 * ladder.footprint)} (x1000)"
+    table = Table(box=box.SIMPLE_HEAD, title=escape(title))
+    for heading in ("", "field", "numbers", "FLOPs a query", "error (x1000)", "its noise", "fit"):
+        table.add_column(heading, justify="left" if heading in ("", "field") else "right")
+    for rung in ladder.rungs:
+        own = rung.numbers
+        mark = "=>" if rung is ladder.chosen else "best" if rung is ladder.best else ""
+        size = f"{own['parameters']:,}", count(own["flops_per_query"])
+        error = number(own.get("error"), 1000), number(own.get("standard_error"), 1000)
+        table.add_row(mark, rung.label, *size, *error, seconds(own["seconds"]))
+    return table
 
 
 def _measured(record: Record) -> Table:

@@ -1,6 +1,5 @@
 """A renderer whose number of samples follows the thinnest part of the shape: `renderer.samples=auto`."""
 
-import re
 from dataclasses import dataclass, field, replace
 from math import inf, log2
 from typing import cast
@@ -43,9 +42,6 @@ class Following:
     inner: Spaced
     seen: Seen = field(default_factory=Seen)
     looks: bool = False
-
-    def __post_init__(self) -> None:
-        self.current()
 
     @property
     def capabilities(self) -> Capabilities:
@@ -90,15 +86,13 @@ def follow(renderer: Renderer) -> Following:
     """The renderer with samples that follow the shape.
 
     Raises:
-        ValueError: where its samples are not spaced along the ray, or other settings decide on their number as well.
+        ValueError: where its samples are not spaced along the ray.
     """
     if isinstance(renderer, Spaced):
         return Following(renderer)
-    described = re.search(r"^\s*samples: (.+?)\.?$", type(renderer).__doc__ or "", re.MULTILINE)
-    own = f", `samples` is something else: {described[1]}" if described else " they are not"
     raise ValueError(
-        f"renderer.samples=auto is for samples spaced along the ray (DVR, Eq. 9); in {type(renderer).__name__}{own}. "
-        "Give a number"
+        f"renderer.samples=auto is for samples spaced along the ray (DVR, Eq. 9), which {type(renderer).__name__} has "
+        "not, whatever it calls samples: give a number"
     )
 
 

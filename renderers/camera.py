@@ -153,13 +153,13 @@ class Camera:
         return pixels @ torch.linalg.inv(self.intrinsics).T
 
 
-def rigid(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
-    """The matrix exponential of an element of se(3): translation in scene units, then rotation vector in radians."""
-    x, y, z = twist[3:]
+def rigid(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """The matrix exponential of elements of se(3): translation in scene units, then rotation vector in radians."""
+    x, y, z = twist[..., 3:].unbind(-1)
     zero = torch.zeros_like(x)
-    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    rows = torch.cat([turn, twist[:3, None]], dim=1)
-    return torch.linalg.matrix_exp(torch.cat([rows, torch.zeros_like(rows[:1])]))
+    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    rows = torch.cat([turn, twist[..., :3, None]], dim=-1)
+    return torch.linalg.matrix_exp(torch.cat([rows, torch.zeros_like(rows[..., :1, :])], dim=-2))
 
 
 def sphere_span(

@@ -74,16 +74,8 @@ class DVR:
         return replace(self, samples=max(self.samples // 2**to_come, 2))
 
     def with_samples(self, samples: int) -> "DVR":
-        """With another n, at every iteration.
-
-        Raises:
-            ValueError: where `doublings` make n another one.
-        """
-        if self.doublings:
-            raise ValueError(
-                f"doublings must be empty where n is set from outside, not {list(self.doublings)}: set doublings=[]"
-            )
-        return replace(self, samples=samples)
+        """With another n, at every iteration: without doublings."""
+        return replace(self, samples=samples, doublings=())
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Searches without a graph, then attaches the implicit gradient to the hits."""

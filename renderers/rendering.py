@@ -95,11 +95,7 @@ class Spaced(Renderer, Protocol):
     sphere_radius: float
 
     def with_samples(self, samples: int) -> "Spaced":
-        """The renderer with that many samples a ray.
-
-        Raises:
-            ValueError: where another setting decides on the number as well.
-        """
+        """The renderer with that many samples a ray, at every iteration."""
         ...
 
 

@@ -22,7 +22,7 @@ DVR = load("renderer", "dvr", doublings=[])
 PLATE = box((0.5, 0.5, 0.025))
 RAYS = camera_of(32).rays()
 OBLIQUE = camera_of(32, angles=(30.0, 25.0)).rays()
-RUN = ("renderer=dvr", "renderer.samples=auto", "renderer.doublings=[]", "dataset=sphere", "scale=smoke")
+RUN = ("renderer=dvr", "renderer.samples=auto", "dataset=sphere", "scale=smoke")
 
 
 def hits_of(shape, rays, n=128):
@@ -142,15 +142,12 @@ def test_it_is_a_renderer_with_the_losses_and_the_schedule_of_its_own():
     assert turning.at_iteration(7).inner.mask_weight == 7.0
 
 
-def test_other_samples_and_other_schedules_are_refused(compose_config):
-    with pytest.raises(ValueError, match=r"spaced along the ray .*; in DIST, `samples` is something else: K, how many"):
-        set_up(compose_config("renderer=dist", "renderer.samples=auto"), silent)
-    with pytest.raises(ValueError, match=r"in Naive, `samples` is something else: .*Give a number"):
-        set_up(compose_config("renderer=naive", "renderer.samples=auto"), silent)
-    with pytest.raises(ValueError, match=r"doublings must be empty .*, not \[10, 30, 50\]: set doublings=\[\]"):
-        set_up(compose_config("renderer=dvr", "renderer.samples=auto"), silent)
-    with pytest.raises(ValueError, match=r"follows an optimisation, and this task has none"):
-        set_up(compose_config(*RUN, "task=ablation", "+common=fitted"), silent)
+def test_other_samples_and_many_optimisations_are_refused(compose_config):
+    for name in ("dist", "naive"):
+        with pytest.raises(ValueError, match=r"spaced along the ray .* has not, whatever it calls samples"):
+            set_up(compose_config(f"renderer={name}", "renderer.samples=auto"), silent)
+    with pytest.raises(ValueError, match=r"follows one optimisation, and a stress has many trials"):
+        set_up(compose_config(*RUN, "task=stability", "stress=thin_plate"), silent)
 
 
 def test_a_number_is_left_as_it_is(compose_config):

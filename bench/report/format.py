@@ -6,11 +6,13 @@ MISSING = "–"
 INFINITE = "∞"
 
 
-def number(x: int | float | None, scale: float = 1.0) -> str:
+def number(x: int | float | str | None, scale: float = 1.0) -> str:
     """`x * scale` to three significant digits, such as 0.0123, 12.3, 1230 or 1.23e-7.
 
-    Zero is "0"; None is missing; a number that is not one is "nan".
+    Zero is "0"; None is missing; a number that is not one is "nan". A word stays as it is.
     """
+    if isinstance(x, str):
+        return x
     if x is None:
         return MISSING
     value = float(x) * scale

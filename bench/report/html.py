@@ -59,10 +59,11 @@ def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     machine, threads = _machine(record)
     return {
         **{name: record[name] for name in ("folder", "task", "renderer", "dataset", "seed", "status", "reason")},
-        **{name: record[name] for name in ("started", "definitions", "environment", "reused", "notes")},
+        **{name: record[name] for name in ("started", "environment", "reused", "notes")},
+        "definitions": {name: text for name in names if (text := _definition(record["definitions"], name))},
         **{name: _number(record, name) for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
         "scene": record.get("scene") or record["dataset"],  # a run that failed early never had a scene
-        "metrics": {name: _number(record["metrics"], name) for name in names},
+        "metrics": {name: _value(record["metrics"], name) for name in names},
         "start": {name: _number(record["metrics_start"], name) for name in names},
         "others": [name for name in names if name not in _NOT_OTHERS],
         "seconds": {name: _number(record["seconds"], name) for name in ("total", *record["seconds"])},
@@ -81,6 +82,24 @@ def _machine(record: dict[str, Any]) -> tuple[str, str]:
     parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
     label = " + ".join(part for part in parts if part and part != "cpu")
     return label or format.MISSING, str(environment.get("threads") or format.MISSING)
+
+
+def _definition(definitions: dict[str, str], name: str) -> str:
+    """The definition of a metric: a key may name several, and stand for those of every band, rung or kind."""
+    if name in definitions:
+        return definitions[name]
+    last = name.rsplit(".", 1)[-1]
+    for key, text in definitions.items():
+        parts = [part.strip().rsplit(".", 1)[-1] for part in key.split(",")]
+        if last in parts or any(part.endswith("_...") and last.startswith(part[:-3]) for part in parts):
+            return text
+    return ""
+
+
+def _value(values: dict[str, Any], name: str) -> int | float | str | None:
+    """The number of that name, or the word."""
+    value = values.get(name)
+    return value if isinstance(value, str) else _number(values, name)
 
 
 def _number(values: dict[str, Any], name: str) -> int | float | None:

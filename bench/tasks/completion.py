@@ -1,10 +1,10 @@
 """Shape completion: find the code whose shape agrees with a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.autodecoder import Prior
@@ -87,15 +87,15 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class GivenView:
-    """What is given of a view; `compare` renders a field and compares."""
+    """What is given of a view, or of rays of any leading shape; `compare` renders a field and compares."""
 
     settings: Weights
     renderer: Renderer
     rays: Rays
-    depth: Float[Tensor, "height width"]
-    depth_of_distance: Float[Tensor, "height width"]  # depth of a point at distance 1, the cosine of Eq. 2
-    observed: Bool[Tensor, "height width"]
-    mask: Bool[Tensor, "height width"] | None
+    depth: Float[Tensor, "*rays"]
+    depth_of_distance: Float[Tensor, "*rays"]  # depth of a point at distance 1, the cosine of Eq. 2
+    observed: Bool[Tensor, "*rays"]
+    mask: Bool[Tensor, "*rays"] | None
 
     @staticmethod
     def of(
@@ -117,6 +117,11 @@ class GivenView:
             observed=observed.to(device),
             mask=None if mask is None else mask.to(device),
         )
+
+    def some(self, rays: Int[Tensor, " n"]) -> "GivenView":
+        """What is given of some rays of a row."""
+        parts = {name: getattr(self, name)[rays] for name in ("rays", "depth", "depth_of_distance", "observed")}
+        return replace(self, **parts, mask=None if self.mask is None else self.mask[rays])
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted terms of DIST, Eq. 5, with the weights of B.4."""

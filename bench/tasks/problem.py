@@ -16,6 +16,9 @@ from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer
 
+SCHEDULES = ("constant", "cosine", "ramped")
+RAMP = 0.1  # share of the iterations over which "ramped" rises
+
 
 class Unsupported(Exception):
     """A renderer lacks what a task needs; the message says what."""
@@ -32,7 +35,8 @@ class OptimiserSettings:
     Args:
         iterations: how many.
         learning_rate: of Adam, at the start.
-        schedule: "constant", or "cosine": the rate falls to zero along half a cosine.
+        schedule: "constant", or "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises
+            from zero over the first tenth, for a start that is nearly right.
     """
 
     iterations: int
@@ -42,12 +46,13 @@ class OptimiserSettings:
     def __post_init__(self) -> None:
         check_at_least("task.iterations", self.iterations, 1, "the paper uses 100")
         check_positive("task.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
-        check_choice("task.schedule", self.schedule, ("constant", "cosine"))
+        check_choice("task.schedule", self.schedule, SCHEDULES)
 
     def rate(self, iteration: int) -> float:
         """The learning rate of an iteration, counted from 0."""
         fall = 1.0 if self.schedule == "constant" else 0.5 * (1 + cos(pi * iteration / self.iterations))
-        return self.learning_rate * fall
+        rise = min((iteration + 1) / (RAMP * self.iterations), 1.0) if self.schedule == "ramped" else 1.0
+        return self.learning_rate * fall * rise
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from torch import Tensor
 from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
+LEAST_SHARE = 1e-6  # of the larger part of a norm: what is less than that changes no float32 value
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,28 @@ def rounded_box(half_sizes: Numbers, radius: Numbers) -> Shape:
     return Shape(lambda p: box(_like(half_sizes, p) - _like(radius, p))(p) - _like(radius, p))
 
 
+def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
+    """A superquadric (Barr 1981) of half sizes `half_sizes` [3] about the origin; a bound.
+
+    Its surface is where a norm is 1: ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes.
+    That norm is at most as steep as the Euclidean one for exponents of 2 and more, and 2^(1/p - 1/2) times as steep
+    below, by which its values are divided.
+
+    Args:
+        half_sizes: along x, y and z, in scene units, positive.
+        exponents: p across x and y, q towards z, each 1 or more: 1 is an octahedron, 2 an ellipsoid, many a box.
+    """
+
+    def bound(points: Tensor) -> Tensor:
+        sizes = _like(half_sizes, points)
+        p, q = _like(exponents, points).unbind()
+        x, y, z = (points / sizes).abs().unbind(-1)
+        slope = 2 ** ((1 / p - 0.5).clamp_min(0) + (1 / q - 0.5).clamp_min(0))
+        return sizes.min() / slope * (_length(torch.stack([_length(torch.stack([x, y], -1), p), z], -1), q) - 1)
+
+    return Shape(bound, Kind.BOUND)
+
+
 def torus(major: Numbers, minor: Numbers) -> Shape:
     """A torus about the y axis: tube of radius `minor` around a circle of radius `major`; exact distance."""
 
@@ -152,6 +175,13 @@ def _combine(function: Callable[[Tensor, Tensor], Tensor], first: Shape, second:
 
 def _like(value: Numbers, points: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=points.dtype, device=points.device)
+
+
+def _length(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*batch"]:
+    """The norm of that power of parts that are not negative; scaled by the largest, so that no power overflows."""
+    largest = parts.amax(-1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)
+    shares = (parts / largest).clamp_min(LEAST_SHARE)  # a power of 0 has no gradient towards its exponent
+    return largest.squeeze(-1) * (shares**power).sum(-1) ** (1 / power)
 
 
 def _norm(vectors: Tensor) -> Tensor:

@@ -1,0 +1,118 @@
+"""Early growth: from the smallest rung on, only while the held-out error falls by more than its noise."""
+
+from dataclasses import dataclass, field
+from math import ceil
+
+from bench.ladder.choice import Evidence
+from bench.ladder.fit import Fitted, Fitter
+from bench.ladder.model import Rung
+from renderers.checks import check_at_least, check_share
+
+OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
+
+
+@dataclass(frozen=True)
+class GrowthSettings:
+    """How far growth looks ahead.
+
+    Args:
+        trial: share of a whole fit's iterations that a rung is tried for.
+        vain: share of the present rung's whole fit that larger rungs may cost in vain, before growth ends.
+    """
+
+    trial: float
+    vain: float
+
+    def __post_init__(self) -> None:
+        check_share("task.growth.trial", self.trial, "1/16 tells whether a rung is better than the one before")
+        check_at_least("task.growth.vain", self.vain, 0, "0.4 keeps the whole within twice the last rung's fit")
+
+
+@dataclass
+class Growth:
+    """What was tried, and what it ended on.
+
+    Args:
+        fitted: the rung that it ended on, fitted to the end.
+        tried: every rung in its turn, as far as it was fitted.
+        kept: names of the rungs that it stood on, one after the other.
+    """
+
+    fitted: Fitted
+    tried: list[Evidence]
+    kept: list[str]
+
+    @property
+    def overhead(self) -> float:
+        """Seconds of all fits together over those of the fit that it ended on, which are its whole budget."""
+        return self.seconds / max(self.fitted.evidence.seconds, 1e-9)
+
+    @property
+    def seconds(self) -> float:
+        """Of all fits together, without looks."""
+        return sum(evidence.seconds for evidence in self.tried)
+
+    @property
+    def evaluations(self) -> int:
+        """Field values of all fits together."""
+        return sum(evidence.evaluations for evidence in self.tried)
+
+    @property
+    def flops(self) -> int:
+        """Of all fits together."""
+        return sum(evidence.flops for evidence in self.tried)
+
+
+@dataclass
+class _Standing:
+    """Where growth stands."""
+
+    fitted: Fitted
+    rung: Rung
+    kept: list[str] = field(default_factory=list)
+    vain: float = 0.0  # cost, in FLOPs a query times shares of a fit
+
+
+def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
+    """Tries rungs from the smallest on, keeps those that are better, and fits the last to the end.
+
+    A rung is better where its held-out error is less than that of the one before by more than the standard error of the
+    difference, over the same rays. Growth ends where the error is below the footprint, or before the next rung would
+    bring what was tried in vain above its share of the present rung's fit.
+
+    Args:
+        fitter: fits them.
+        rungs: the smallest first.
+        settings: how far to look ahead.
+
+    Raises:
+        ValueError: where no rung can be fitted.
+    """
+    whole = fitter.settings.iterations
+    trial = max(ceil(settings.trial * whole), 1)
+    share = trial / whole + fitter.warm_share
+    tried: list[Evidence] = []
+    now: _Standing | None = None
+    for rung in rungs:
+        cost = (rung.flops + OVERHEAD) * share
+        if now is not None and now.vain + cost > settings.vain * (now.rung.flops + OVERHEAD):
+            break
+        fitted = fitter.begin(rung, None if now is None else now.fitted.model)
+        tried.append(fitted.evidence)
+        fitter.fit(fitted, trial, schedule="ramped", looks=False)
+        if now is None or _is_better(fitted, now.fitted):
+            now = _Standing(fitted, rung, [*([] if now is None else now.kept), rung.name])
+        else:
+            now.vain += cost
+        if now.fitted.evidence.mean <= fitter.observations.footprint:
+            break
+    if now is None:
+        raise ValueError("no rung can be fitted: task.ladder is empty")
+    fitter.fit(now.fitted, whole - trial, schedule="ramped", looks=True)
+    return Growth(now.fitted, tried, now.kept)
+
+
+def _is_better(new: Fitted, old: Fitted) -> bool:
+    if new.evidence.error is None or old.evidence.error is None:
+        return old.evidence.error is None and new.evidence.error is not None
+    return old.evidence.mean - new.evidence.mean > new.evidence.error.noise_of_difference(old.evidence.error)

@@ -1,0 +1,114 @@
+"""Rungs without a formula: networks of one shape, and a grid whose samples near the surface are free."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bench.autodecoder import initialise_to_sphere
+from bench.ladder.model import Model, Seen
+from renderers.checks import check_at_least
+from renderers.fields.grid import FLOPS, Grid
+from renderers.fields.mlp import BoundDecoder, Decoder
+
+DEEP = 8  # layers from which on the points come in again half-way, as in DeepSDF
+FASTEST, RATE_OF_WIDTH = 2e-3, 0.1  # Adam's rate falls as the width grows (Yang et al. 2021), from a largest one on
+START_RADIUS = 0.5  # of the ball that a network begins near, in scene units
+REACH = 1.05  # of the sampled cube: the unit sphere and a little more
+BAND = 2.0  # cells to both sides of the surface whose samples are free
+GRID_RATE = 1e-3  # scene units
+
+
+@dataclass(frozen=True)
+class Network:
+    """Fully connected ReLU layers from a point to a distance (see `renderers.fields.mlp.Decoder`, without a code)."""
+
+    layers: int
+    width: int
+
+    def __post_init__(self) -> None:
+        check_at_least("network layers", self.layers, 1, "network_1x16 is the least of the default ladder")
+        check_at_least("network width", self.width, 4, "network_1x16 is the least of the default ladder")
+
+    @property
+    def name(self) -> str:
+        return f"network_{self.layers}x{self.width}"
+
+    @property
+    def size(self) -> int:
+        """Free numbers."""
+        return sum(parameter.numel() for parameter in self._decoder().parameters())
+
+    @property
+    def flops(self) -> int:
+        return self._bound(list(self._decoder().parameters())).flops.value
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """Near a ball's distance; what was there before is taken over by the warm start."""
+        with torch.random.fork_rng():
+            torch.manual_seed(seen.seed)
+            decoder = self._decoder()
+            initialise_to_sphere(decoder, START_RADIUS)
+        parameters = [parameter.detach().to(seen.device).requires_grad_() for parameter in decoder.parameters()]
+        return [Model(self.name, parameters, self._bound, min(FASTEST, RATE_OF_WIDTH / self.width), metric=False)]
+
+    def _decoder(self) -> Decoder:
+        skip = self.layers // 2 if self.layers >= DEEP else 0
+        return Decoder(layers=self.layers, width=self.width, code_length=0, skip=skip, narrow=True)
+
+    def _bound(self, free: list[Tensor]) -> BoundDecoder:
+        pairs = list(zip(free[::2], free[1::2], strict=True))
+        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], self.layers // 2 if self.layers >= DEEP else 0)
+
+
+@dataclass(frozen=True)
+class NarrowBand:
+    """A grid of distances of which those near the surface are free; the others stay those of the previous field."""
+
+    resolution: int
+
+    def __post_init__(self) -> None:
+        check_at_least("grid", self.resolution, 8, "grid_32 is that of the default ladder")
+
+    @property
+    def name(self) -> str:
+        return f"grid_{self.resolution}"
+
+    @property
+    def flops(self) -> int:
+        return FLOPS.value
+
+    @torch.no_grad()
+    def starts(self, seen: Seen) -> list[Model]:
+        """The previous field's values; free ones lie near its surface or near the observed points.
+
+        Raises:
+            ValueError: where there is no previous field.
+        """
+        if seen.previous is None:
+            raise ValueError(f"{self.name} needs a field to start from: put another rung before it in task.ladder")
+        axis = torch.linspace(-REACH, REACH, self.resolution, device=seen.device)
+        corners = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        values = seen.previous.frozen()(corners.view(-1, 3))
+        cell = 2 * REACH / (self.resolution - 1)
+        near = values.abs() < BAND * cell
+        near[self._around(seen.points.to(seen.device), cell)] = True
+        band = near.nonzero().squeeze(-1)
+
+        def grid(free: list[Tensor]) -> Grid:
+            kept = values.index_put((band,), free[0])
+            return Grid(kept.view(self.resolution, self.resolution, self.resolution), REACH)
+
+        free = values[band].clone().requires_grad_()
+        return [Model(self.name, [free], grid, GRID_RATE, metric=False, held=len(values) - len(free))]
+
+    def _around(self, points: Float[Tensor, "n 3"], cell: float) -> Int[Tensor, " m"]:
+        """The samples within `BAND` cells of some point, along each axis."""
+        reach = int(BAND)
+        steps = torch.arange(1 - reach, reach + 1, device=points.device)
+        offsets = torch.cartesian_prod(steps, steps, steps)
+        low = ((points + REACH) / cell).floor().long()
+        corners = (low[:, None] + offsets).clamp(0, self.resolution - 1).reshape(-1, 3)
+        place = (corners[:, 0] * self.resolution + corners[:, 1]) * self.resolution + corners[:, 2]
+        return place.unique()

@@ -1,0 +1,126 @@
+"""Fits a ladder of fields to one shape, and says which rung the shape needs, and what that saves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from bench.ladder.choice import Choice, Evidence, choose, is_as_good
+from bench.ladder.fit import Fitted, Fitter
+from bench.ladder.growth import Growth, GrowthSettings, grow
+from bench.ladder.model import Rung
+from bench.ladder.views import Views
+from renderers.checks import check_at_least
+from renderers.field import Counts, Meter
+from renderers.rendering import Renderer
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """How a choice is checked by views that it has not seen.
+
+    Args:
+        views: how many more there are.
+        seeds: draws of some of them.
+        drawn: how many of them a draw has.
+    """
+
+    views: int
+    seeds: int
+    drawn: int
+
+    def __post_init__(self) -> None:
+        check_at_least("task.checks.seeds", self.seeds, 1, "20 can tell 95 %")
+        check_at_least("task.checks.drawn", self.drawn, 2, "8 give a standard error")
+        check_at_least("task.checks.views", self.views, self.drawn, f"{3 * self.drawn} give draws that differ")
+
+
+@dataclass
+class Study:
+    """The fits of all rungs to the same observations.
+
+    Args:
+        fitter: of the renderer as it was asked for.
+        frugal: the same renderer, no more precise than a pixel.
+        fewest_rays: that an iteration of the frugal fit begins with.
+        on_rung: is told of each rung that was fitted, and how many there are.
+    """
+
+    fitter: Fitter
+    frugal: Renderer
+    fewest_rays: int
+    on_rung: Callable[[Fitted, int], None]
+    fits: list[Fitted] = field(default_factory=list)
+
+    def climb(self, rungs: list[Rung]) -> list[Evidence]:
+        """Fits every rung, each begun with the best before it where that helps."""
+        for rung in rungs:
+            self.fits.append(self._fitted(self.fitter, rung, self._best(self.fits)))
+            self.on_rung(self.fits[-1], len(rungs))
+        return [fitted.evidence for fitted in self.fits]
+
+    def grow(self, rungs: list[Rung], settings: GrowthSettings) -> Growth:
+        """What early growth alone would end on."""
+        return grow(self.fitter, rungs, settings)
+
+    def choose(self) -> Choice:
+        """The rung that the shape needs."""
+        return choose([fitted.evidence for fitted in self.fits], self.fitter.observations.footprint)
+
+    def of(self, evidence: Evidence) -> Fitted:
+        """The fit that an evidence is of."""
+        return next(fitted for fitted in self.fits if fitted.evidence is evidence)
+
+    def check(self, choice: Choice, views: Views, settings: CheckSettings) -> dict[str, float]:
+        """On what share of draws of views, unseen by the choice, it holds; the best rung is that of each draw."""
+        seed, footprint = self.fitter.seed, self.fitter.observations.footprint
+        further = views.further(settings.views, seed)
+        sound = _sound(self.fits)
+        errors = [further.error(fitted.model.frozen(), self.fitter.renderer) for fitted in sound]
+        own = errors[sound.index(self.of(choice.chosen))]
+        draw, strict, holds = np.random.default_rng([seed, 4]), 0, 0
+        for _ in range(settings.seeds):
+            drawn = draw.choice(settings.views, settings.drawn, replace=False)
+            best = min((error.some(drawn) for error in errors), key=lambda error: error.mean)
+            within = is_as_good(own.some(drawn), best)
+            strict += within
+            holds += within or own.some(drawn).mean <= footprint
+        shares = {"held_out_seeds_within": strict / settings.seeds, "held_out_seeds_held": holds / settings.seeds}
+        return {"held_out_seeds": settings.seeds, **shares}
+
+    def refit(self, rung: Rung) -> Evidence:
+        """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for."""
+        settings = replace(self.fitter.settings, fewest_rays=self.fewest_rays)
+        observations = self.fitter.observations.through(self.frugal)
+        fitter = replace(self.fitter, renderer=self.frugal, settings=settings, observations=observations, spent={})
+        place = next(place for place, fitted in enumerate(self.fits) if fitted.evidence.rung == rung.name)
+        return self._fitted(fitter, rung, self._best(self.fits[:place])).evidence
+
+    def precision(self, fitted: Fitted) -> dict[str, float]:
+        """What rendering the held-out rays costs with either renderer, and hits that only one has."""
+        rays, shape = self.fitter.observations.held_out.rays, fitted.model.frozen()
+        counts = Counts(), Counts()
+        hits = [
+            renderer.render(Meter(shape, count), rays).hit
+            for renderer, count in zip((self.fitter.renderer, self.frugal), counts, strict=True)
+        ]
+        lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
+        return {
+            "precision.evaluations": counts[0].value,
+            "precision.evaluations_auto": counts[1].value,
+            "precision.hits": int(hits[0].sum()),
+            "precision.lost": lost,
+            "precision.gained": gained,
+        }
+
+    def _best(self, fits: list[Fitted]) -> Fitted | None:
+        return min(_sound(fits), key=lambda fitted: fitted.evidence.mean, default=None)
+
+    def _fitted(self, fitter: Fitter, rung: Rung, previous: Fitted | None) -> Fitted:
+        fitted = fitter.begin(rung, None if previous is None else previous.model)
+        fitter.fit(fitted, fitter.settings.iterations, schedule="ramped", looks=True)
+        return fitted
+
+
+def _sound(fits: list[Fitted]) -> list[Fitted]:
+    return [fitted for fitted in fits if fitted.evidence.error is not None]

@@ -1,0 +1,103 @@
+"""The start of a rung without a renderer: towards the observed points, or towards the field that was there before."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.autodecoder import near_surface_first
+from bench.ladder.model import Model
+from bench.ladder.observations import Observations, generator
+from renderers.field import Counts, Field, Meter
+
+SURFACE_WIDTH = 0.05  # scene units: of `near_surface_first`
+NEAR = 0.05  # scene units, standard deviation: how far from the surface half of the points are
+BALL = 1.1  # radius of the ball that holds the others: rays start on the unit sphere
+
+
+@dataclass
+class WarmStart:
+    """A model's free numbers, to be fitted to points; see `bench.tasks.problem.Problem`.
+
+    A field with a formula is fitted to the observed points, where it should be 0, and to points that are known to be
+    free, where it should not be negative. Another takes over a field as a whole.
+
+    Args:
+        model: what is fitted.
+        surface, free: points of the surface; points outside.
+        target: the field that is taken over; None fits to the points.
+        count: of points in an iteration, of each kind.
+        seed: of the draws.
+    """
+
+    model: Model
+    surface: Float[Tensor, "n 3"]
+    free: Float[Tensor, "m 3"]
+    target: Field | None
+    count: int
+    seed: int
+    counts: Counts = field(default_factory=Counts)
+    photographs: None = None
+
+    @staticmethod
+    def of(model: Model, observations: Observations, target: Field | None, *, count: int, seed: int) -> "WarmStart":
+        """The start that observations, or a field, allow."""
+        return WarmStart(model, observations.points, observations.free(seed), target, count, seed)
+
+    @torch.no_grad()
+    def error(self) -> float:
+        """The loss of the model as it stands, on the first draw, not counted."""
+        return float(self._loss(self.model.field(), 0))
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """What is free."""
+        return self.model.parameters
+
+    @property
+    def rays_per_iteration(self) -> int:
+        """None: no ray is rendered; points are counted in their place."""
+        return self.count
+
+    @property
+    def observed(self) -> Bool[Tensor, " n"]:
+        """The points of the surface."""
+        return torch.ones(len(self.surface), dtype=torch.bool)
+
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        """The mean error of the values."""
+        return {"total": self._loss(Meter(self.model.field(), self.counts), iteration)}
+
+    def _loss(self, shape: Field, iteration: int) -> Float[Tensor, ""]:
+        draw = generator(self.seed, iteration)
+        if self.target is not None:
+            points = scattered(self.surface, self.count, draw)
+            with torch.no_grad():
+                wanted = self.target(points)
+            return near_surface_first((shape(points) - wanted).abs(), wanted, SURFACE_WIDTH).mean()
+        off = [shape(_some(self.surface, self.count, draw)).abs()] if len(self.surface) else []
+        inside = [(-shape(_some(self.free, self.count, draw))).clamp_min(0)] if len(self.free) else []
+        return sum((part.mean() for part in [*off, *inside]), 0 * self.parameters[0].sum())
+
+    def objective(self) -> None:
+        """Losses of different iterations are comparable."""
+
+    def field(self) -> Field:
+        """As it stands."""
+        return self.model.frozen()
+
+
+def scattered(surface: Float[Tensor, "n 3"], count: int, draw: torch.Generator) -> Float[Tensor, "count 3"]:
+    """Points of which half lie near those of a surface, and the others anywhere in a ball that holds the scene."""
+    near = count // 2 if len(surface) else 0
+    around = torch.nn.functional.normalize(torch.randn(count - near, 3, generator=draw), dim=-1)
+    around *= BALL * torch.rand(count - near, 1, generator=draw) ** (1 / 3)
+    if not near:
+        return around.to(surface.device)
+    beside = NEAR * torch.randn(near, 3, generator=draw)
+    return torch.cat([_some(surface, near, draw) + beside.to(surface.device), around.to(surface.device)])
+
+
+def _some(points: Float[Tensor, "n 3"], count: int, draw: torch.Generator) -> Float[Tensor, "count 3"]:
+    return points[torch.randint(len(points), (count,), generator=draw).to(points.device)]

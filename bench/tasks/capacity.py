@@ -1,0 +1,178 @@
+"""How much model a shape needs: fields from four numbers to the papers' network, fitted to the same views."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from bench.film import Film
+from bench.judge import judge
+from bench.ladder.choice import Choice, Evidence
+from bench.ladder.fit import FitSettings, Fitted, Fitter
+from bench.ladder.growth import Growth, GrowthSettings
+from bench.ladder.model import FLOAT
+from bench.ladder.picture import draw_ladder
+from bench.ladder.rungs import PAPERS, rung
+from bench.ladder.study import CheckSettings, Study
+from bench.ladder.views import Views, ViewSettings
+from bench.metrics import DEFINITIONS
+from bench.records import RunStatus, plain
+from bench.stage import Cell
+from bench.tasks.problem import check_field_gradient
+from datasets.truth import Truth
+from renderers.checks import check_at_least
+
+TINY = 1e-9  # seconds: a clock that did not move
+NEEDS = {
+    "recommended_field, recommended_parameters": "the smallest rung of the ladder, by free numbers, whose held-out "
+    "error is within one standard error of the best rung's or under the footprint",
+    "recommended_within, recommended_enough": "1 where the first, the second of these holds",
+    "best_field": "the rung of the least held-out error",
+    "footprint": "half a pixel where the shape may be nearest (DIST, Eq. 10, theta = 0), in scene units",
+    "RUNG.error": "of held-out rays: distance along the field's normal between the observed and the rendered point, at "
+    "most 10 footprints; 10 footprints where only one hits; mean over the rays on which either hits, in scene units",
+    "RUNG.standard_error": "of that mean, by the jackknife over views",
+    "RUNG.parameters, RUNG.bytes, RUNG.flops_per_query": "free numbers; what it takes to keep the field in float32; "
+    "floating-point operations of a value, for formulas an estimate",
+    "RUNG.seconds, RUNG.evaluations, RUNG.flops": "of its fit, with its warm start, without looks",
+    "RUNG.seconds_at_auto, RUNG.flops_at_auto": "when a look first found the error of field=auto, or less than "
+    "a standard error more; none where none did",
+    "saved_...": "of the papers' network, over that of the recommended rung; seconds only where the network was fitted",
+    "auto.field, auto.error, ...": "what early growth (field=auto) ends on; its costs are of all rungs that it tried",
+    "auto.overhead": "seconds of early growth over those of the fit that it ended on",
+    "frugal....": "the recommended rung fitted again with renderer.epsilon=auto, renderer.steps=auto and the rays of "
+    "an iteration from the loss",
+    "precision....": "held-out rays rendered at the renderer's own epsilon and steps, and at auto (Eqs. 8, 10)",
+    "held_out_seeds": "draws of views that no choice has seen",
+    "held_out_seeds_within, held_out_seeds_held": "share of them on which the recommended rung is within one standard "
+    "error of the draw's best rung; on which it is, or is under the footprint",
+}
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Fits a ladder of fields to views of a shape, and recommends the smallest that will do.
+
+    Args:
+        ladder: names of rungs, the smallest first; see `bench.ladder.rungs`.
+        views: that are fitted and held out.
+        fit: how each rung is fitted.
+        fewest_rays: that the frugal fit of the recommended rung begins with.
+        growth: how `field=auto` grows.
+        checks: by which the choice is checked afterwards.
+    """
+
+    ladder: tuple[str, ...]
+    views: ViewSettings
+    fit: FitSettings
+    fewest_rays: int
+    growth: GrowthSettings
+    checks: CheckSettings
+
+    def __post_init__(self) -> None:
+        check_at_least("the length of task.ladder", len(self.ladder), 1, "conf/task/capacity.yaml has the whole one")
+        for name in self.ladder:
+            rung(name)
+
+    def execute(self, cell: Cell) -> None:
+        """Fits, chooses, checks, and lets the truth judge what was chosen."""
+        stage, record = cell.stage, cell.record
+        check_field_gradient(stage.renderer)
+        record.definitions = DEFINITIONS | NEEDS
+        rungs, film = [rung(name) for name in self.ladder], Film(stage, "by rung")
+        views = Views(Truth(stage.scene.mesh), stage.views, self.views, self.fit, stage.renderer, stage.device)
+        with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
+
+            def on_line(name: str, line: dict[str, Any]) -> None:
+                curve.write(json.dumps(plain({"rung": name, **line}), allow_nan=False) + "\n")
+
+            def on_rung(fitted: Fitted, count: int) -> None:
+                film.shoot(fitted.evidence.rung, fitted.model.frozen(), stage.scene.view.camera)
+                cell.progress("climbing", len(study.fits), count, fitted.evidence.mean)
+
+            fitter = Fitter(views.observations(stage.seed), stage.renderer, self.fit, stage.seed, stage.device, on_line)
+            study = Study(fitter, stage.frugal, self.fewest_rays, on_rung)
+            growth = study.grow(rungs, self.growth)
+            evidence = study.climb(rungs)
+            self._note_costs(cell, study, evidence)
+            choice = study.choose()
+            chosen = study.of(choice.chosen)
+            metrics = needs(choice, evidence, growth) | study.precision(chosen)
+            metrics |= study.check(choice, views, self.checks)
+            metrics |= costs("frugal", study.refit(rung(choice.chosen.rung)))
+        judged = judge(chosen.model.frozen(), stage)
+        record.metrics = judged.metrics | {"footprint": views.footprint} | metrics
+        record.status, record.reason = RunStatus.OK, ""
+        if judged.mesh is None:
+            record.status, record.reason = RunStatus.EMPTY, "the recommended field has no surface in the unit sphere"
+        else:
+            judged.mesh.save(cell.folder / "mesh.ply")
+        record.notes = [*record.notes, told(choice, growth)]
+        title = f"{record.task}, {record.name}, {record.scene}"
+        film.save(cell.folder, title)
+        if stage.evaluation.picture is not None:
+            draw_ladder(cell.folder, record.metrics, title)
+
+    def _note_costs(self, cell: Cell, study: Study, evidence: list[Evidence]) -> None:
+        rays = sum(fitted.done for fitted in study.fits) * self.fit.rays
+        values = sum(rung.evaluations for rung in evidence)
+        cell.record.seconds |= study.fitter.spent
+        cell.record.flops = sum(rung.flops for rung in evidence)
+        cell.record.evaluations = {
+            "value": values,
+            "per_ray": values / max(rays, 1),
+            "observed": int(study.fitter.observations.given.observed.sum()),
+        }
+
+
+def costs(name: str, evidence: Evidence) -> dict[str, Any]:
+    """A fit's error and costs, as metrics of that name; what it lacks, where it failed."""
+    known = {key: getattr(evidence, key) for key in ("parameters", "bytes", "flops_per_query")}
+    spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops")}
+    error = evidence.error
+    how = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
+    errors = {} if error is None else {"error": error.mean, "standard_error": error.standard_error}
+    return {f"{name}.{key}": value for key, value in {**known, **spent, **errors, **how}.items()}
+
+
+def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str, Any]:
+    """What a shape needs, with the evidence of every rung, as metrics."""
+    chosen, last = choice.chosen, growth.fitted.evidence
+    metrics = {
+        "recommended_field": chosen.rung,
+        "recommended_parameters": chosen.parameters,
+        "recommended_error": chosen.mean,
+        "recommended_within": int(choice.within),
+        "recommended_enough": int(choice.enough),
+        "best_field": choice.best.rung,
+    }
+    for one in evidence:
+        metrics |= costs(one.rung, one)
+    metrics |= {"auto.field": last.rung, **costs("auto", last), "auto.overhead": growth.overhead}
+    metrics |= {f"auto.{name}": getattr(growth, name) for name in ("seconds", "evaluations", "flops")}
+    if last.error is not None:
+        target = last.mean + last.error.standard_error
+        for one in evidence:
+            reached: dict[str, float] = next((look for look in one.looks if look["error"] <= target), {})
+            metrics |= {f"{one.rung}.{key}_at_auto": reached.get(key) for key in ("seconds", "flops", "evaluations")}
+    return metrics | saved(chosen, evidence)
+
+
+def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
+    """The papers' network over the chosen rung; its time only where it was fitted here."""
+    fitted = next((one for one in evidence if one.rung == PAPERS.name and one.error is not None), None)
+    network = {"parameters": PAPERS.size, "flops_per_query": PAPERS.flops, "bytes": FLOAT * PAPERS.size}
+    if fitted is not None:
+        network["seconds"] = fitted.seconds
+    return {f"saved_{key}": value / max(getattr(chosen, key), TINY) for key, value in network.items()}
+
+
+def told(choice: Choice, growth: Growth) -> str:
+    """The recommendation, in words."""
+    chosen, best = choice.chosen, choice.best
+    rules = {"within one standard error of the best": choice.within, "under half a pixel": choice.enough}
+    why = " and ".join(rule for rule, holds in rules.items() if holds)
+    return (
+        f"needs {chosen.rung}, {chosen.parameters} numbers: its held-out error {chosen.mean:.4f} is {why} "
+        f"({best.rung}, {best.mean:.4f} +- {best.error.standard_error:.4f}); field=auto ends on "
+        f"{growth.fitted.evidence.rung}, {growth.fitted.evidence.mean:.4f}"
+    )
