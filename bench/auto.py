@@ -67,12 +67,17 @@ def samples(thinnest: float, radius: float) -> int:
     return min(max(wanted, FEWEST), MOST)
 
 
-def rays(most: int, least: int, footprint: float, error: float) -> int:
-    """How many pixels there are where half a pixel is the error that is left, out of `most` where it is `footprint`.
+def rays_share(least: float, footprint: float, error: float) -> float:
+    """The share of an image's pixels that there are where half a pixel is the error that is left.
 
-    A pixel need be no finer than the error: DIST, Eq. 10, solved for the resolution R, whose square this goes with.
+    A pixel need be no finer than the error: DIST, Eq. 10, solved for the resolution, with whose square pixels grow.
+
+    Args:
+        least: of the shares.
+        footprint: half a pixel of the whole image, in scene units.
+        error: in scene units.
     """
-    return min(max(ceil(most * (footprint / max(error, footprint)) ** 2), least), most)
+    return min(max((footprint / max(error, footprint)) ** 2, least), 1.0) if footprint else 1.0
 
 
 def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:

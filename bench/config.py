@@ -85,7 +85,9 @@ class Config:
     tracker: Any = MISSING
     view: Any = MISSING
     auto: Any = MISSING
+    ladder: Any = MISSING
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    field: str = MISSING  # from here on the word is not dataclasses.field
     split: str = MISSING
     index: int = MISSING
     seed: int = MISSING

@@ -13,6 +13,7 @@ from bench.auto import AUTO, frugal, resolved
 from bench.autodecoder import Prior, PriorSettings
 from bench.config import EvaluationSettings, build
 from bench.environment import pick_device
+from bench.ladder.settings import PRIOR, LadderSettings
 from bench.prior_store import prior_for
 from bench.progress import Report
 from bench.records import Record
@@ -39,6 +40,8 @@ class Stage:
     cache: Path  # where what is slow to make is kept
     notes: tuple[str, ...] = ()  # what settings came to that follow from others
     endings: tuple[Callable[[], str], ...] = ()  # what settings came to that change on the way, when it has ended
+    ladder: LadderSettings | None = None  # the fields to choose from, where none is a prior's
+    field: str = PRIOR  # what a shape that is looked for is made of
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
 
     @cached_property
@@ -121,6 +124,8 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         cache=cache,
         notes=chosen.notes,
         endings=chosen.endings,
+        ladder=build(config.ladder, "ladder", target="bench.ladder.settings.LadderSettings"),
+        field=config.field,
         trained=trained,
     )
 

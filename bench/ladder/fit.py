@@ -9,57 +9,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.auto import rays
+from bench.auto import rays_share
 from bench.ladder.choice import Evidence
 from bench.ladder.model import Model, Rung, Seen
-from bench.ladder.observations import Drawn, Observations, generator
+from bench.ladder.observations import Observations, generator
+from bench.ladder.settings import FitSettings
 from bench.ladder.warm_start import WarmStart, scattered
 from bench.optimise import Course, optimise
 from bench.records import RunStatus
+from bench.tasks.code import Terms
 from bench.tasks.problem import OptimiserSettings, Unsupported, check_kind
-from renderers.checks import check_at_least
 from renderers.field import Counts, Field, Meter
-from renderers.rendering import Renderer
 
 EIKONAL_POINTS = 512
+NEAR_ENOUGH = 0.1  # loss: a warm start may begin below it, and then that is what divergence is measured from
 QUERIES = 8  # field values a ray, about, of a tracer
+EIKONAL_SEED = 7  # of the points; those of iterations differ
 LOOKS = {4**power for power in range(1, 12)}  # iterations
 PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids
-
-
-@dataclass(frozen=True)
-class FitSettings:
-    """How each rung is fitted.
-
-    Args:
-        iterations: of the renderer's loss.
-        rays: drawn in each.
-        fewest_rays: with which it begins where their number follows the loss (`bench.auto.rays`); None: all the same.
-        warm_iterations, warm_points: of the start without a renderer, to the observed points and the previous field.
-        depth_weight, silhouette_weight: see `bench.tasks.completion.Completion`.
-        eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are no distance by
-            themselves.
-    """
-
-    iterations: int
-    rays: int
-    fewest_rays: int | None
-    warm_iterations: int
-    warm_points: int
-    depth_weight: float
-    silhouette_weight: float
-    eikonal_weight: float
-
-    def __post_init__(self) -> None:
-        for name in ("iterations", "rays", "warm_points"):
-            check_at_least(f"task.fit.{name}", getattr(self, name), 1, "conf/task/capacity.yaml has values that work")
-        if self.fewest_rays is not None and not 1 <= self.fewest_rays <= self.rays:
-            raise ValueError(
-                f"task.fit.fewest_rays must lie between 1 and rays={self.rays}, not {self.fewest_rays}: 128"
-            )
-        check_at_least("task.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")
-        for name in ("depth_weight", "silhouette_weight", "eikonal_weight"):
-            check_at_least(f"task.fit.{name}", getattr(self, name), 0, "0 switches the term off")
 
 
 @dataclass
@@ -82,7 +49,6 @@ class Fitter:
 
     Args:
         observations: what is given and what is held out.
-        renderer: through which it is seen.
         settings: how.
         seed: of what is drawn.
         device: where.
@@ -90,7 +56,6 @@ class Fitter:
     """
 
     observations: Observations
-    renderer: Renderer
     settings: FitSettings
     seed: int
     device: torch.device
@@ -101,7 +66,9 @@ class Fitter:
     def warm_share(self) -> float:
         """Field values of a warm start over those of a whole fit, about."""
         settings = self.settings
-        return settings.warm_iterations * settings.warm_points / (settings.iterations * settings.rays * QUERIES)
+        return (
+            settings.warm_iterations * settings.warm_points / (settings.iterations * self.observations.rays * QUERIES)
+        )
 
     def begin(self, rung: Rung, previous: Model | None) -> Fitted:
         """A rung's model after its warm start, judged."""
@@ -119,7 +86,7 @@ class Fitter:
         """A model after its warm start, and what that came to."""
         fitted = Fitted(model, Evidence(rung.name, model.size, model.bytes, rung.flops))
         try:
-            check_kind(self.renderer, model.frozen())
+            check_kind(self.observations.renderer, model.frozen())
         except Unsupported as error:
             fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
             return fitted, inf
@@ -134,8 +101,7 @@ class Fitter:
         """Goes on with a rung for so many iterations, and judges it; with `looks` on the way, too."""
         if fitted.failed or iterations < 1:
             return
-        drawn = Drawn(self.observations.given, self.observations.through_sphere(), self.settings.rays, self.seed)
-        problem = RungProblem(fitted.model, drawn, self.observations, self.settings, fitted.done)
+        problem = RungProblem(fitted.model, self.observations, self.settings, fitted.done)
         settings = OptimiserSettings(iterations, fitted.model.learning_rate, schedule)
         self._run(fitted, problem, settings, looks=looks)
         fitted.done += iterations
@@ -145,7 +111,7 @@ class Fitter:
         self, fitted: Fitted, problem: "RungProblem | WarmStart", settings: OptimiserSettings, *, looks: bool
     ) -> None:
         """Runs the one loop, and adds what it cost to the evidence."""
-        course, evidence = Course(least_reference=self._pixel_loss()), fitted.evidence
+        course, evidence = Course(least_reference=NEAR_ENOUGH), fitted.evidence
         before = evidence.seconds, evidence.evaluations, evidence.flops
 
         def on_step(line: dict[str, Any]) -> None:
@@ -164,15 +130,11 @@ class Fitter:
         if fitted.failed:
             evidence.error = None
 
-    def _pixel_loss(self) -> float:
-        """The loss where every ray is wrong by the footprint: a warm start may begin below it."""
-        return (self.settings.depth_weight + self.settings.silhouette_weight) * self.observations.footprint
-
     def _judge(self, fitted: Fitted) -> None:
         """Looks at a rung as it stands."""
         evidence = fitted.evidence
         if not fitted.failed:
-            evidence.error = self.observations.held_out.error(fitted.model.frozen(), self.renderer)
+            evidence.error = self.observations.error(fitted.model.frozen())
             spent = {"seconds": evidence.seconds, "evaluations": evidence.evaluations, "flops": evidence.flops}
             evidence.looks.append({**spent, "error": evidence.mean})
 
@@ -182,11 +144,10 @@ class RungProblem:
     """The free numbers of a rung; see `bench.tasks.problem.Problem`."""
 
     model: Model
-    drawn: Drawn
     observations: Observations
     settings: FitSettings
     begun: int  # iterations that were before
-    error: float = inf  # mean error of the depths at the last iteration, in scene units
+    error: float = inf  # at the last iteration, in scene units: the loss over its weight
     counts: Counts = field(default_factory=Counts)
     photographs: None = None
 
@@ -197,30 +158,24 @@ class RungProblem:
 
     @property
     def rays_per_iteration(self) -> int:
-        """That are drawn."""
-        return self.drawn.count
+        """That are drawn, at most."""
+        return self.observations.rays
 
     @property
     def observed(self) -> Bool[Tensor, " n"]:
-        """Rays whose depth is given."""
-        return self.drawn.view.observed
+        """Points of the surface that are known."""
+        return torch.ones(len(self.observations.points), dtype=torch.bool)
 
-    def loss(self, iteration: int) -> dict[str, Tensor]:
+    def loss(self, iteration: int) -> Terms:
         """The renderer's terms, that of the gradient's length, and their sum."""
         counted, own, settings = Meter(self.model.field(), self.counts), self.begun + iteration, self.settings
-        terms = self.drawn.rays(own, self._count()).compare(counted, own)
-        if settings.depth_weight:
-            self.error = float(terms["depth"].detach()) / settings.depth_weight
+        share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
+        terms = self.observations.terms(counted, own, share)
+        self.error = float(sum(terms.values()).detach()) / self.observations.weight
         if not self.model.metric and settings.eikonal_weight:
-            points = scattered(self.observations.points, EIKONAL_POINTS, generator(self.drawn.seed, own))
+            points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, own))
             terms["eikonal"] = settings.eikonal_weight * _slope_error(counted, points)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
-
-    def _count(self) -> int:
-        """Rays of this iteration."""
-        if self.settings.fewest_rays is None:
-            return self.drawn.count
-        return rays(self.drawn.count, self.settings.fewest_rays, self.observations.footprint, self.error)
 
     def objective(self) -> None:
         """Losses of different iterations are comparable."""

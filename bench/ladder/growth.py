@@ -6,26 +6,10 @@ from math import ceil
 from bench.ladder.choice import Evidence
 from bench.ladder.fit import Fitted, Fitter
 from bench.ladder.model import Rung
-from renderers.checks import check_at_least, check_share
+from bench.ladder.settings import GrowthSettings
+from renderers.field import Field
 
 OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
-
-
-@dataclass(frozen=True)
-class GrowthSettings:
-    """How far growth looks ahead.
-
-    Args:
-        trial: share of a whole fit's iterations that a rung is tried for.
-        vain: share of the present rung's whole fit that larger rungs may cost in vain, before growth ends.
-    """
-
-    trial: float
-    vain: float
-
-    def __post_init__(self) -> None:
-        check_share("task.growth.trial", self.trial, "1/16 tells whether a rung is better than the one before")
-        check_at_least("task.growth.vain", self.vain, 0, "0.4 keeps the whole within twice the last rung's fit")
 
 
 @dataclass
@@ -34,11 +18,13 @@ class Growth:
 
     Args:
         fitted: the rung that it ended on, fitted to the end.
+        first: the field of the first rung as it began.
         tried: every rung in its turn, as far as it was fitted.
         kept: names of the rungs that it stood on, one after the other.
     """
 
     fitted: Fitted
+    first: Field
     tried: list[Evidence]
     kept: list[str]
 
@@ -93,23 +79,25 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     share = trial / whole + fitter.warm_share
     tried: list[Evidence] = []
     now: _Standing | None = None
-    for rung in rungs:
-        cost = (rung.flops + OVERHEAD) * share
+    first: Field | None = None
+    for place in rungs:
+        cost = (place.flops + OVERHEAD) * share
         if now is not None and now.vain + cost > settings.vain * (now.rung.flops + OVERHEAD):
             break
-        fitted = fitter.begin(rung, None if now is None else now.fitted.model)
+        fitted = fitter.begin(place, None if now is None else now.fitted.model)
         tried.append(fitted.evidence)
+        first = first or fitted.model.frozen()
         fitter.fit(fitted, trial, schedule="ramped", looks=False)
         if now is None or _is_better(fitted, now.fitted):
-            now = _Standing(fitted, rung, [*([] if now is None else now.kept), rung.name])
+            now = _Standing(fitted, place, [*([] if now is None else now.kept), place.name])
         else:
             now.vain += cost
         if now.fitted.evidence.mean <= fitter.observations.footprint:
             break
-    if now is None:
-        raise ValueError("no rung can be fitted: task.ladder is empty")
+    if now is None or first is None:
+        raise ValueError("no rung can be fitted: ladder.rungs is empty")
     fitter.fit(now.fitted, whole - trial, schedule="ramped", looks=True)
-    return Growth(now.fitted, tried, now.kept)
+    return Growth(now.fitted, first, tried, now.kept)
 
 
 def _is_better(new: Fitted, old: Fitted) -> bool:

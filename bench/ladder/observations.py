@@ -1,32 +1,89 @@
 """What a field is fitted to, what is held out, and what a fit may begin with."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.ladder.held_out import HeldOut
+from bench.ladder.held_out import HeldOut, HeldOutError
+from bench.tasks.code import Terms
 from bench.tasks.completion import GivenView
 from renderers.camera import Rays, sphere_span
+from renderers.field import Field
 from renderers.rendering import Renderer
 
 FREE = 4  # points known to be free, on each ray that has some
 
 
+@runtime_checkable
+class Observations(Protocol):
+    """What a field is fitted to through a renderer, and what is held out of it."""
+
+    @property
+    def renderer(self) -> Renderer: ...
+
+    @property
+    def footprint(self) -> float:
+        """Half a pixel, in scene units (DIST, Eq. 10): an error below it is none. 0 where errors have another unit."""
+        ...
+
+    @property
+    def rays(self) -> int:
+        """That are rendered in an iteration."""
+        ...
+
+    @property
+    def weight(self) -> float:
+        """What a scene unit of error weighs in the loss; infinite where errors have another unit."""
+        ...
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """Of the surface, where they are known."""
+        ...
+
+    def free(self, seed: int) -> Float[Tensor, "n 3"]:
+        """Points that are known to lie outside."""
+        ...
+
+    def terms(self, field: Field, iteration: int, share: float) -> Terms:
+        """The weighted loss of an iteration, at some share of its rays."""
+        ...
+
+    def error(self, field: Field) -> HeldOutError:
+        """Of what was held out."""
+        ...
+
+
 @dataclass(frozen=True)
-class Observations:
-    """Rays of one or more views, in a row, of which some are held out.
+class RayObservations:
+    """Rays of one or more views, in a row, of which some are held out, and some of the others drawn for an iteration.
 
     Args:
         given: all rays that are not held out.
         held_out: the others.
-        footprint: half a pixel, in scene units (DIST, Eq. 10).
+        rays: drawn in an iteration.
+        seed: of the draws, which are the same for every rung.
     """
 
     given: GivenView
     held_out: HeldOut
-    footprint: float
+    rays: int
+    seed: int
+
+    @property
+    def renderer(self) -> Renderer:
+        """Through which they are compared."""
+        return self.given.renderer
+
+    @property
+    def footprint(self) -> float:
+        """Half a pixel, in scene units (DIST, Eq. 10)."""
+        return self.held_out.footprint
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -35,14 +92,30 @@ class Observations:
         distance = self.given.depth[observed] / self.given.depth_of_distance[observed]
         return self.given.rays[observed].at(distance)
 
-    def through(self, renderer: Renderer) -> "Observations":
-        """The same, compared through another renderer."""
-        return replace(self, given=replace(self.given, renderer=renderer))
+    @property
+    def weight(self) -> float:
+        """That of the depth."""
+        return self.given.settings.depth_weight or inf
 
+    @cached_property
     def through_sphere(self) -> Int[Tensor, " n"]:
         """The given rays that meet the unit sphere: the others say nothing of a shape in it."""
         _, _, meets = sphere_span(self.given.rays)
         return meets.nonzero().squeeze(-1)
+
+    def through(self, renderer: Renderer) -> "RayObservations":
+        """The same, compared through another renderer."""
+        return replace(self, given=replace(self.given, renderer=renderer))
+
+    def terms(self, field: Field, iteration: int, share: float) -> Terms:
+        """The weighted loss of the rays that are drawn for an iteration."""
+        count = max(round(share * self.rays), 1)
+        drawn = torch.randint(len(self.through_sphere), (count,), generator=generator(self.seed, iteration))
+        return self.given.some(self.through_sphere[drawn.to(self.through_sphere.device)]).compare(field, iteration)
+
+    def error(self, field: Field) -> HeldOutError:
+        """Of the rays that are held out."""
+        return self.held_out.error(field, self.renderer)
 
     def free(self, seed: int) -> Float[Tensor, "n 3"]:
         """Points that are known to lie outside: in front of what was seen, and where nothing was."""
@@ -57,33 +130,41 @@ class Observations:
         return given.rays[chosen].at(distance).reshape(-1, 3)
 
 
-def hold_out(
-    view: GivenView,
-    group: Int[Tensor, " n"],
-    *,
-    share: float,
-    whole: Bool[Tensor, " groups"],
-    footprint: float,
-    seed: int,
-) -> Observations:
+@dataclass(frozen=True)
+class Split:
+    """What is held out.
+
+    Args:
+        share: of the rays, and of those with a known depth, from 0 to 1.
+        whole: groups of which nothing is given.
+        footprint: half a pixel, in scene units.
+        seed: of the draw.
+    """
+
+    share: float
+    whole: tuple[int, ...]
+    footprint: float
+    seed: int
+
+
+def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Split, *, rays: int) -> RayObservations:
     """Holds out whole groups, and a share of the rays of the others.
 
     Args:
         view: of rays in a row.
         group: which view, or part of one, a ray belongs to, from 0.
-        share: of the rays of other groups, and of those with a known depth, from 0 to 1.
-        whole: groups of which nothing is given.
-        footprint: half a pixel, in scene units.
-        seed: of the draw.
+        split: what is held out.
+        rays: to be drawn in an iteration.
     """
-    generator = torch.Generator().manual_seed(seed)
-    out = whole[group]
+    draw = torch.Generator().manual_seed(split.seed)
+    out = torch.isin(group, torch.tensor(split.whole))
     for kind in (view.observed.cpu(), ~view.observed.cpu()):
-        places = kind.nonzero().squeeze(-1)
-        count = round(share * len(places))
-        out[places[torch.randperm(len(places), generator=generator)[:count]]] = True
+        places = (kind & ~out).nonzero().squeeze(-1)
+        count = round(split.share * len(places))
+        out[places[torch.randperm(len(places), generator=draw)[:count]]] = True
     out = out.to(view.observed.device)
-    return Observations(view.some((~out).nonzero().squeeze(-1)), _held(view, out, group, footprint), footprint)
+    given = view.some((~out).nonzero().squeeze(-1))
+    return RayObservations(given, _held(view, out, group, split.footprint), rays, split.seed)
 
 
 def together(views: list[GivenView]) -> GivenView:
@@ -105,28 +186,6 @@ def _held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], fo
     mask = part.observed if part.mask is None else part.mask
     own = group.to(known.device)[known].unique(return_inverse=True)[1]
     return HeldOut(part.rays, part.depth / part.depth_of_distance, part.observed, mask, own, footprint)
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A view's loss over rays that are drawn anew in each iteration.
-
-    Args:
-        view: of rays in a row.
-        among: rays that may be drawn.
-        count: how many, at most.
-        seed: of the draws: the same for every rung.
-    """
-
-    view: GivenView
-    among: Int[Tensor, " n"]
-    count: int
-    seed: int
-
-    def rays(self, iteration: int, count: int) -> GivenView:
-        """What is given of so many rays of an iteration."""
-        drawn = torch.randint(len(self.among), (count,), generator=generator(self.seed, iteration))
-        return self.view.some(self.among[drawn.to(self.among.device)])
 
 
 def generator(seed: int, iteration: int) -> torch.Generator:

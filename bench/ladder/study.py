@@ -7,8 +7,10 @@ import numpy as np
 
 from bench.ladder.choice import Choice, Evidence, choose, is_as_good
 from bench.ladder.fit import Fitted, Fitter
-from bench.ladder.growth import Growth, GrowthSettings, grow
+from bench.ladder.growth import Growth, grow
 from bench.ladder.model import Rung
+from bench.ladder.observations import RayObservations
+from bench.ladder.settings import GrowthSettings
 from bench.ladder.views import Views
 from renderers.checks import check_at_least
 from renderers.field import Counts, Meter
@@ -40,15 +42,17 @@ class Study:
     """The fits of all rungs to the same observations.
 
     Args:
-        fitter: of the renderer as it was asked for.
+        observations: through the renderer as it was asked for.
+        fitter: of these observations.
         frugal: the same renderer, no more precise than a pixel.
-        fewest_rays: that an iteration of the frugal fit begins with.
+        fewest_rays: share of the rays that the frugal fit begins with.
         on_rung: is told of each rung that was fitted, and how many there are.
     """
 
+    observations: RayObservations
     fitter: Fitter
     frugal: Renderer
-    fewest_rays: int
+    fewest_rays: float
     on_rung: Callable[[Fitted, int], None]
     fits: list[Fitted] = field(default_factory=list)
 
@@ -65,7 +69,7 @@ class Study:
 
     def choose(self) -> Choice:
         """The rung that the shape needs."""
-        return choose([fitted.evidence for fitted in self.fits], self.fitter.observations.footprint)
+        return choose([fitted.evidence for fitted in self.fits], self.observations.footprint)
 
     def of(self, evidence: Evidence) -> Fitted:
         """The fit that an evidence is of."""
@@ -73,10 +77,10 @@ class Study:
 
     def check(self, choice: Choice, views: Views, settings: CheckSettings) -> dict[str, float]:
         """On what share of draws of views, unseen by the choice, it holds; the best rung is that of each draw."""
-        seed, footprint = self.fitter.seed, self.fitter.observations.footprint
+        seed, footprint = self.fitter.seed, self.observations.footprint
         further = views.further(settings.views, seed)
         sound = _sound(self.fits)
-        errors = [further.error(fitted.model.frozen(), self.fitter.renderer) for fitted in sound]
+        errors = [further.error(fitted.model.frozen(), self.observations.renderer) for fitted in sound]
         own = errors[sound.index(self.of(choice.chosen))]
         draw, strict, holds = np.random.default_rng([seed, 4]), 0, 0
         for _ in range(settings.seeds):
@@ -91,18 +95,18 @@ class Study:
     def refit(self, rung: Rung) -> Evidence:
         """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for."""
         settings = replace(self.fitter.settings, fewest_rays=self.fewest_rays)
-        observations = self.fitter.observations.through(self.frugal)
-        fitter = replace(self.fitter, renderer=self.frugal, settings=settings, observations=observations, spent={})
+        observations = self.observations.through(self.frugal)
+        fitter = replace(self.fitter, settings=settings, observations=observations, spent={})
         place = next(place for place, fitted in enumerate(self.fits) if fitted.evidence.rung == rung.name)
         return self._fitted(fitter, rung, self._best(self.fits[:place])).evidence
 
     def precision(self, fitted: Fitted) -> dict[str, float]:
         """What rendering the held-out rays costs with either renderer, and hits that only one has."""
-        rays, shape = self.fitter.observations.held_out.rays, fitted.model.frozen()
+        rays, shape = self.observations.held_out.rays, fitted.model.frozen()
         counts = Counts(), Counts()
         hits = [
             renderer.render(Meter(shape, count), rays).hit
-            for renderer, count in zip((self.fitter.renderer, self.frugal), counts, strict=True)
+            for renderer, count in zip((self.observations.renderer, self.frugal), counts, strict=True)
         ]
         lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
         return {

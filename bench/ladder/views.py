@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.auto import RADIUS, half_pixel
 from bench.ladder.held_out import HeldOut
-from bench.ladder.observations import Observations, hold_out, together
+from bench.ladder.observations import RayObservations, Split, hold_out, together
 from bench.tasks.completion import GivenView, Weights
 from datasets.scene import see
 from datasets.truth import Truth
@@ -31,16 +31,19 @@ class ViewSettings:
         held_out: of which nothing is.
         share: of the fitted views' rays that are held out, too.
         elevation: of all cameras, at most, to both sides, in degrees.
+        rays: of the fitted views, drawn in each iteration.
     """
 
     fitted: int
     held_out: int
     share: float
     elevation: float
+    rays: int
 
     def __post_init__(self) -> None:
         check_at_least("task.views.fitted", self.fitted, 1, "12 see all sides")
         check_at_least("task.views.held_out", self.held_out, 2, "8 give a standard error")
+        check_at_least("task.views.rays", self.rays, 1, "1024 work")
         if not 0 <= self.share < 1:
             raise ValueError(f"task.views.share must lie between 0 and 1, not {self.share}: 0.1 holds out a tenth")
         if not 0 <= self.elevation < 90:
@@ -72,22 +75,21 @@ class Views:
         """Half a pixel where the shape may be nearest (DIST, Eq. 10), in scene units."""
         return half_pixel(self.sampler, self.sampler.distance - RADIUS)
 
-    def observations(self, seed: int) -> Observations:
+    def observations(self, seed: int) -> RayObservations:
         """Evenly spread views to fit and, between them, views to hold out."""
         settings = self.settings
         turn = float(np.random.default_rng([seed, 2]).uniform(0, 360))
         cameras = [*self._spread(settings.fitted, turn), *self._spread(settings.held_out, turn + GOLDEN / 2)]
-        held = torch.arange(len(cameras)) >= settings.fitted
-        view, group = self._seen(cameras)
-        return hold_out(view, group, share=settings.share, whole=held, footprint=self.footprint, seed=seed)
+        held = tuple(range(settings.fitted, len(cameras)))
+        return hold_out(*self._seen(cameras), Split(settings.share, held, self.footprint, seed), rays=settings.rays)
 
     def further(self, count: int, seed: int) -> HeldOut:
         """So many views more, that no choice has seen, each drawn at random."""
         draw, highest = np.random.default_rng([seed, 3]), sin(radians(self.settings.elevation))
         angles = [(draw.uniform(0, 360), degrees(asin(draw.uniform(-highest, highest)))) for _ in range(count)]
-        view, group = self._seen([self.sampler.camera(*pair) for pair in angles])
-        whole = torch.ones(count, dtype=torch.bool)
-        return hold_out(view, group, share=0.0, whole=whole, footprint=self.footprint, seed=seed).held_out
+        cameras = [self.sampler.camera(*pair) for pair in angles]
+        everything = Split(0.0, tuple(range(count)), self.footprint, seed)
+        return hold_out(*self._seen(cameras), everything, rays=self.settings.rays).held_out
 
     def _spread(self, count: int, turn: float) -> list[Camera]:
         """Cameras of even spacing over the belt of a sphere between the largest elevations (Fibonacci's lattice)."""

@@ -7,8 +7,8 @@ from typing import Any
 from bench.film import Film
 from bench.judge import judge
 from bench.ladder.choice import Choice, Evidence
-from bench.ladder.fit import FitSettings, Fitted, Fitter
-from bench.ladder.growth import Growth, GrowthSettings
+from bench.ladder.fit import Fitted, Fitter
+from bench.ladder.growth import Growth
 from bench.ladder.model import FLOAT
 from bench.ladder.picture import draw_ladder
 from bench.ladder.rungs import PAPERS, rung
@@ -19,7 +19,7 @@ from bench.records import RunStatus, plain
 from bench.stage import Cell
 from bench.tasks.problem import check_field_gradient
 from datasets.truth import Truth
-from renderers.checks import check_at_least
+from renderers.checks import check_positive, check_share
 
 TINY = 1e-9  # seconds: a clock that did not move
 NEEDS = {
@@ -53,33 +53,31 @@ class Capacity:
     """Fits a ladder of fields to views of a shape, and recommends the smallest that will do.
 
     Args:
-        ladder: names of rungs, the smallest first; see `bench.ladder.rungs`.
         views: that are fitted and held out.
-        fit: how each rung is fitted.
-        fewest_rays: that the frugal fit of the recommended rung begins with.
-        growth: how `field=auto` grows.
+        depth_weight, silhouette_weight: see `bench.tasks.completion.Completion`.
+        fewest_rays: share of the rays that the frugal fit of the recommended rung begins with.
         checks: by which the choice is checked afterwards.
     """
 
-    ladder: tuple[str, ...]
     views: ViewSettings
-    fit: FitSettings
-    fewest_rays: int
-    growth: GrowthSettings
+    depth_weight: float
+    silhouette_weight: float
+    fewest_rays: float
     checks: CheckSettings
 
     def __post_init__(self) -> None:
-        check_at_least("the length of task.ladder", len(self.ladder), 1, "conf/task/capacity.yaml has the whole one")
-        for name in self.ladder:
-            rung(name)
+        check_share("task.fewest_rays", self.fewest_rays, "0.125 begins with an eighth of the rays")
+        for name in ("depth_weight", "silhouette_weight"):
+            check_positive(f"task.{name}", getattr(self, name), "10 works for both")
 
     def execute(self, cell: Cell) -> None:
         """Fits, chooses, checks, and lets the truth judge what was chosen."""
         stage, record = cell.stage, cell.record
         check_field_gradient(stage.renderer)
         record.definitions = DEFINITIONS | NEEDS
-        rungs, film = [rung(name) for name in self.ladder], Film(stage, "by rung")
-        views = Views(Truth(stage.scene.mesh), stage.views, self.views, self.fit, stage.renderer, stage.device)
+        ladder, film = stage.ladder, Film(stage, "by rung")
+        views = Views(Truth(stage.scene.mesh), stage.views, self.views, self, stage.renderer, stage.device)
+        observations = views.observations(stage.seed)
         with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
             def on_line(name: str, line: dict[str, Any]) -> None:
@@ -89,10 +87,10 @@ class Capacity:
                 film.shoot(fitted.evidence.rung, fitted.model.frozen(), stage.scene.view.camera)
                 cell.progress("climbing", len(study.fits), count, fitted.evidence.mean)
 
-            fitter = Fitter(views.observations(stage.seed), stage.renderer, self.fit, stage.seed, stage.device, on_line)
-            study = Study(fitter, stage.frugal, self.fewest_rays, on_rung)
-            growth = study.grow(rungs, self.growth)
-            evidence = study.climb(rungs)
+            fitter = Fitter(observations, ladder.fit, stage.seed, stage.device, on_line)
+            study = Study(observations, fitter, stage.frugal, self.fewest_rays, on_rung)
+            growth = study.grow(ladder.all(), ladder.growth)
+            evidence = study.climb(ladder.all())
             self._note_costs(cell, study, evidence)
             choice = study.choose()
             chosen = study.of(choice.chosen)
@@ -113,14 +111,14 @@ class Capacity:
             draw_ladder(cell.folder, record.metrics, title)
 
     def _note_costs(self, cell: Cell, study: Study, evidence: list[Evidence]) -> None:
-        rays = sum(fitted.done for fitted in study.fits) * self.fit.rays
+        rays = sum(fitted.done for fitted in study.fits) * self.views.rays
         values = sum(rung.evaluations for rung in evidence)
         cell.record.seconds |= study.fitter.spent
         cell.record.flops = sum(rung.flops for rung in evidence)
         cell.record.evaluations = {
             "value": values,
             "per_ray": values / max(rays, 1),
-            "observed": int(study.fitter.observations.given.observed.sum()),
+            "observed": int(study.observations.given.observed.sum()),
         }
 
 

@@ -1,0 +1,81 @@
+"""Which fields there are to choose from, and how they are fitted."""
+
+from dataclasses import dataclass
+
+from bench.auto import AUTO
+from bench.ladder.model import Rung
+from bench.ladder.rungs import rung
+from renderers.checks import check_at_least, check_share
+
+PRIOR = "prior"  # the field that a task looks for where nothing else is asked for: a code of the dataset's prior
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How each rung is fitted.
+
+    Args:
+        iterations: of the renderer's loss.
+        fewest_rays: share of the rays that it begins with where their number follows the loss (`bench.auto.rays`); 1:
+            always all.
+        warm_iterations, warm_points: of the start without a renderer, to the observed points and the previous field.
+        eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are no distance by
+            themselves.
+    """
+
+    iterations: int
+    fewest_rays: float
+    warm_iterations: int
+    warm_points: int
+    eikonal_weight: float
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "warm_points"):
+            check_at_least(f"ladder.fit.{name}", getattr(self, name), 1, "conf/scale has values that work")
+        check_share("ladder.fit.fewest_rays", self.fewest_rays, "1 takes all rays from the start on")
+        check_at_least("ladder.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")
+        check_at_least("ladder.fit.eikonal_weight", self.eikonal_weight, 0, "0 switches the term off")
+
+
+@dataclass(frozen=True)
+class GrowthSettings:
+    """How far growth looks ahead.
+
+    Args:
+        trial: share of a whole fit's iterations that a rung is tried for.
+        vain: share of the present rung's whole fit that larger rungs may cost in vain, before growth ends.
+    """
+
+    trial: float
+    vain: float
+
+    def __post_init__(self) -> None:
+        check_share("ladder.growth.trial", self.trial, "1/16 tells whether a rung is better than the one before")
+        check_at_least("ladder.growth.vain", self.vain, 0, "0.4 keeps the whole within twice the last rung's fit")
+
+
+@dataclass(frozen=True)
+class LadderSettings:
+    """Which fields there are to choose from, and how they are fitted.
+
+    Args:
+        rungs: their names, the smallest first; see `bench.ladder.rungs`.
+        fit: how each is fitted.
+        growth: how `field=auto` grows.
+    """
+
+    rungs: tuple[str, ...]
+    fit: FitSettings
+    growth: GrowthSettings
+
+    def __post_init__(self) -> None:
+        check_at_least("the length of ladder.rungs", len(self.rungs), 1, "conf/scale has whole ones")
+        self.all()
+
+    def all(self) -> list[Rung]:
+        """Every rung."""
+        return [rung(name) for name in self.rungs]
+
+    def asked(self, field: str) -> list[Rung]:
+        """All for `auto`; the one of that name otherwise."""
+        return self.all() if field == AUTO else [rung(field)]
