@@ -12,10 +12,11 @@ from omegaconf import DictConfig
 from bench import environment
 from bench.config import build, check_top_level
 from bench.contention import Contention
+from bench.ladder.settings import PRIOR
 from bench.progress import Report
 from bench.records import Record, RunStatus
 from bench.stage import Cell, set_up
-from bench.tasks.problem import Task, Unsupported
+from bench.tasks.problem import TakesField, Task, Unsupported
 
 
 def execute(
@@ -41,6 +42,9 @@ def execute(
         if not isinstance(task, Task):
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
         stage = set_up(config, progress)
+        if stage.field != PRIOR and not isinstance(task, TakesField):
+            readers = "completion, pose and capacity"
+            raise ValueError(f"field={stage.field} is read by {readers}, not by task={record.task}: leave it out")
         record.scene, record.notes = stage.scene_name, [*record.notes, *stage.notes]
         record.environment |= environment.describe(stage.device)
         checkpoint(record)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -88,6 +89,7 @@ class OnePart:
     """A part of `PARTS`, begun as the smallest box about the observed points."""
 
     name: str
+    follows: ClassVar[bool] = False
 
     @property
     def flops(self) -> int:
@@ -116,6 +118,7 @@ class UnionOf:
     """
 
     count: int
+    follows: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_at_least("union", self.count, 2, "union_2 is the least")

@@ -18,8 +18,8 @@ class Evidence:
         flops_per_query: floating-point operations a value.
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.
-        seconds, evaluations, flops: of the fit with its warm start, without looks.
-        iterations: of the fit.
+        seconds, evaluations, gradients, flops: of the fit with its warm start, without looks.
+        iterations: of the fit, without its warm start.
         looks: on the way: seconds, evaluations, flops and error at each.
     """
 
@@ -32,6 +32,7 @@ class Evidence:
     reason: str = ""
     seconds: float = 0.0
     evaluations: int = 0
+    gradients: int = 0
     flops: int = 0
     iterations: int = 0
     looks: list[dict[str, float]] = field(default_factory=list)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.auto import rays_share
+from bench.ladder.analytic import OnePart
 from bench.ladder.choice import Evidence
 from bench.ladder.model import Model, Rung, Seen
 from bench.ladder.observations import Observations, generator
@@ -22,6 +23,7 @@ from bench.tasks.problem import OptimiserSettings, Unsupported, check_kind
 from renderers.field import Counts, Field, Meter
 
 EIKONAL_POINTS = 512
+SPENT = ("seconds", "evaluations", "gradients", "flops")  # of an evidence
 NEAR_ENOUGH = 0.1  # loss: a warm start may begin below it, and then that is what divergence is measured from
 QUERIES = 8  # field values a ray, about, of a tracer
 EIKONAL_SEED = 7  # of the points; those of iterations differ
@@ -35,7 +37,6 @@ class Fitted:
 
     model: Model
     evidence: Evidence
-    done: int = 0  # iterations
 
     @property
     def failed(self) -> bool:
@@ -72,13 +73,17 @@ class Fitter:
 
     def begin(self, rung: Rung, previous: Model | None) -> Fitted:
         """A rung's model after its warm start, judged."""
+        ball = None
+        if previous is None and rung.follows:
+            ball = self.begin(OnePart("sphere"), None)
+            previous = ball.model
         seen = Seen(self.observations.points.cpu(), previous, self.seed, self.device)
         started = [self._started(rung, model, previous) for model in rung.starts(seen)]
         fitted, _ = min(started, key=lambda pair: pair[1])
+        started += [] if ball is None else [(ball, inf)]
         evidence = fitted.evidence
-        evidence.seconds, evidence.evaluations, evidence.flops = (
-            sum(getattr(other.evidence, name) for other, _ in started) for name in ("seconds", "evaluations", "flops")
-        )
+        for name in SPENT:
+            setattr(evidence, name, sum(getattr(other.evidence, name) for other, _ in started))
         self._judge(fitted)
         return fitted
 
@@ -90,7 +95,7 @@ class Fitter:
         except Unsupported as error:
             fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
             return fitted, inf
-        target = None if model.metric or previous is None else previous.frozen()
+        target = previous.frozen() if rung.follows and previous is not None else None
         start = WarmStart.of(model, self.observations, target, count=self.settings.warm_points, seed=self.seed)
         if self.settings.warm_iterations:
             rate = PARTS_RATE if model.metric else WHOLE_RATE
@@ -101,10 +106,10 @@ class Fitter:
         """Goes on with a rung for so many iterations, and judges it; with `looks` on the way, too."""
         if fitted.failed or iterations < 1:
             return
-        problem = RungProblem(fitted.model, self.observations, self.settings, fitted.done)
+        problem = RungProblem(fitted.model, self.observations, self.settings, fitted.evidence.iterations)
         settings = OptimiserSettings(iterations, fitted.model.learning_rate, schedule)
         self._run(fitted, problem, settings, looks=looks)
-        fitted.done += iterations
+        fitted.evidence.iterations += iterations
         self._judge(fitted)
 
     def _run(
@@ -112,16 +117,17 @@ class Fitter:
     ) -> None:
         """Runs the one loop, and adds what it cost to the evidence."""
         course, evidence = Course(least_reference=NEAR_ENOUGH), fitted.evidence
-        before = evidence.seconds, evidence.evaluations, evidence.flops
+        before = {name: getattr(evidence, name) for name in SPENT}
 
         def on_step(line: dict[str, Any]) -> None:
-            evidence.seconds = before[0] + line["seconds"]
-            evidence.evaluations = before[1] + course.counts.value
-            evidence.flops = before[2] + (course.counts.flops(fitted.model.field()) or 0)
+            spent = {"evaluations": course.counts.value, "gradients": course.counts.gradient}
+            spent |= {"seconds": line["seconds"], "flops": course.counts.flops(fitted.model.field()) or 0}
+            for name, amount in spent.items():
+                setattr(evidence, name, before[name] + amount)
             step = line["iteration"] + 1
             if looks and course.status is RunStatus.OK and step in LOOKS and step < settings.iterations:
                 self._judge(fitted)
-            self.on_line(evidence.rung, {**line, "iteration": fitted.done + line["iteration"]})
+            self.on_line(evidence.rung, {**line, "iteration": fitted.evidence.iterations + line["iteration"]})
 
         optimise(problem, settings, self.device, course=course, on_step=on_step)
         for name, seconds in course.seconds.items():
@@ -135,8 +141,7 @@ class Fitter:
         evidence = fitted.evidence
         if not fitted.failed:
             evidence.error = self.observations.error(fitted.model.frozen())
-            spent = {"seconds": evidence.seconds, "evaluations": evidence.evaluations, "flops": evidence.flops}
-            evidence.looks.append({**spent, "error": evidence.mean})
+            evidence.looks.append({name: getattr(evidence, name) for name in SPENT} | {"error": evidence.mean})
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Early growth: from the smallest rung on, only while the held-out error falls by more than its noise."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import ceil
 
 from bench.ladder.choice import Evidence
@@ -20,13 +20,20 @@ class Growth:
         fitted: the rung that it ended on, fitted to the end.
         first: the field of the first rung as it began.
         tried: every rung in its turn, as far as it was fitted.
-        kept: names of the rungs that it stood on, one after the other.
+        fields: those of the rungs that it stood on, by name, one after the other; the last one at its end.
     """
 
     fitted: Fitted
     first: Field
     tried: list[Evidence]
-    kept: list[str]
+    fields: dict[str, Field]
+
+    def told(self, asked: str) -> str:
+        """What it came to, in words."""
+        error = self.fitted.evidence.mean
+        return (
+            f"field={asked}: {' -> '.join(self.fields)}, {self.fitted.model.size} numbers, held-out error {error:.3g}"
+        )
 
     @property
     def overhead(self) -> float:
@@ -44,6 +51,11 @@ class Growth:
         return sum(evidence.evaluations for evidence in self.tried)
 
     @property
+    def gradients(self) -> int:
+        """Gradient evaluations of all fits together."""
+        return sum(evidence.gradients for evidence in self.tried)
+
+    @property
     def flops(self) -> int:
         """Of all fits together."""
         return sum(evidence.flops for evidence in self.tried)
@@ -55,7 +67,6 @@ class _Standing:
 
     fitted: Fitted
     rung: Rung
-    kept: list[str] = field(default_factory=list)
     vain: float = 0.0  # cost, in FLOPs a query times shares of a fit
 
 
@@ -80,6 +91,7 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     tried: list[Evidence] = []
     now: _Standing | None = None
     first: Field | None = None
+    fields: dict[str, Field] = {}
     for place in rungs:
         cost = (place.flops + OVERHEAD) * share
         if now is not None and now.vain + cost > settings.vain * (now.rung.flops + OVERHEAD):
@@ -89,7 +101,8 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
         first = first or fitted.model.frozen()
         fitter.fit(fitted, trial, schedule="ramped", looks=False)
         if now is None or _is_better(fitted, now.fitted):
-            now = _Standing(fitted, place, [*([] if now is None else now.kept), place.name])
+            now = _Standing(fitted, place)
+            fields[place.name] = fitted.model.frozen()
         else:
             now.vain += cost
         if now.fitted.evidence.mean <= fitter.observations.footprint:
@@ -97,7 +110,8 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     if now is None or first is None:
         raise ValueError("no rung can be fitted: ladder.rungs is empty")
     fitter.fit(now.fitted, whole - trial, schedule="ramped", looks=True)
-    return Growth(now.fitted, first, tried, now.kept)
+    fields[now.rung.name] = now.fitted.model.frozen()
+    return Growth(now.fitted, first, tried, fields)
 
 
 def _is_better(new: Fitted, old: Fitted) -> bool:

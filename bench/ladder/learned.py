@@ -1,6 +1,7 @@
 """Rungs without a formula: networks of one shape, and a grid whose samples near the surface are free."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -26,6 +27,7 @@ class Network:
 
     layers: int
     width: int
+    follows: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_at_least("network layers", self.layers, 1, "network_1x16 is the least of the default ladder")
@@ -67,6 +69,7 @@ class NarrowBand:
     """A grid of distances of which those near the surface are free; the others stay those of the previous field."""
 
     resolution: int
+    follows: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_at_least("grid", self.resolution, 8, "grid_32 is that of the default ladder")
@@ -81,13 +84,8 @@ class NarrowBand:
 
     @torch.no_grad()
     def starts(self, seen: Seen) -> list[Model]:
-        """The previous field's values; free ones lie near its surface or near the observed points.
-
-        Raises:
-            ValueError: where there is no previous field.
-        """
-        if seen.previous is None:
-            raise ValueError(f"{self.name} needs a field to start from: put another rung before it in task.ladder")
+        """The previous field's values; free ones lie near its surface or near the observed points."""
+        assert seen.previous is not None
         axis = torch.linspace(-REACH, REACH, self.resolution, device=seen.device)
         corners = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         values = seen.previous.frozen()(corners.view(-1, 3))

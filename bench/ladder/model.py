@@ -81,6 +81,11 @@ class Rung(Protocol):
         """That a value costs; what it costs to fit grows with it."""
         ...
 
+    @property
+    def follows(self) -> bool:
+        """Whether it begins with another field, and not with the observed points."""
+        ...
+
     def starts(self, seen: Seen) -> list[Model]:
         """Models before they are fitted, of which the one whose warm start ends best goes on."""
         ...

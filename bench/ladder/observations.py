@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.ladder.held_out import HeldOut, HeldOutError
 from bench.tasks.code import Terms
-from bench.tasks.completion import GivenView
+from bench.tasks.given import GivenView
 from renderers.camera import Rays, sphere_span
 from renderers.field import Field
 from renderers.rendering import Renderer

@@ -55,6 +55,34 @@ class GrowthSettings:
 
 
 @dataclass(frozen=True)
+class ViewSettings:
+    """How many views there are.
+
+    Args:
+        fitted: whose depth and silhouette are given.
+        held_out: of which nothing is.
+        share: of the fitted views' rays that are held out, too.
+        elevation: of all cameras, at most, to both sides, in degrees.
+        rays: of the fitted views, drawn in each iteration.
+    """
+
+    fitted: int
+    held_out: int
+    share: float
+    elevation: float
+    rays: int
+
+    def __post_init__(self) -> None:
+        check_at_least("ladder.views.fitted", self.fitted, 1, "12 see all sides")
+        check_at_least("ladder.views.held_out", self.held_out, 2, "8 give a standard error")
+        check_at_least("ladder.views.rays", self.rays, 1, "1024 work")
+        if not 0 <= self.share < 1:
+            raise ValueError(f"ladder.views.share must lie between 0 and 1, not {self.share}: 0.1 holds out a tenth")
+        if not 0 <= self.elevation < 90:
+            raise ValueError(f"ladder.views.elevation must lie between 0 and 90 degrees, not {self.elevation}: 60")
+
+
+@dataclass(frozen=True)
 class LadderSettings:
     """Which fields there are to choose from, and how they are fitted.
 
@@ -62,11 +90,13 @@ class LadderSettings:
         rungs: their names, the smallest first; see `bench.ladder.rungs`.
         fit: how each is fitted.
         growth: how `field=auto` grows.
+        views: of a known shape.
     """
 
     rungs: tuple[str, ...]
     fit: FitSettings
     growth: GrowthSettings
+    views: ViewSettings
 
     def __post_init__(self) -> None:
         check_at_least("the length of ladder.rungs", len(self.rungs), 1, "conf/scale has whole ones")

@@ -8,46 +8,18 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from bench.auto import RADIUS, half_pixel
+from bench.auto import RADIUS
 from bench.ladder.held_out import HeldOut
 from bench.ladder.observations import RayObservations, Split, hold_out, together
-from bench.tasks.completion import GivenView, Weights
+from bench.ladder.settings import ViewSettings
+from bench.tasks.given import GivenView, Weights
 from datasets.scene import see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.checks import check_at_least
 from renderers.rendering import Renderer
 
 GOLDEN = 180 * (3 - sqrt(5))  # degrees: from a camera to the next, of any number that are spread over a sphere
-
-
-@dataclass(frozen=True)
-class ViewSettings:
-    """How many views there are.
-
-    Args:
-        fitted: whose depth and silhouette are given.
-        held_out: of which nothing is.
-        share: of the fitted views' rays that are held out, too.
-        elevation: of all cameras, at most, to both sides, in degrees.
-        rays: of the fitted views, drawn in each iteration.
-    """
-
-    fitted: int
-    held_out: int
-    share: float
-    elevation: float
-    rays: int
-
-    def __post_init__(self) -> None:
-        check_at_least("task.views.fitted", self.fitted, 1, "12 see all sides")
-        check_at_least("task.views.held_out", self.held_out, 2, "8 give a standard error")
-        check_at_least("task.views.rays", self.rays, 1, "1024 work")
-        if not 0 <= self.share < 1:
-            raise ValueError(f"task.views.share must lie between 0 and 1, not {self.share}: 0.1 holds out a tenth")
-        if not 0 <= self.elevation < 90:
-            raise ValueError(f"task.views.elevation must lie between 0 and 90 degrees, not {self.elevation}: 60")
 
 
 @dataclass(frozen=True)
@@ -73,7 +45,7 @@ class Views:
     @property
     def footprint(self) -> float:
         """Half a pixel where the shape may be nearest (DIST, Eq. 10), in scene units."""
-        return half_pixel(self.sampler, self.sampler.distance - RADIUS)
+        return self.sampler.camera(0.0, 0.0).half_pixel(RADIUS)
 
     def observations(self, seed: int) -> RayObservations:
         """Evenly spread views to fit and, between them, views to hold out."""

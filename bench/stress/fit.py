@@ -17,7 +17,7 @@ from bench.optimise import Course, optimise
 from bench.records import RunStatus
 from bench.stress.conditions import Conditions, FitSettings
 from bench.stress.outcome import Failure, Outcome
-from bench.tasks.completion import GivenView
+from bench.tasks.given import GivenView
 from bench.tasks.problem import OptimiserSettings, check_field_gradient
 from datasets.scene import View
 from datasets.stress.solids import Solid, ball

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.film import Film
 from bench.judge import judge
@@ -13,7 +13,7 @@ from bench.ladder.model import FLOAT
 from bench.ladder.picture import draw_ladder
 from bench.ladder.rungs import PAPERS, rung
 from bench.ladder.study import CheckSettings, Study
-from bench.ladder.views import Views, ViewSettings
+from bench.ladder.views import Views
 from bench.metrics import DEFINITIONS
 from bench.records import RunStatus, plain
 from bench.stage import Cell
@@ -53,17 +53,17 @@ class Capacity:
     """Fits a ladder of fields to views of a shape, and recommends the smallest that will do.
 
     Args:
-        views: that are fitted and held out.
         depth_weight, silhouette_weight: see `bench.tasks.completion.Completion`.
         fewest_rays: share of the rays that the frugal fit of the recommended rung begins with.
         checks: by which the choice is checked afterwards.
     """
 
-    views: ViewSettings
     depth_weight: float
     silhouette_weight: float
     fewest_rays: float
     checks: CheckSettings
+
+    takes_field: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_share("task.fewest_rays", self.fewest_rays, "0.125 begins with an eighth of the rays")
@@ -76,7 +76,7 @@ class Capacity:
         check_field_gradient(stage.renderer)
         record.definitions = DEFINITIONS | NEEDS
         ladder, film = stage.ladder, Film(stage, "by rung")
-        views = Views(Truth(stage.scene.mesh), stage.views, self.views, self, stage.renderer, stage.device)
+        views = Views(Truth(stage.scene.mesh), stage.views, ladder.views, self, stage.renderer, stage.device)
         observations = views.observations(stage.seed)
         with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
@@ -111,7 +111,7 @@ class Capacity:
             draw_ladder(cell.folder, record.metrics, title)
 
     def _note_costs(self, cell: Cell, study: Study, evidence: list[Evidence]) -> None:
-        rays = sum(fitted.done for fitted in study.fits) * self.views.rays
+        rays = sum(fitted.evidence.iterations for fitted in study.fits) * cell.stage.ladder.views.rays
         values = sum(rung.evaluations for rung in evidence)
         cell.record.seconds |= study.fitter.spent
         cell.record.flops = sum(rung.flops for rung in evidence)

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from bench.film import Film
 from bench.judge import look
+from bench.ladder.known import grown_shape
+from bench.ladder.settings import PRIOR
 from bench.pictures import draw_curve
 from bench.poses import JUDGED, PoseStart, of_moved_object
 from bench.solve import COSTS, descend, verdict
@@ -59,6 +62,8 @@ class Pose:
     learning_rate: float
     schedule: str
 
+    takes_field: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_choice("task.shape", self.shape, ("grid", "prior", "formula"))
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
@@ -88,7 +93,7 @@ class Pose:
         stage, record, view = cell.stage, cell.record, cell.stage.scene.view
         if not stage.renderer.capabilities.ray_gradient:
             raise Unsupported(f"{type(stage.renderer).__name__} has no gradient towards rays, so none towards a camera")
-        known = known_shape(self, stage)
+        known = known_shape(self, stage) if stage.field == PRIOR else grown_shape(cell, self)
         check_kind(stage.renderer, known)
         record.definitions = JUDGED | COSTS
         cameras = self.start.cameras(view.camera, stage.scene.seed(stage.seed))

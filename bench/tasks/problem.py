@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import cos, pi
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -89,6 +89,13 @@ class Task(Protocol):
             Unsupported: where the renderer cannot do what the task or its field needs.
         """
         ...
+
+
+@runtime_checkable
+class TakesField(Protocol):
+    """A task that can do with any field in the place of a prior's, as `field` asks."""
+
+    takes_field: ClassVar[bool]
 
 
 @runtime_checkable

@@ -1,0 +1,26 @@
+"""A known shape as no more of a field than it needs: for tasks whose unknown is something else."""
+
+from bench.ladder.fit import Fitter
+from bench.ladder.growth import grow
+from bench.ladder.views import Views
+from bench.stage import Cell
+from bench.tasks.given import Weights
+from datasets.truth import Truth
+from renderers.field import Field
+
+
+def grown_shape(cell: Cell, weights: Weights) -> Field:
+    """The scene's shape as the field that the run asks for, grown from views of it (`field=auto`), or of one rung.
+
+    It is done before the task's own clock begins.
+
+    Args:
+        cell: the run, whose record notes what was grown.
+        weights: of a view's loss.
+    """
+    stage, ladder = cell.stage, cell.stage.ladder
+    views = Views(Truth(stage.scene.mesh), stage.views, ladder.views, weights, stage.renderer, stage.device)
+    fitter = Fitter(views.observations(stage.seed), ladder.fit, stage.seed, stage.device, lambda name, line: None)
+    growth = grow(fitter, ladder.asked(stage.field), ladder.growth)
+    cell.record.notes = [*cell.record.notes, growth.told(stage.field)]
+    return growth.fitted.model.frozen()

@@ -1,0 +1,129 @@
+"""Solves a task whose unknown is a shape with a field of the ladder in the place of a prior's code: `field=auto`."""
+
+import json
+import time
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+
+from bench.film import Film
+from bench.gallery import draw_run
+from bench.judge import judge
+from bench.ladder.fit import Fitter
+from bench.ladder.growth import Growth, grow
+from bench.ladder.observations import Observations
+from bench.metrics import DEFINITIONS
+from bench.pictures import Given
+from bench.records import RunStatus, plain
+from bench.solve import COSTS
+from bench.stage import Cell
+from bench.tasks.problem import check_field_gradient
+from datasets.scene import Scene
+from renderers.rendering import Renderer
+
+ENDED = {
+    "field": "the rung that field=auto ended on, or the one that was asked for",
+    "field_parameters": "its free numbers",
+    "field_error, field_standard_error": "of what was held out of the observations, see bench/ladder/held_out.py",
+    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends",
+    "field_overhead": "seconds of all rungs that were tried over those of the one that it ended on",
+    "fields_tried": "rungs that were tried",
+}
+
+
+@runtime_checkable
+class Grows(Protocol):
+    """A task whose unknown is a shape, and may be any field."""
+
+    def observations(
+        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
+    ) -> tuple[Observations, Given]:
+        """What a field is fitted to, of which some is held out, and what is shown of it in pictures."""
+        ...
+
+
+def solve_by_growth(task: Grows, cell: Cell) -> None:
+    """Executes a task by early growth, or with the one field that was asked for.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+    """
+    stage, record = cell.stage, cell.record
+    check_field_gradient(stage.renderer)
+    record.definitions = DEFINITIONS | COSTS | ENDED
+    observations, given = task.observations(stage.scene, stage.renderer, seed=stage.seed, device=stage.device)
+    lines: list[dict[str, Any]] = []
+    rungs = stage.ladder.asked(stage.field)
+    with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
+
+        def on_line(name: str, line: dict[str, Any]) -> None:
+            lines.append({**line, "iteration": len(lines)})
+            curve.write(json.dumps(plain({**lines[-1], "rung": name}), allow_nan=False) + "\n")
+            cell.progress(name, line["iteration"] + 1, stage.ladder.fit.iterations, line["total"])
+
+        fitter = Fitter(observations, stage.ladder.fit, stage.seed, stage.device, on_line)
+        growth = grow(fitter, rungs, stage.ladder.growth)
+    clock = time.perf_counter()
+    _note_costs(cell, fitter, growth)
+    first, last = growth.first, growth.fitted.model.frozen()
+    record.metrics_start, after = judge(first, stage).metrics, judge(last, stage)
+    record.metrics = after.metrics | ended(growth, observations)
+    record.status, record.reason = _verdict(growth, empty=after.mesh is None)
+    record.notes = [*record.notes, growth.told(stage.field)]
+    if after.mesh is not None:
+        after.mesh.save(cell.folder / "mesh.ply")
+    title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
+    if stage.evaluation.picture is not None:
+        draw_run(cell.folder, stage, (first, last), given, rendered(lines), title)
+    film = Film(stage, "by rung")
+    for name, field in growth.fields.items():
+        film.shoot(name, field, stage.scene.view.camera)
+    film.save(cell.folder, title)
+    record.seconds["evaluation"] = time.perf_counter() - clock
+
+
+def rendered(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The lines of all fits through the renderer, one after the other, with their common terms."""
+    fits = [line for line in lines if set(line) - {"eikonal"} == set(lines[-1]) - {"eikonal"}]
+    common = [{name: value for name, value in line.items() if name != "eikonal"} for line in fits]
+    return [{**line, "iteration": place} for place, line in enumerate(common)]
+
+
+def ended(growth: Growth, observations: Observations) -> dict[str, Any]:
+    """What growth ended on, as metrics."""
+    evidence = growth.fitted.evidence
+    error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
+    return {
+        "field": evidence.rung,
+        "field_parameters": evidence.parameters,
+        "field_error": evidence.mean,
+        **error,
+        "field_footprint": observations.footprint,
+        "field_overhead": growth.overhead,
+        "fields_tried": len(growth.tried),
+    }
+
+
+def _verdict(growth: Growth, *, empty: bool) -> tuple[RunStatus, str]:
+    evidence = growth.fitted.evidence
+    if evidence.error is None:
+        return evidence.status, evidence.reason
+    return (RunStatus.EMPTY, "the field has no surface in the unit sphere") if empty else (RunStatus.OK, "")
+
+
+def _note_costs(cell: Cell, fitter: Fitter, growth: Growth) -> None:
+    record, iterations = cell.record, sum(evidence.iterations for evidence in growth.tried)
+    rays = max(iterations * fitter.observations.rays, 1)
+    record.seconds |= fitter.spent
+    record.flops = growth.flops
+    record.evaluations = {
+        "value": growth.evaluations,
+        "gradient": growth.gradients,
+        "per_ray": growth.evaluations / rays,
+        "rays_per_iteration": fitter.observations.rays,
+        "observed": len(fitter.observations.points),
+        "iterations": iterations,
+    }
+    seconds = record.seconds["forward"] + record.seconds["backward"]
+    if seconds > 0:
+        record.gemm_fraction = growth.flops / seconds / record.environment["gemm_peak_flops"]
