@@ -42,6 +42,7 @@ KINDS = {
     "fig7": Kind(("ablation",)),
     "gradients": Kind(("gradients",)),
     "stability": Kind(("stability",), ("stress",), ("stress",)),
+    "parsimony": Kind(("capacity",), ("dataset",)),
     "speed_accuracy": Kind(("completion", "ablation"), ("dataset", "task", "view", "split")),
 }
 MACHINE = ("cpu", "device", "threads")

@@ -81,6 +81,7 @@ def panels(axes: np.ndarray, ladder: Ladder, *, legend: bool) -> None:
     """Error over free numbers and over FLOPs a query, with the recommended rung ringed."""
     for axis, (key, heading) in zip(axes, AXES.items(), strict=True):
         panel(axis, ladder, key)
+        name_chosen(axis, ladder, key)
         axis.set_xlabel(heading)
     axes[0].set_ylabel("held-out error (scene units)")
     if legend:
@@ -104,7 +105,13 @@ def panel(axis: Axes, ladder: Ladder, key: str) -> None:
         )
     if chosen is not None:
         at = chosen.numbers[key], chosen.numbers["error"]
-        axis.plot(*at, "o", ms=11, mfc="none", mec="#111111", mew=1.2, label="recommended")
-        axis.annotate(chosen.label, at, (0, 9), textcoords="offset points", ha="center", fontsize=7)
+        axis.plot(*at, "o", ms=9, mfc="none", mec="#111111", mew=1.2, label="recommended")
     axis.set(xscale="log", yscale="log")
     style.log_axis(axis, "y", [rung.error for rung in ladder.rungs if rung.error is not None])
+
+
+def name_chosen(axis: Axes, ladder: Ladder, key: str) -> None:
+    """Writes the recommended rung's name above its ring."""
+    if (chosen := ladder.chosen) is not None:
+        at = chosen.numbers[key], chosen.numbers["error"]
+        axis.annotate(chosen.label, at, (0, 9), textcoords="offset points", ha="center", fontsize=7)

@@ -137,7 +137,8 @@ def log_axis(axes: Axes, letter: str, values: Any) -> None:
 
 def short(x: float) -> str:
     """A number of one significant digit or few, such as 5e-5, 0.02 or 10."""
-    return f"{x:g}" if 1e-3 <= abs(x) < 1e4 or x == 0 else f"{x:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    mantissa, power = f"{x:.0e}".split("e")
+    return f"{x:g}" if 1e-3 <= abs(x) < 1e4 or x == 0 else f"{mantissa}e{int(power)}"
 
 
 def error_colours() -> Colormap:

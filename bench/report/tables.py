@@ -29,6 +29,7 @@ _LATEX = {
     "…": r"\ldots{}",
     "∞": r"$\infty$",
     "×": r"$\times$",
+    "±": r"$\pm$",
     "²": "$^2$",
     "→": r"$\rightarrow$",
     "°": r"$^\circ$",
