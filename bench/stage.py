@@ -31,7 +31,6 @@ class Stage:
     renderer: Renderer
     views: ViewSampler
     scene_name: str
-    make_frugal: Callable[[], Renderer]
     make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
     evaluation: EvaluationSettings
@@ -40,6 +39,7 @@ class Stage:
     cache: Path  # where what is slow to make is kept
     notes: tuple[str, ...] = ()  # what settings came to that follow from others
     endings: tuple[Callable[[], str], ...] = ()  # what settings came to that change on the way, when it has ended
+    make_frugal: Callable[[], Renderer] | None = None
     ladder: LadderSettings | None = None  # the fields to choose from, where none is a prior's
     field: str = PRIOR  # what a shape that is looked for is made of
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
@@ -52,7 +52,7 @@ class Stage:
     @cached_property
     def frugal(self) -> Renderer:
         """The renderer with no more precision than a pixel, and no more steps than that takes."""
-        return self.make_frugal()
+        return self.renderer if self.make_frugal is None else self.make_frugal()
 
     @property
     def last_notes(self) -> list[str]:

@@ -9,7 +9,8 @@ import trimesh
 
 from bench.config import load
 from bench.optimise import Course, optimise
-from bench.tasks.multiview import GivenPhotographs, Multiview, blurred
+from bench.tasks.multiview import Multiview
+from bench.tasks.photographs import GivenPhotographs, blurred
 from bench.tasks.problem import NotReached, OptimiserSettings, Unsupported
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see

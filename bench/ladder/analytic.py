@@ -19,7 +19,8 @@ from renderers.fields.analytic import box as exact_box
 LEARNING_RATE = 0.01  # scene units, radians or a share of a size: what a step of Adam may change
 LEAST = 0.01  # scene units: half size of a part at its start
 AROUND = 3000  # points that parts are found among
-STARTS = 4  # clusterings
+CORNER = 0.3  # scene units: of a cube that stands for points where none are known
+STARTS = 6  # clusterings
 WORST = 0.75  # share of the points that a smaller union shows better than those where new parts begin
 ROUND, EDGED = 0.0, -1.5  # how a rounded box begins: its radius is that logistic share of its least half size
 EXPONENTS = (1.0, 20.0)  # of a superquadric: from an octahedron to nearly a box
@@ -90,6 +91,7 @@ class OnePart:
 
     name: str
     follows: ClassVar[bool] = False
+    tries: ClassVar[int] = 1
 
     @property
     def flops(self) -> int:
@@ -119,6 +121,7 @@ class UnionOf:
 
     count: int
     follows: ClassVar[bool] = False
+    tries: ClassVar[int] = STARTS + 1
 
     def __post_init__(self) -> None:
         check_at_least("union", self.count, 2, "union_2 is the least")
@@ -166,9 +169,9 @@ def _turn(numbers: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
 
 
 def _or_unit(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-    """The points, some of many; the corners of a cube in the unit sphere where there are too few for a box."""
+    """The points, some of many; the corners of a cube in the middle of the scene where there are too few for a box."""
     if len(points) < 4:
-        return 0.5 * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+        return CORNER * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     every = max(len(points) // AROUND, 1)
     return points[::every].cpu()
 

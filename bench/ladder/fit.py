@@ -19,13 +19,15 @@ from bench.ladder.warm_start import WarmStart, scattered
 from bench.optimise import Course, optimise
 from bench.records import RunStatus
 from bench.tasks.code import Terms
-from bench.tasks.problem import OptimiserSettings, Unsupported, check_kind
+from bench.tasks.problem import NotReached, OptimiserSettings, Unsupported, check_kind
 from renderers.field import Counts, Field, Meter
 
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # of an evidence
 NEAR_ENOUGH = 0.1  # loss: a warm start may begin below it, and then that is what divergence is measured from
-QUERIES = 8  # field values a ray, about, of a tracer
+SCREENING = (
+    4  # where there are several starts: each has one of so many parts of a warm start, then the best a whole one
+)
 EIKONAL_SEED = 7  # of the points; those of iterations differ
 LOOKS = {4**power for power in range(1, 12)}  # iterations
 PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids
@@ -63,14 +65,6 @@ class Fitter:
     on_line: Callable[[str, dict[str, Any]], None]
     spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by what they were for
 
-    @property
-    def warm_share(self) -> float:
-        """Field values of a warm start over those of a whole fit, about."""
-        settings = self.settings
-        return (
-            settings.warm_iterations * settings.warm_points / (settings.iterations * self.observations.rays * QUERIES)
-        )
-
     def begin(self, rung: Rung, previous: Model | None) -> Fitted:
         """A rung's model after its warm start, judged."""
         ball = None
@@ -78,29 +72,32 @@ class Fitter:
             ball = self.begin(OnePart("sphere"), None)
             previous = ball.model
         seen = Seen(self.observations.points.cpu(), previous, self.seed, self.device)
-        started = [self._started(rung, model, previous) for model in rung.starts(seen)]
-        fitted, _ = min(started, key=lambda pair: pair[1])
-        started += [] if ball is None else [(ball, inf)]
-        evidence = fitted.evidence
+        starts = [self._start(rung, model, previous) for model in rung.starts(seen)]
+        screened = self.settings.warm_iterations // SCREENING if len(starts) > 1 else 0
+        for fitted, start in starts:
+            self._warm(fitted, start, screened)
+        fitted, start = min(starts, key=lambda pair: inf if pair[0].failed else pair[1].error())
+        self._warm(fitted, start, self.settings.warm_iterations)
+        spent = [other.evidence for other, _ in starts] + ([] if ball is None else [ball.evidence])
         for name in SPENT:
-            setattr(evidence, name, sum(getattr(other.evidence, name) for other, _ in started))
+            setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in spent))
         self._judge(fitted)
         return fitted
 
-    def _started(self, rung: Rung, model: Model, previous: Model | None) -> tuple[Fitted, float]:
-        """A model after its warm start, and what that came to."""
+    def _start(self, rung: Rung, model: Model, previous: Model | None) -> tuple[Fitted, WarmStart]:
+        """A model that the renderer takes, and how it starts."""
         fitted = Fitted(model, Evidence(rung.name, model.size, model.bytes, rung.flops))
         try:
             check_kind(self.observations.renderer, model.frozen())
         except Unsupported as error:
             fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
-            return fitted, inf
         target = previous.frozen() if rung.follows and previous is not None else None
-        start = WarmStart.of(model, self.observations, target, count=self.settings.warm_points, seed=self.seed)
-        if self.settings.warm_iterations:
-            rate = PARTS_RATE if model.metric else WHOLE_RATE
-            self._run(fitted, start, OptimiserSettings(self.settings.warm_iterations, rate, "cosine"), looks=False)
-        return fitted, inf if fitted.failed else start.error()
+        return fitted, WarmStart.of(model, self.observations, target, count=self.settings.warm_points, seed=self.seed)
+
+    def _warm(self, fitted: Fitted, start: WarmStart, iterations: int) -> None:
+        if iterations and not fitted.failed:
+            rate = PARTS_RATE if fitted.model.metric else WHOLE_RATE
+            self._run(fitted, start, OptimiserSettings(iterations, rate, "cosine"), looks=False)
 
     def fit(self, fitted: Fitted, iterations: int, *, schedule: str, looks: bool) -> None:
         """Goes on with a rung for so many iterations, and judges it; with `looks` on the way, too."""
@@ -129,7 +126,10 @@ class Fitter:
                 self._judge(fitted)
             self.on_line(evidence.rung, {**line, "iteration": fitted.evidence.iterations + line["iteration"]})
 
-        optimise(problem, settings, self.device, course=course, on_step=on_step)
+        try:
+            optimise(problem, settings, self.device, course=course, on_step=on_step)
+        except NotReached as error:
+            course.status, course.reason = RunStatus.NOT_REACHED, str(error)
         for name, seconds in course.seconds.items():
             self.spent[name] = self.spent.get(name, 0.0) + seconds
         evidence.status, evidence.reason = course.status, course.reason

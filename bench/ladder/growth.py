@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from math import ceil
 
 from bench.ladder.choice import Evidence
-from bench.ladder.fit import Fitted, Fitter
+from bench.ladder.fit import SCREENING, Fitted, Fitter
 from bench.ladder.model import Rung
 from bench.ladder.settings import GrowthSettings
 from renderers.field import Field
 
 OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
+WARM = 1 / 12  # of an iteration's time: one of a warm start (measured: 1.5 ms of 16)
 
 
 @dataclass
@@ -61,57 +62,47 @@ class Growth:
         return sum(evidence.flops for evidence in self.tried)
 
 
-@dataclass
-class _Standing:
-    """Where growth stands."""
-
-    fitted: Fitted
-    rung: Rung
-    vain: float = 0.0  # cost, in FLOPs a query times shares of a fit
-
-
 def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     """Tries rungs from the smallest on, keeps those that are better, and fits the last to the end.
 
     A rung is better where its held-out error is less than that of the one before by more than the standard error of the
-    difference, over the same rays. Growth ends where the error is below the footprint, or before the next rung would
-    bring what was tried in vain above its share of the present rung's fit.
+    difference, over the same rays. Growth ends where the error is below the footprint, where patience ends, or where
+    another trial would take the whole above its budget.
 
     Args:
         fitter: fits them.
         rungs: the smallest first.
         settings: how far to look ahead.
-
-    Raises:
-        ValueError: where no rung can be fitted.
     """
     whole = fitter.settings.iterations
     trial = max(ceil(settings.trial * whole), 1)
-    share = trial / whole + fitter.warm_share
-    tried: list[Evidence] = []
-    now: _Standing | None = None
-    first: Field | None = None
-    fields: dict[str, Field] = {}
-    for place in rungs:
-        cost = (place.flops + OVERHEAD) * share
-        if now is not None and now.vain + cost > settings.vain * (now.rung.flops + OVERHEAD):
+    now, rung = fitter.begin(rungs[0], None), rungs[0]
+    first = now.model.frozen()
+    fitter.fit(now, trial, schedule="ramped", looks=False)
+    tried, fields, vain, others = [now.evidence], {rung.name: now.model.frozen()}, 0, 0.0
+    for larger in rungs[1:]:
+        enough = now.evidence.mean <= fitter.observations.footprint
+        budget = (settings.budget - 1) * cost(rung, whole, fitter)
+        if enough or vain == settings.patience or others + cost(larger, trial, fitter) > budget:
             break
-        fitted = fitter.begin(place, None if now is None else now.fitted.model)
-        tried.append(fitted.evidence)
-        first = first or fitted.model.frozen()
+        fitted = fitter.begin(larger, now.model)
         fitter.fit(fitted, trial, schedule="ramped", looks=False)
-        if now is None or _is_better(fitted, now.fitted):
-            now = _Standing(fitted, place)
-            fields[place.name] = fitted.model.frozen()
-        else:
-            now.vain += cost
-        if now.fitted.evidence.mean <= fitter.observations.footprint:
-            break
-    if now is None or first is None:
-        raise ValueError("no rung can be fitted: ladder.rungs is empty")
-    fitter.fit(now.fitted, whole - trial, schedule="ramped", looks=True)
-    fields[now.rung.name] = now.fitted.model.frozen()
-    return Growth(now.fitted, first, tried, fields)
+        tried.append(fitted.evidence)
+        better = _is_better(fitted, now)
+        others += cost(rung if better else larger, trial, fitter)
+        vain = 0 if better else vain + 1
+        if better:
+            now, rung = fitted, larger
+            fields[rung.name] = now.model.frozen()
+    fitter.fit(now, whole - trial, schedule="ramped", looks=True)
+    return Growth(now, first, tried, fields | {rung.name: now.model.frozen()})
+
+
+def cost(rung: Rung, iterations: int, fitter: Fitter) -> float:
+    """About what a warm start and so many iterations cost, in iterations of a field that costs nothing to ask."""
+    starts = 1 + (rung.tries / SCREENING if rung.tries > 1 else 0)
+    warm = fitter.settings.warm_iterations * starts
+    return (iterations + WARM * warm) * (1 + rung.flops / OVERHEAD)
 
 
 def _is_better(new: Fitted, old: Fitted) -> bool:

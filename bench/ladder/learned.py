@@ -14,7 +14,7 @@ from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import BoundDecoder, Decoder
 
 DEEP = 8  # layers from which on the points come in again half-way, as in DeepSDF
-FASTEST, RATE_OF_WIDTH = 2e-3, 0.1  # Adam's rate falls as the width grows (Yang et al. 2021), from a largest one on
+FASTEST, RATE_OF_WIDTH = 2e-3, 0.4  # Adam's rate falls as the width grows (Yang et al. 2021), from a largest one on
 START_RADIUS = 0.5  # of the ball that a network begins near, in scene units
 REACH = 1.05  # of the sampled cube: the unit sphere and a little more
 BAND = 2.0  # cells to both sides of the surface whose samples are free
@@ -28,6 +28,7 @@ class Network:
     layers: int
     width: int
     follows: ClassVar[bool] = True
+    tries: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
         check_at_least("network layers", self.layers, 1, "network_1x16 is the least of the default ladder")
@@ -70,6 +71,7 @@ class NarrowBand:
 
     resolution: int
     follows: ClassVar[bool] = True
+    tries: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
         check_at_least("grid", self.resolution, 8, "grid_32 is that of the default ladder")

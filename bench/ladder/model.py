@@ -82,6 +82,11 @@ class Rung(Protocol):
         ...
 
     @property
+    def tries(self) -> int:
+        """How many starts it has, at most."""
+        ...
+
+    @property
     def follows(self) -> bool:
         """Whether it begins with another field, and not with the observed points."""
         ...

@@ -131,7 +131,7 @@ class RayObservations:
 
 
 @dataclass(frozen=True)
-class Split:
+class Holdout:
     """What is held out.
 
     Args:
@@ -147,7 +147,7 @@ class Split:
     seed: int
 
 
-def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Split, *, rays: int) -> RayObservations:
+def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays: int) -> RayObservations:
     """Holds out whole groups, and a share of the rays of the others.
 
     Args:

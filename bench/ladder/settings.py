@@ -43,15 +43,19 @@ class GrowthSettings:
 
     Args:
         trial: share of a whole fit's iterations that a rung is tried for.
-        vain: share of the present rung's whole fit that larger rungs may cost in vain, before growth ends.
+        patience: successive rungs that may be tried in vain.
+        budget: what all rungs together may cost, over the whole fit of the one that it ends on; by the model of
+            `bench.ladder.growth.cost`, not by a clock, so that the same run ends the same everywhere.
     """
 
     trial: float
-    vain: float
+    patience: int
+    budget: float
 
     def __post_init__(self) -> None:
         check_share("ladder.growth.trial", self.trial, "1/16 tells whether a rung is better than the one before")
-        check_at_least("ladder.growth.vain", self.vain, 0, "0.4 keeps the whole within twice the last rung's fit")
+        check_at_least("ladder.growth.patience", self.patience, 1, "5 finds a grid behind small networks")
+        check_at_least("ladder.growth.budget", self.budget, 1, "2 is twice the fit of the rung that it ends on")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -17,7 +18,7 @@ from bench.pictures import Given
 from bench.records import RunStatus, plain
 from bench.solve import COSTS
 from bench.stage import Cell
-from bench.tasks.problem import check_field_gradient
+from bench.tasks.problem import OptimiserSettings, check_field_gradient
 from datasets.scene import Scene
 from renderers.rendering import Renderer
 
@@ -33,7 +34,10 @@ ENDED = {
 
 @runtime_checkable
 class Grows(Protocol):
-    """A task whose unknown is a shape, and may be any field."""
+    """A task whose unknown may be any field: each is fitted for the task's iterations, at a rate of its own."""
+
+    @property
+    def optimiser(self) -> OptimiserSettings: ...
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
@@ -59,9 +63,10 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
         def on_line(name: str, line: dict[str, Any]) -> None:
             lines.append({**line, "iteration": len(lines)})
             curve.write(json.dumps(plain({**lines[-1], "rung": name}), allow_nan=False) + "\n")
-            cell.progress(name, line["iteration"] + 1, stage.ladder.fit.iterations, line["total"])
+            cell.progress(name, line["iteration"] + 1, task.optimiser.iterations, line["total"])
 
-        fitter = Fitter(observations, stage.ladder.fit, stage.seed, stage.device, on_line)
+        settings = replace(stage.ladder.fit, iterations=task.optimiser.iterations)
+        fitter = Fitter(observations, settings, stage.seed, stage.device, on_line)
         growth = grow(fitter, rungs, stage.ladder.growth)
     clock = time.perf_counter()
     _note_costs(cell, fitter, growth)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.auto import RADIUS
 from bench.ladder.held_out import HeldOut
-from bench.ladder.observations import RayObservations, Split, hold_out, together
+from bench.ladder.observations import Holdout, RayObservations, hold_out, together
 from bench.ladder.settings import ViewSettings
 from bench.tasks.given import GivenView, Weights
 from datasets.scene import see
@@ -53,14 +53,14 @@ class Views:
         turn = float(np.random.default_rng([seed, 2]).uniform(0, 360))
         cameras = [*self._spread(settings.fitted, turn), *self._spread(settings.held_out, turn + GOLDEN / 2)]
         held = tuple(range(settings.fitted, len(cameras)))
-        return hold_out(*self._seen(cameras), Split(settings.share, held, self.footprint, seed), rays=settings.rays)
+        return hold_out(*self._seen(cameras), Holdout(settings.share, held, self.footprint, seed), rays=settings.rays)
 
     def further(self, count: int, seed: int) -> HeldOut:
         """So many views more, that no choice has seen, each drawn at random."""
         draw, highest = np.random.default_rng([seed, 3]), sin(radians(self.settings.elevation))
         angles = [(draw.uniform(0, 360), degrees(asin(draw.uniform(-highest, highest)))) for _ in range(count)]
         cameras = [self.sampler.camera(*pair) for pair in angles]
-        everything = Split(0.0, tuple(range(count)), self.footprint, seed)
+        everything = Holdout(0.0, tuple(range(count)), self.footprint, seed)
         return hold_out(*self._seen(cameras), everything, rays=self.settings.rays).held_out
 
     def _spread(self, count: int, turn: float) -> list[Camera]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.auto import RADIUS
 from bench.autodecoder import Prior
-from bench.ladder.observations import Observations, Split, hold_out, together
+from bench.ladder.observations import Holdout, Observations, hold_out, together
 from bench.ladder.settings import PRIOR
 from bench.ladder.solve import solve_by_growth
 from bench.pictures import Given
@@ -89,7 +89,7 @@ class Completion:
         view, given_part = self._given(scene.view, renderer, seed=seed, device=device)
         rows, columns = given_part.shape
         tile = (torch.arange(rows) * TILES // rows)[:, None] * TILES + torch.arange(columns) * TILES // columns
-        split = Split(HELD_OUT, (), scene.view.camera.half_pixel(RADIUS), seed)
+        split = Holdout(HELD_OUT, (), scene.view.camera.half_pixel(RADIUS), seed)
         return (
             hold_out(together([view]), tile.flatten(), split, rays=given_part.numel()),
             Given(scene.view, given_part.numpy()),

@@ -2,29 +2,32 @@
 
 from dataclasses import dataclass
 from math import radians
+from typing import ClassVar
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.autodecoder import Prior
+from bench.ladder.observations import Observations
+from bench.ladder.settings import PRIOR
+from bench.ladder.solve import solve_by_growth
+from bench.pictures import Given
 from bench.solve import solve
 from bench.stage import Cell
 from bench.starts import StartSettings
-from bench.tasks.code import CodePenalty, CodeProblem, Terms, code_problem
-from bench.tasks.problem import NotReached, OptimiserSettings, check_field_gradient
-from bench.warp import project, sample
-from datasets.photographs import Photograph, Photography
+from bench.tasks.code import CodePenalty, CodeProblem, code_problem
+from bench.tasks.photographs import GivenPhotographs, PhotographObservations
+from bench.tasks.problem import OptimiserSettings, check_field_gradient
+from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.truth import Truth
-from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field
-from renderers.rendering import Renderer, at_iteration
+from renderers.rendering import Renderer
 
 LEAST_SCALE, MOST_SHIFT = 0.8, 0.2
 FAR_APART = 60.0  # degrees between two photographs that a note is made of
-SURE = 0.999  # of the weight of a pixel's neighbours must be on the shape for a depth between them
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class Multiview:
     learning_rate: float
     schedule: str
 
+    takes_field: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
@@ -109,7 +114,20 @@ class Multiview:
         if apart > FAR_APART:
             told = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             cell.record.notes = [*cell.record.notes, told]
-        solve(self, cell)
+        if cell.stage.field == PRIOR:
+            solve(self, cell)
+        else:
+            solve_by_growth(self, cell)
+
+    def observations(
+        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
+    ) -> tuple[Observations, Given]:
+        """What a field without a prior is fitted to; some photographs are held out."""
+        own = scene.seed(seed)
+        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=own)
+        given = GivenPhotographs(self, renderer, photographs, device)
+        nothing = np.zeros(scene.view.mask.shape, dtype=bool)
+        return PhotographObservations.of(given), Given(scene.view, nothing, given.colours.cpu().numpy())
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -144,81 +162,3 @@ class Multiview:
         axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
         similarity = torch.cat([self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()])
         return similarity.expand(self.starts, -1)
-
-
-class GivenPhotographs:
-    """The photographs; `compare` renders a field's depths and warps by them."""
-
-    def __init__(self, settings: Multiview, renderer: Renderer, photographs: list[Photograph], device: torch.device):
-        self.settings, self.renderer = settings, renderer
-        self.cameras = [photograph.view.camera.to(device) for photograph in photographs]
-        self.rays = [camera.rays() for camera in self.cameras]
-        self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
-        self.per_step = min(settings.views_per_step, len(photographs))
-
-    def pairs(self, iteration: int) -> list[tuple[int, int]]:
-        """The views that an iteration compares, each with its neighbour."""
-        count = len(self.cameras)
-        views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
-        return [(view, (view + self.settings.neighbour) % count) for view in views]
-
-    def compare(self, field: Field, iteration: int) -> Terms:
-        """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
-
-        Raises:
-            NotReached: where there is no such pixel.
-        """
-        renderer = at_iteration(self.renderer, iteration)
-        pairs = self.pairs(iteration)
-        mine = renderer.render(field, self._together([pair[0] for pair in pairs]))
-        with torch.no_grad():
-            others = renderer.render(field, self._together([pair[1] for pair in pairs]))
-        colours = self._blurred(iteration)
-        differences = []
-        for k, (view, other) in enumerate(pairs):
-            pixels, depth = project(self.cameras[other], mine.points[k])
-            with torch.no_grad():
-                there = self.cameras[other].depth(others.distance[k])
-                seen = mine.hit[k] & self._sees(there, others.hit[k], pixels, depth)
-            warped, _ = sample(colours[other], pixels[seen])
-            differences.append((warped - colours[view][seen]).abs().mean(-1))
-        together = torch.cat(differences)
-        if not len(together):
-            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
-        return {"photometric": self.settings.photometric_weight * together.mean()}
-
-    def _sees(
-        self,
-        depth: Float[Tensor, "height width"],
-        hit: Bool[Tensor, "height width"],
-        pixels: Float[Tensor, "height width 2"],
-        expected: Float[Tensor, "height width"],
-    ) -> Bool[Tensor, "height width"]:
-        """Where a view's own depth agrees with that of the points that fall on `pixels` (DIST, B.3)."""
-        both = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
-        known, inside = sample(both, pixels)
-        close = (known[..., 0] - expected).square() < self.settings.visible
-        return inside & close & (known[..., 1] > SURE)
-
-    def _together(self, views: list[int]) -> Rays:
-        chosen = [self.rays[view] for view in views]
-        origins = torch.stack([rays.origins for rays in chosen])
-        return Rays(origins, torch.stack([rays.directions for rays in chosen]), image=True)
-
-    def _blurred(self, iteration: int) -> Float[Tensor, "views height width 3"]:
-        """The images at an iteration: coarse ones first, where that is asked for."""
-        own = self.settings.turns.own(self.settings.iterations)
-        sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * iteration / own)
-        return self.colours if sigma <= 0 else blurred(self.colours, sigma)
-
-
-def blurred(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:
-    """Images under a Gaussian whose standard deviation is in pixels; at their edges they are mirrored."""
-    reach = min(int(3 * sigma) + 1, images.shape[1] - 1, images.shape[2] - 1)
-    offsets = torch.arange(-reach, reach + 1, dtype=images.dtype, device=images.device)
-    weights = torch.softmax(-0.5 * (offsets / sigma).square(), dim=0)
-    flat = images.permute(0, 3, 1, 2).reshape(-1, 1, *images.shape[1:3])
-    padded = torch.nn.functional.pad(flat, (reach, reach, reach, reach), mode="reflect")
-    across = torch.nn.functional.conv2d(padded, weights.view(1, 1, 1, -1))
-    both = torch.nn.functional.conv2d(across, weights.view(1, 1, -1, 1))
-    return both.view(len(images), 3, *images.shape[1:3]).permute(0, 2, 3, 1)

@@ -1,0 +1,221 @@
+"""Photographs with known cameras: their loss, and what is held out of them where a field has no prior."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.ladder.held_out import HeldOutError
+from bench.starts import StartSettings
+from bench.tasks.code import Terms
+from bench.tasks.problem import NotReached
+from bench.warp import project, sample
+from datasets.photographs import Photograph
+from renderers.camera import Rays
+from renderers.field import Field
+from renderers.rendering import Renderer, at_iteration
+
+SURE = 0.999  # of the weight of a pixel's neighbours must be on the shape for a depth between them
+HELD_OUT_EVERY = 6  # photographs, where a field has no prior: a pair of them
+
+
+@runtime_checkable
+class PhotometricSettings(Protocol):
+    """What the loss reads of a task's settings; see `bench.tasks.multiview.Multiview`."""
+
+    @property
+    def views_per_step(self) -> int: ...
+
+    @property
+    def neighbour(self) -> int: ...
+
+    @property
+    def visible(self) -> float: ...
+
+    @property
+    def photometric_weight(self) -> float: ...
+
+    @property
+    def coarse_blur(self) -> float: ...
+
+    @property
+    def iterations(self) -> int: ...
+
+    @property
+    def turns(self) -> StartSettings: ...
+
+
+class GivenPhotographs:
+    """The photographs; `compare` renders a field's depths and warps by them."""
+
+    def __init__(
+        self, settings: PhotometricSettings, renderer: Renderer, photographs: list[Photograph], device: torch.device
+    ):
+        self.settings, self.renderer = settings, renderer
+        self.cameras = [photograph.view.camera.to(device) for photograph in photographs]
+        self.rays = [camera.rays() for camera in self.cameras]
+        self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
+        self.per_step = min(settings.views_per_step, len(photographs))
+
+    def pairs(self, iteration: int) -> list[tuple[int, int]]:
+        """The views that an iteration compares, each with its neighbour."""
+        count = len(self.cameras)
+        views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
+        return [(view, (view + self.settings.neighbour) % count) for view in views]
+
+    def compare(self, field: Field, iteration: int) -> Terms:
+        """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
+
+        Raises:
+            NotReached: where there is no such pixel.
+        """
+        return self.over(field, iteration, self.pairs(iteration))
+
+    def over(self, field: Field, iteration: int, pairs: list[tuple[int, int]]) -> Terms:
+        """The same over pairs of views.
+
+        Raises:
+            NotReached: where there is no such pixel.
+        """
+        renderer = at_iteration(self.renderer, iteration)
+        together = torch.cat(self.differences(field, renderer, pairs, self._blurred(iteration)))
+        if not len(together):
+            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
+        return {"photometric": self.settings.photometric_weight * together.mean()}
+
+    def differences(
+        self,
+        field: Field,
+        renderer: Renderer,
+        pairs: list[tuple[int, int]],
+        colours: Float[Tensor, "views height width 3"],
+    ) -> list[Float[Tensor, "_"]]:
+        """Absolute differences of colours, of each pair over the pixels that both views see."""
+        mine = renderer.render(field, self._together([pair[0] for pair in pairs]))
+        with torch.no_grad():
+            others = renderer.render(field, self._together([pair[1] for pair in pairs]))
+        differences = []
+        for k, (view, other) in enumerate(pairs):
+            pixels, depth = project(self.cameras[other], mine.points[k])
+            with torch.no_grad():
+                there = self.cameras[other].depth(others.distance[k])
+                seen = mine.hit[k] & self._sees(there, others.hit[k], pixels, depth)
+            warped, _ = sample(colours[other], pixels[seen])
+            differences.append((warped - colours[view][seen]).abs().mean(-1))
+        return differences
+
+    def _sees(
+        self,
+        depth: Float[Tensor, "height width"],
+        hit: Bool[Tensor, "height width"],
+        pixels: Float[Tensor, "height width 2"],
+        expected: Float[Tensor, "height width"],
+    ) -> Bool[Tensor, "height width"]:
+        """Where a view's own depth agrees with that of the points that fall on `pixels` (DIST, B.3)."""
+        both = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
+        known, inside = sample(both, pixels)
+        close = (known[..., 0] - expected).square() < self.settings.visible
+        return inside & close & (known[..., 1] > SURE)
+
+    def _together(self, views: list[int]) -> Rays:
+        chosen = [self.rays[view] for view in views]
+        origins = torch.stack([rays.origins for rays in chosen])
+        return Rays(origins, torch.stack([rays.directions for rays in chosen]), image=True)
+
+    def _blurred(self, iteration: int) -> Float[Tensor, "views height width 3"]:
+        """The images at an iteration: coarse ones first, where that is asked for."""
+        own = self.settings.turns.own(self.settings.iterations)
+        sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * iteration / own)
+        return self.colours if sigma <= 0 else blurred(self.colours, sigma)
+
+
+@dataclass(frozen=True)
+class PhotographObservations:
+    """Photographs of which some are held out; see `bench.ladder.observations.Observations`.
+
+    Errors are differences of colours, which no pixel's footprint bounds.
+
+    Args:
+        given: all photographs.
+        fitted, held_out: pairs of neighbours, of which no photograph is in both.
+    """
+
+    given: GivenPhotographs
+    fitted: list[tuple[int, int]]
+    held_out: list[tuple[int, int]]
+
+    footprint: ClassVar[float] = 0.0
+    weight: ClassVar[float] = inf
+
+    @staticmethod
+    def of(given: GivenPhotographs) -> "PhotographObservations":
+        """Holds out every so many pairs.
+
+        Raises:
+            ValueError: where there are too few photographs.
+        """
+        count, apart = len(given.cameras), given.settings.neighbour
+        held_out = [(view, (view + apart) % count) for view in range(0, count, HELD_OUT_EVERY)]
+        hidden = {view for pair in held_out for view in pair}
+        pairs = [(view, (view + apart) % count) for view in range(count)]
+        fitted = [pair for pair in pairs if not hidden & set(pair)]
+        if len(held_out) < 2 or not fitted:
+            least = 2 * HELD_OUT_EVERY
+            raise ValueError(
+                f"task.images.views must be at least {least}, not {count}: some are held out where no prior is used"
+            )
+        return PhotographObservations(given, fitted, held_out)
+
+    @property
+    def renderer(self) -> Renderer:
+        """Through which photographs are compared."""
+        return self.given.renderer
+
+    @property
+    def rays(self) -> int:
+        """Of both views of each pair."""
+        return 2 * self.given.per_step * self.given.colours.shape[1] * self.given.colours.shape[2]
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """None are known."""
+        return self.given.colours.new_zeros(0, 3)
+
+    def free(self, seed: int) -> Float[Tensor, "n 3"]:
+        """None are known."""
+        return self.points
+
+    def terms(self, field: Field, iteration: int, share: float) -> Terms:
+        """The photometric loss of an iteration's pairs.
+
+        Raises:
+            NotReached: where no point is seen by two views.
+        """
+        count, per_step = len(self.fitted), min(self.given.per_step, len(self.fitted))
+        chosen = [self.fitted[(iteration + round(k * count / per_step)) % count] for k in range(per_step)]
+        return self.given.over(field, iteration, chosen)
+
+    @torch.no_grad()
+    def error(self, field: Field) -> HeldOutError:
+        """The mean difference of colours over held-out pairs; 1, the largest, where a pair shows nothing in common."""
+        rows = []
+        for pair in self.held_out:
+            (found,) = self.given.differences(field, self.renderer, [pair], self.given.colours)
+            rows.append([float(found.sum()), len(found), 0, len(found)] if len(found) else [0, 0, 1, 1])
+        return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
+
+
+def blurred(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:
+    """Images under a Gaussian whose standard deviation is in pixels; at their edges they are mirrored."""
+    reach = min(int(3 * sigma) + 1, images.shape[1] - 1, images.shape[2] - 1)
+    offsets = torch.arange(-reach, reach + 1, dtype=images.dtype, device=images.device)
+    weights = torch.softmax(-0.5 * (offsets / sigma).square(), dim=0)
+    flat = images.permute(0, 3, 1, 2).reshape(-1, 1, *images.shape[1:3])
+    padded = torch.nn.functional.pad(flat, (reach, reach, reach, reach), mode="reflect")
+    across = torch.nn.functional.conv2d(padded, weights.view(1, 1, 1, -1))
+    both = torch.nn.functional.conv2d(across, weights.view(1, 1, -1, 1))
+    return both.view(len(images), 3, *images.shape[1:3]).permute(0, 2, 3, 1)
