@@ -100,6 +100,9 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
     chosen = _renderer(config, config.renderer, views)
     dataset = cast(Dataset, build(config.dataset, "dataset", list(config.packages)))
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
+    ladder: LadderSettings = build(config.ladder, "ladder", target="bench.ladder.settings.LadderSettings")
+    if config.field != PRIOR:
+        ladder.asked(config.field)
     settings = prior_settings(config)
     cache = Path(config.priors_dir)
     torch.manual_seed(config.seed)
@@ -124,7 +127,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         cache=cache,
         notes=chosen.notes,
         endings=chosen.endings,
-        ladder=build(config.ladder, "ladder", target="bench.ladder.settings.LadderSettings"),
+        ladder=ladder,
         field=config.field,
         trained=trained,
     )

@@ -33,7 +33,7 @@ class HeldOutError:
     @property
     def mean(self) -> float:
         """In scene units."""
-        return float(_mean(self.sums.sum(0), self.missed))
+        return float(_means(self.sums.sum(0, keepdims=True), self.missed)[0])
 
     @property
     def standard_error(self) -> float:
@@ -49,7 +49,7 @@ class HeldOutError:
         return HeldOutError(self.sums[groups], self.missed)
 
     def _without_each(self) -> Float[np.ndarray, " groups"]:
-        return _mean(self.sums.sum(0) - self.sums, self.missed)
+        return _means(self.sums.sum(0) - self.sums, self.missed)
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class HeldOut:
         return HeldOutError(torch.stack(sums, dim=1).cpu().numpy(), missed)
 
 
-def _mean(sums: Float[np.ndarray, "*groups 4"], missed: float) -> Float[np.ndarray, "*groups"]:
+def _means(sums: Float[np.ndarray, "n 4"], missed: float) -> Float[np.ndarray, " n"]:
     """Errors of hits and of misses, each by its share of the rays on which either hits."""
-    errors, hits, disagree, either = np.moveaxis(np.asarray(sums, dtype=np.float64), -1, 0)
+    errors, hits, disagree, either = sums.T
     share = disagree / np.maximum(either, 1)
     return (1 - share) * errors / np.maximum(hits, 1) + share * missed
 

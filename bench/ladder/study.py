@@ -8,6 +8,7 @@ import numpy as np
 from bench.ladder.choice import Choice, Evidence, choose, is_as_good
 from bench.ladder.fit import Fitted, Fitter
 from bench.ladder.growth import Growth, grow
+from bench.ladder.held_out import HeldOutError
 from bench.ladder.model import Rung
 from bench.ladder.observations import RayObservations
 from bench.ladder.settings import GrowthSettings
@@ -77,20 +78,11 @@ class Study:
 
     def check(self, choice: Choice, views: Views, settings: CheckSettings) -> dict[str, float]:
         """On what share of draws of views, unseen by the choice, it holds; the best rung is that of each draw."""
-        seed, footprint = self.fitter.seed, self.observations.footprint
-        further = views.further(settings.views, seed)
+        further = views.further(settings.views, self.fitter.seed)
         sound = _sound(self.fits)
         errors = [further.error(fitted.model.frozen(), self.observations.renderer) for fitted in sound]
         own = errors[sound.index(self.of(choice.chosen))]
-        draw, strict, holds = np.random.default_rng([seed, 4]), 0, 0
-        for _ in range(settings.seeds):
-            drawn = draw.choice(settings.views, settings.drawn, replace=False)
-            best = min((error.some(drawn) for error in errors), key=lambda error: error.mean)
-            within = is_as_good(own.some(drawn), best)
-            strict += within
-            holds += within or own.some(drawn).mean <= footprint
-        shares = {"held_out_seeds_within": strict / settings.seeds, "held_out_seeds_held": holds / settings.seeds}
-        return {"held_out_seeds": settings.seeds, **shares}
+        return shares(own, errors, settings, footprint=self.observations.footprint, seed=self.fitter.seed)
 
     def refit(self, rung: Rung) -> Evidence:
         """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for."""
@@ -128,3 +120,26 @@ class Study:
 
 def _sound(fits: list[Fitted]) -> list[Fitted]:
     return [fitted for fitted in fits if fitted.evidence.error is not None]
+
+
+def shares(
+    chosen: HeldOutError, rungs: list[HeldOutError], settings: CheckSettings, *, footprint: float, seed: int
+) -> dict[str, float]:
+    """On what share of draws of views a choice is as good as the draw's best rung; on what share it holds.
+
+    Args:
+        chosen: its errors in all views.
+        rungs: those of all rungs.
+        settings: how many draws of how many views.
+        footprint: half a pixel, in scene units, under which a choice holds as well.
+        seed: of the draws.
+    """
+    draw, within, held = np.random.default_rng([seed, 4]), 0, 0
+    for _ in range(settings.seeds):
+        drawn = draw.choice(settings.views, settings.drawn, replace=False)
+        best = min((error.some(drawn) for error in rungs), key=lambda error: error.mean)
+        as_good = is_as_good(chosen.some(drawn), best)
+        within += as_good
+        held += as_good or chosen.some(drawn).mean <= footprint
+    found = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": held / settings.seeds}
+    return {"held_out_seeds": settings.seeds, **found}

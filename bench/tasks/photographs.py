@@ -158,11 +158,8 @@ class PhotographObservations:
         Raises:
             ValueError: where there are too few photographs.
         """
-        count, apart = len(given.cameras), given.settings.neighbour
-        held_out = [(view, (view + apart) % count) for view in range(0, count, HELD_OUT_EVERY)]
-        hidden = {view for pair in held_out for view in pair}
-        pairs = [(view, (view + apart) % count) for view in range(count)]
-        fitted = [pair for pair in pairs if not hidden & set(pair)]
+        count = len(given.cameras)
+        fitted, held_out = split_pairs(count, neighbour=given.settings.neighbour)
         if len(held_out) < 2 or not fitted:
             least = 2 * HELD_OUT_EVERY
             raise ValueError(
@@ -207,6 +204,14 @@ class PhotographObservations:
             (found,) = self.given.differences(field, self.renderer, [pair], self.given.colours)
             rows.append([float(found.sum()), len(found), 0, len(found)] if len(found) else [0, 0, 1, 1])
         return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
+
+
+def split_pairs(count: int, *, neighbour: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Pairs of neighbouring views that a field is fitted to, and pairs that judge it; no view is in both."""
+    pairs = [(view, (view + neighbour) % count) for view in range(count)]
+    held_out = pairs[::HELD_OUT_EVERY]
+    hidden = {view for pair in held_out for view in pair}
+    return [pair for pair in pairs if not hidden & set(pair)], held_out
 
 
 def blurred(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:

@@ -1,0 +1,168 @@
+"""How much model a shape needs, end to end; and tasks that take any field in the place of a prior's."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.execute import execute
+from bench.ladder.choice import Evidence
+from bench.ladder.held_out import HeldOutError
+from bench.ladder.rungs import PAPERS
+from bench.ladder.settings import LadderSettings
+from bench.ladder.study import CheckSettings, shares
+from bench.records import Record, RunStatus
+from bench.report.records import read_record
+from bench.summary import show
+from bench.tasks.capacity import Capacity, saved
+from bench.tasks.photographs import split_pairs
+from bench.tasks.problem import Unsupported
+from tests.test_ladder import FIT, GROWTH, VIEWS
+from tests.tiny import Blind, ball_prior, camera_of, cell_of, silent
+
+TINY = (
+    "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
+    "ladder.fit.iterations=8", "ladder.fit.warm_iterations=40", "ladder.fit.warm_points=128", "ladder.views.fitted=4",
+    "ladder.views.held_out=3", "ladder.views.rays=64", "prior.shapes=1",
+)  # fmt: skip
+
+
+BETTER = ("task.iterations=20", "ladder.rungs=[sphere,box,union_2]", "ladder.fit.warm_iterations=120")
+
+
+def run(folder, compose_config, *overrides: str) -> Record:
+    """The record of a run in this process, and its files in the folder."""
+    config = compose_config(*TINY, *overrides)
+    record = Record("id", "task", "dist", config.dataset.name, 0, {"label": None})
+    execute(config, folder, record, progress=silent, checkpoint=lambda record: None)
+    return record
+
+
+def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
+    ladder = "ladder.rungs=[sphere,box,rounded_box,network_1x16]"
+    better = ("ladder.fit.iterations=30", "ladder.fit.warm_iterations=150")
+    small = ("task.checks.views=4", "task.checks.drawn=3", "task.checks.seeds=5", "evaluation.picture=24")
+    record = run(tmp_path, compose_config, "task=capacity", "dataset=capsule", ladder, *small, *better)
+    assert (record.status, record.reason) == ("ok", "")
+    metrics = record.metrics
+    assert metrics["recommended_field"] == "rounded_box"
+    assert metrics["recommended_parameters"] == 10 == metrics["rounded_box.parameters"]
+    assert metrics["recommended_error"] == metrics["rounded_box.error"] < metrics["footprint"]
+    assert metrics["saved_parameters"] == PAPERS.size / 10
+    assert "saved_seconds" not in metrics  # the network was not fitted
+    for name in ("sphere", "box", "network_1x16"):
+        assert metrics[f"{name}.error"] > metrics["footprint"]
+        assert metrics[f"{name}.seconds"] > 0 < metrics[f"{name}.evaluations"]
+    assert metrics["auto.field"] == "rounded_box"
+    assert metrics["auto.overhead"] > 1
+    assert metrics["auto.evaluations"] > metrics["rounded_box.evaluations"]
+    assert metrics["precision.evaluations_auto"] < metrics["precision.evaluations"]
+    assert metrics["frugal.evaluations"] < metrics["rounded_box.evaluations"]
+    assert 0 <= metrics["held_out_seeds_within"] <= metrics["held_out_seeds_held"] == 1
+    assert metrics["chamfer_l2"] < 0.01
+    assert any("needs rounded_box, 10 numbers" in note for note in record.notes)
+    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert {line["rung"] for line in lines} == {"sphere", "box", "rounded_box", "network_1x16"}
+    assert {path.name for path in tmp_path.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
+    record.write(tmp_path)
+    assert read_record(tmp_path)["metrics"]["recommended_field"] == "rounded_box"
+    show(tmp_path, record, tmp_path)
+    told = capsys.readouterr().out
+    assert re.search(r"=> +rounded box +10 ", told)
+    assert "half a pixel is" in told
+
+
+def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
+    ladder = LadderSettings(("sphere",), FIT, GROWTH, VIEWS)
+    cell = cell_of(tmp_path, Blind(), ball_prior(), camera_of(8), ladder=ladder)
+    task = Capacity(10.0, 10.0, 0.5, CheckSettings(4, 2, 2))
+    with pytest.raises(Unsupported, match="no gradient towards the field"):
+        task.execute(cell)
+
+
+def test_what_is_saved_counts_time_only_where_the_network_was_fitted():
+    error = HeldOutError(np.array([[0.1, 10, 0, 10]] * 3), 0.1)
+    chosen = Evidence("sphere", 4, 16, 10, error, seconds=2.0)
+    network = Evidence(PAPERS.name, PAPERS.size, 4 * PAPERS.size, PAPERS.flops, error, seconds=300.0)
+    failed = replace(network, error=None, status=RunStatus.DIVERGED)
+    assert saved(chosen, [chosen, network])["saved_seconds"] == 150
+    assert "saved_seconds" not in saved(chosen, [chosen, failed])
+    assert saved(chosen, [chosen])["saved_flops_per_query"] == PAPERS.flops / 10
+
+
+def test_a_choice_is_checked_by_the_best_rung_of_each_draw():
+    """Two rungs change places from view to view: the choice is within one standard error on some draws only."""
+    off = {"chosen": [0.01, 0.03, 0.03, 0.03], "other": [0.03, 0.01, 0.01, 0.01]}
+    chosen, other = (HeldOutError(np.array([[10 * mean, 10, 0, 10] for mean in means]), 0.1) for means in off.values())
+    settings = CheckSettings(views=4, seeds=40, drawn=2)
+    checked = shares(chosen, [chosen, other], settings, footprint=0.001, seed=0)
+    assert 0.2 < checked["held_out_seeds_within"] < 0.8  # of six pairs of views, three are those with the first one
+    assert checked["held_out_seeds_held"] == checked["held_out_seeds_within"]
+    assert shares(chosen, [chosen, other], settings, footprint=0.04, seed=0)["held_out_seeds_held"] == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "ends"),
+    [
+        (("task=completion", "dataset=box", "task.points=dense"), "box"),
+        (("task=completion", "dataset=sphere", "field=sphere", "task.points=50", "task.mask=false"), "sphere"),
+    ],
+    ids=["auto", "one rung, without a mask"],
+)
+def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
+    asked = () if any(part.startswith("field=") for part in overrides) else ("field=auto",)
+    record = run(tmp_path, compose_config, *overrides, *asked, *BETTER)
+    assert record.status == "ok", record.reason
+    assert record.metrics["field"] == ends
+    assert record.metrics["field_parameters"] == {"box": 9, "sphere": 4}[ends]
+    assert record.metrics["field_error"] < 3 * record.metrics["field_footprint"]
+    assert record.evaluations["iterations"] >= 20
+    assert record.evaluations["value"] > record.evaluations["gradient"] > 0
+    assert record.seconds["forward"] > 0 < record.seconds["backward"]
+    assert (tmp_path / "mesh.ply").is_file()
+
+
+def test_a_pose_is_found_with_a_grown_shape(compose_config, tmp_path):
+    overrides = ("task=pose", "dataset=box", "field=auto", "ladder.rungs=[sphere,box]", "task.iterations=3")
+    record = run(tmp_path, compose_config, *overrides, "ladder.fit.warm_iterations=80")
+    assert record.status in ("ok", "not_reached"), record.reason
+    assert any(note.startswith("field=auto: sphere -> box, 9 numbers") for note in record.notes)
+    assert record.metrics["mask_iou"] > 0.5
+
+
+def test_photographs_judge_a_field_by_pairs_that_it_was_not_fitted_to(compose_config, tmp_path):
+    overrides = ("task=multiview", "dataset=sphere", "field=auto", "ladder.rungs=[sphere,box]", "task.iterations=6")
+    record = run(tmp_path, compose_config, *overrides, "task.images.views=12")
+    assert record.status in ("ok", "not_reached"), record.reason
+    assert record.metrics["field"] in ("sphere", "box")
+    assert record.metrics["field_footprint"] == 0
+    fitted, held_out = split_pairs(12, neighbour=1)
+    assert not {view for pair in fitted for view in pair} & {view for pair in held_out for view in pair}
+    assert (len(fitted), len(held_out)) == (6, 2)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (("task=gradients", "+common=fitted", "field=auto"), "read by completion, multiview, pose and capacity"),
+        (("task=completion", "field=spere"), "unknown field 'spere': did you mean sphere"),
+        (("task=capacity", "ladder.rungs=[]"), "ladder.rungs must be at least 1"),
+        (("task=capacity", "ladder.growth.budget=0.5"), "budget must be at least 1"),
+        (("task=capacity", "task.fewest_rays=0"), "fewest_rays must be above 0"),
+        (("task=capacity", "view.distance=0.5"), "outside of the sphere"),
+        (("task=multiview", "field=auto", "task.images.views=6"), "task.images.views must be at least 12, not 6"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_told(compose_config, tmp_path, overrides, told):
+    record = run(tmp_path, compose_config, *overrides)
+    assert record.status == "crashed"
+    assert told in record.reason
+
+
+def test_the_shipped_ladders_are_in_order_and_reach_the_papers_network(compose_config):
+    for scale, last in (("smoke", "network_4x64"), ("desk", PAPERS.name), ("paper", PAPERS.name)):
+        names = list(compose_config(f"scale={scale}").ladder.rungs)
+        assert names[0] == "sphere"
+        assert names[-1] == last
