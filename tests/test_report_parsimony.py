@@ -148,12 +148,12 @@ def test_a_place_that_is_left_over_holds_the_legend(four):
     assert figure.axes[-1].get_legend() is not None
 
 
-def test_need_over_what_a_sphere_leaves(four):
+def test_need_over_what_the_best_single_part_leaves(four):
     made = made_of(four, parsimony_needs.make)
     data = made.data.set_index("scene")
-    assert list(data["sphere_error_footprints"][:3]) == pytest.approx([0.01, 7, 8])
+    assert list(data["single_part_error_footprints"][:3]) == pytest.approx([0.01, 0.5, 8])
     assert list(data["recommended_parameters"][:3]) == [4, 9, 3000]
-    assert data.loc["torus", "sphere_error_footprints"] is None
+    assert data.loc["torus", "single_part_error_footprints"] is None
     assert "3 of 4 scenes are drawn." in made.caption
     axis = made.figure.axes[0]
     assert {text.get_text() for text in axis.texts} == {"ball", "box", "car", "half a pixel"}

@@ -16,14 +16,12 @@ from bench.report.ladder import KINDS, RungResult
 from bench.report.parsimony_runs import SceneRun, over, scene_runs
 from bench.report.tables import Result
 
-SIMPLEST = "sphere"  # of four free numbers
 MOST = 10.0  # half pixels: no ray's error is larger
 CAPTION = (
-    "Over the held-out error that the best sphere, of four free numbers, leaves, in half pixels: a measure of a "
-    "scene's complexity that needs no model of it. No ray counts for more than {most:g} half pixels, so complex scenes "
-    "crowd below that; bars are one standard error by the jackknife over views. Where the sphere leaves less than half "
-    "a pixel it is what the rule recommends. The dashed line is the size of the papers' network, the dotted one a "
-    "tenth of it."
+    "Over the held-out error that the best single part leaves, a ball or a box of one kind or another of at most 11 "
+    "free numbers, in half pixels: how far the scene is from one part, told by the data alone. No ray counts for more "
+    "than {most:g} half pixels; bars are one standard error by the jackknife over views. The dashed line is the size "
+    "of the papers' network, the dotted one a tenth of it."
 )
 SIDES = ((0, 9, "center"), (0, -9, "center"), (6, 0, "left"), (-6, 0, "right"), (3, 9, "left"), (-3, 9, "right"))
 SIDES += ((3, -9, "left"), (-3, -9, "right"), (0, 18, "center"), (0, -18, "center"), (0, 27, "center"))
@@ -32,7 +30,7 @@ LETTER, LINE = 3.6, 8.0  # points: about what a letter takes, and a line
 
 @dataclass(frozen=True)
 class Need:
-    """A point of the chart: a scene, what the sphere leaves of it, and what it needs."""
+    """A point of the chart: a scene, what the best single part leaves of it, and what it needs."""
 
     run: SceneRun
     chosen: RungResult
@@ -50,7 +48,7 @@ def make(experiment: Experiment) -> Result:
     runs = scene_runs(experiment)
     needs = [need for run in runs if (need := _need(run)) is not None]
     unknown = [run.name for run in runs if run.ok and not any(need.run is run for need in needs)]
-    told = f"Without a sphere's error, and so not drawn: {', '.join(unknown)}." if unknown else ""
+    told = f"Without a single part's error, and so not drawn: {', '.join(unknown)}." if unknown else ""
     return Result(
         name="parsimony_needs",
         title="Free numbers that each scene needs, over its complexity.",
@@ -89,7 +87,9 @@ def draw(needs: list[Need], papers: float | None) -> Figure:
             axes.axhline(size, color="#777777", lw=0.9, ls=line, label=label)
     axes.axvline(1.0, color="#bbbbbb", lw=0.8, zorder=0)
     axes.annotate("half a pixel", (1.0, 0.45), (3, 0), xycoords=("data", "axes fraction"), **_SMALL)
-    axes.set(xlim=(-0.5, MOST + 0.5), xlabel="what a sphere leaves: held-out error (half pixels)", yscale="log")
+    axes.set(
+        xlim=(-0.5, MOST + 0.5), xlabel="what the best single part leaves: held-out error (half pixels)", yscale="log"
+    )
     axes.set_ylabel("free numbers of the recommended field")
     axes.margins(y=0.1)
     handles, labels = axes.get_legend_handles_labels()
@@ -126,20 +126,21 @@ def _box(at: np.ndarray, side: tuple[int, int, str], letters: int) -> Bbox:
 
 
 def _need(run: SceneRun) -> Need | None:
-    """None where the run did not end ok, or has no sphere that could be fitted."""
-    chosen, sphere = run.ladder.chosen, run.ladder.rung(SIMPLEST)
-    if not run.ok or chosen is None or sphere is None or sphere.error is None:
+    """None where the run did not end ok, or has no single part that could be fitted."""
+    chosen, parts = run.ladder.chosen, [rung for rung in run.ladder.rungs if rung.kind == "" and rung.error is not None]
+    if not run.ok or chosen is None or not parts:
         return None
-    spread = sphere.numbers.get("standard_error") or 0.0
-    return Need(run, chosen, sphere.error / run.ladder.footprint, spread / run.ladder.footprint)
+    best = min(parts, key=lambda rung: rung.error)
+    spread = best.numbers.get("standard_error") or 0.0
+    return Need(run, chosen, best.error / run.ladder.footprint, spread / run.ladder.footprint)
 
 
 def _raw(run: SceneRun, need: Need | None) -> dict[str, Any]:
     saved = run.number("saved_parameters")
     return {
         **run.identity,
-        "sphere_error_footprints": None if need is None else need.complexity,
-        "sphere_standard_error_footprints": None if need is None else need.spread,
+        "single_part_error_footprints": None if need is None else need.complexity,
+        "single_part_standard_error_footprints": None if need is None else need.spread,
         "footprint": run.number("footprint"),
         "recommended_field": run.word("recommended_field"),
         "kind": None if need is None else KINDS[need.chosen.kind][0],
