@@ -36,15 +36,24 @@ class AutoSettings:
 
 
 def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> float:
-    """Half a pixel where the shape may be nearest to the camera (DIST, Eq. 10, at theta = 0), in scene units."""
-    nearest = view.distance - RADIUS
-    check_positive("view.distance - 1", nearest, "renderer.epsilon=auto needs a camera outside of the unit sphere")
-    return half_pixel(view, nearest)
+    """See `footprint`."""
+    return footprint(view.focal_length, view.distance)
 
 
-def half_pixel(view: ViewSampler, depth: float) -> float:
+def footprint(focal_length: float, distance: float) -> float:
+    """Half a pixel where the shape may be nearest to the camera (DIST, Eq. 10, at theta = 0), in scene units.
+
+    Args:
+        focal_length: in pixels.
+        distance: of the camera from the origin, in scene units.
+    """
+    check_positive("view.distance - 1", distance - RADIUS, "a pixel's size needs a camera outside of the unit sphere")
+    return half_pixel(focal_length, distance - RADIUS)
+
+
+def half_pixel(focal_length: float, depth: float) -> float:
     """Half a pixel's width at a depth, on the optical axis (DIST, Eq. 10, at theta = 0), in scene units."""
-    return depth / (2 * view.focal_length)
+    return depth / (2 * focal_length)
 
 
 def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:

@@ -1,6 +1,7 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
-from dataclasses import dataclass, field, fields, is_dataclass
+import dataclasses
+from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
@@ -86,8 +87,8 @@ class Config:
     view: Any = MISSING
     auto: Any = MISSING
     ladder: Any = MISSING
-    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
-    field: str = MISSING  # from here on the word is not dataclasses.field
+    field: str = MISSING
+    evaluation: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
     split: str = MISSING
     index: int = MISSING
     seed: int = MISSING

@@ -43,8 +43,7 @@ def execute(
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/problem.py")
         stage = set_up(config, progress)
         if stage.field != PRIOR and not isinstance(task, TakesField):
-            readers = "completion, multiview, pose and capacity"
-            raise ValueError(f"field={stage.field} is read by {readers}, not by task={record.task}: leave it out")
+            raise ValueError(f"task={record.task} takes no field but its own: leave field={stage.field} out")
         record.scene, record.notes = stage.scene_name, [*record.notes, *stage.notes]
         record.environment |= environment.describe(stage.device)
         checkpoint(record)

@@ -9,7 +9,7 @@ import torch
 
 from bench.environment import MemoryPeak, synchronise
 from bench.records import RunStatus
-from bench.tasks.problem import OptimiserSettings, Problem
+from bench.tasks.problem import Descent, OptimiserSettings
 from renderers.field import Counts
 
 DIVERGED = 100.0  # times its first value, or what stands for it: a loss above that has diverged
@@ -25,17 +25,17 @@ class Course:
     seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
-    least_reference: float = 0.0  # a first loss below that, of a start that is nearly right, counts as that
     objectives: list[float] = field(default_factory=list)  # the problem's own, before and after, where it has one
 
 
 def optimise(
-    problem: Problem,
+    problem: Descent,
     settings: OptimiserSettings,
     device: torch.device,
     *,
     course: Course,
     on_step: Callable[[dict[str, Any]], None],
+    least_reference: float = 0.0,
 ) -> None:
     """Runs Adam on the problem's free parameters.
 
@@ -45,6 +45,7 @@ def optimise(
         device: what to wait for when the clock is read.
         course: an empty one, filled as the loop goes, so that it is there for a loop that is cut short. A loss that
             becomes NaN or diverges ends the loop, and stands there as its status.
+        least_reference: a first loss below that, of a start that is nearly right, counts as that for divergence.
         on_step: called with each line of the curve, to which it may add; off the clock, and its memory is not counted.
     """
     optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
@@ -69,16 +70,16 @@ def optimise(
         }
         course.curve.append(line)
         course.peak_memory_bytes = memory.growth()
-        over = _failed(course, problem)
+        over = _failed(course, problem, least_reference)
         with memory.pause():
             on_step(line)
         if over:
             break
 
 
-def _failed(course: Course, problem: Problem) -> bool:
+def _failed(course: Course, problem: Descent, least_reference: float) -> bool:
     """Notes in the course why it cannot go on, if so."""
-    loss, first = course.curve[-1]["total"], max(course.curve[0]["total"], course.least_reference)
+    loss, first = course.curve[-1]["total"], max(course.curve[0]["total"], least_reference)
     iteration = course.curve[-1]["iteration"]
     finite = all(bool(parameter.isfinite().all()) for parameter in problem.parameters)
     if loss != loss or not finite:

@@ -17,7 +17,7 @@ from bench.ladder.settings import PRIOR, LadderSettings
 from bench.prior_store import prior_for
 from bench.progress import Report
 from bench.records import Record
-from bench.thickness import follow
+from bench.thickness import Following, follow
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
@@ -38,7 +38,6 @@ class Stage:
     device: torch.device
     cache: Path  # where what is slow to make is kept
     notes: tuple[str, ...] = ()  # what settings came to that follow from others
-    endings: tuple[Callable[[], str], ...] = ()  # what settings came to that change on the way, when it has ended
     make_frugal: Callable[[], Renderer] | None = None
     ladder: LadderSettings | None = None  # the fields to choose from, where none is a prior's
     field: str = PRIOR  # what a shape that is looked for is made of
@@ -56,9 +55,9 @@ class Stage:
 
     @property
     def last_notes(self) -> list[str]:
-        """What is known when a task has ended: repairs of the scene's mesh, if it was made, and the endings."""
+        """What is known at the end: repairs of the scene's mesh, if it was made, and what settings came to."""
         repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
-        return [*repairs, *(ending() for ending in self.endings)]
+        return [*repairs, *([self.renderer.ending()] if isinstance(self.renderer, Following) else [])]
 
     @cached_property
     def prior(self) -> Prior:
@@ -97,7 +96,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         torch.set_num_threads(config.threads)
     device = pick_device(config.device)
     views = build(config.view, "view", target="datasets.views.ViewSampler")
-    chosen = _renderer(config, config.renderer, views)
+    renderer, notes = _renderer(config, config.renderer, views)
     dataset = cast(Dataset, build(config.dataset, "dataset", list(config.packages)))
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     ladder: LadderSettings = build(config.ladder, "ladder", target="bench.ladder.settings.LadderSettings")
@@ -115,35 +114,25 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         return prior_for(dataset, settings, cache, device, progress)
 
     return Stage(
-        renderer=chosen.renderer,
+        renderer=renderer,
         views=views,
         scene_name=scene_name(dataset, Split(config.split), config.index),
-        make_frugal=lambda: _renderer(config, frugal(config.renderer), views).renderer,
+        make_frugal=lambda: _renderer(config, frugal(config.renderer), views)[0],
         make_scene=shape_and_view,
         make_prior=make_prior,
         evaluation=evaluation,
         seed=config.seed,
         device=device,
         cache=cache,
-        notes=chosen.notes,
-        endings=chosen.endings,
+        notes=tuple(notes),
         ladder=ladder,
         field=config.field,
         trained=trained,
     )
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """A renderer, and what is to be said of its settings; see Stage."""
-
-    renderer: Renderer
-    notes: tuple[str, ...]
-    endings: tuple[Callable[[], str], ...] = ()
-
-
-def _renderer(config: DictConfig, asked: DictConfig, views: ViewSampler) -> _Chosen:
-    """A `renderer` node, built with a number for each `auto`."""
+def _renderer(config: DictConfig, asked: DictConfig, views: ViewSampler) -> tuple[Renderer, list[str]]:
+    """A `renderer` node, built with a number for each `auto`, and what these are, in words."""
     auto = build(config.auto, "auto", target="bench.auto.AutoSettings")
     node, notes = resolved(asked, views, auto)
     renderer = build(node, "renderer", list(config.packages))
@@ -151,11 +140,10 @@ def _renderer(config: DictConfig, asked: DictConfig, views: ViewSampler) -> _Cho
         name = type(renderer).__name__
         raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
     if asked.get("samples") != AUTO:
-        return _Chosen(renderer, tuple(notes))
+        return renderer, notes
     if config.stress is not None:
         raise ValueError("renderer.samples=auto follows one optimisation, and a stress has many trials: give a number")
-    following = follow(renderer)
-    return _Chosen(following, tuple(notes), (following.ending,))
+    return follow(renderer), notes
 
 
 def prior_settings(config: DictConfig) -> PriorSettings:

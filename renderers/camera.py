@@ -101,19 +101,6 @@ class Camera:
         """Where the camera is, in world coordinates."""
         return self.camera_to_world[:3, 3]
 
-    def half_pixel(self, radius: float) -> float:
-        """Half a pixel where the sphere of `radius` about the origin is nearest (DIST, Eq. 10), in scene units.
-
-        Raises:
-            ValueError: where the camera is in the sphere.
-        """
-        nearest = float(torch.linalg.vector_norm(self.center)) - radius
-        if nearest <= 0:
-            raise ValueError(
-                f"a pixel's footprint needs a camera outside of the sphere of radius {radius}: move it back"
-            )
-        return nearest / (2 * float(self.intrinsics[0, 0]))
-
     def resized(self, height: int, width: int) -> "Camera":
         """The same view in other pixels."""
         intrinsics = self.intrinsics.clone()

@@ -146,12 +146,12 @@ def test_photographs_judge_a_field_by_pairs_that_it_was_not_fitted_to(compose_co
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        (("task=gradients", "+common=fitted", "field=auto"), "read by completion, multiview, pose and capacity"),
+        (("task=gradients", "+common=fitted", "field=auto"), "takes no field but its own: leave field=auto out"),
         (("task=completion", "field=spere"), "unknown field 'spere': did you mean sphere"),
         (("task=capacity", "ladder.rungs=[]"), "ladder.rungs must be at least 1"),
         (("task=capacity", "ladder.growth.budget=0.5"), "budget must be at least 1"),
-        (("task=capacity", "task.fewest_rays=0"), "fewest_rays must be above 0"),
-        (("task=capacity", "view.distance=0.5"), "outside of the sphere"),
+        (("task=capacity", "task.frugal_rays=0"), "frugal_rays must be above 0"),
+        (("task=capacity", "view.distance=0.5"), "outside of the unit sphere"),
         (("task=multiview", "field=auto", "task.images.views=6"), "task.images.views must be at least 12, not 6"),
     ],
 )  # fmt: skip
@@ -161,7 +161,7 @@ def test_what_cannot_be_is_told(compose_config, tmp_path, overrides, told):
     assert told in record.reason
 
 
-def test_the_shipped_ladders_are_in_order_and_reach_the_papers_network(compose_config):
+def test_the_shipped_ladders_begin_with_a_sphere_and_reach_the_papers_network(compose_config):
     for scale, last in (("smoke", "network_4x64"), ("desk", PAPERS.name), ("paper", PAPERS.name)):
         names = list(compose_config(f"scale={scale}").ladder.rungs)
         assert names[0] == "sphere"

@@ -263,7 +263,7 @@ def test_a_fit_goes_on_from_a_warm_start_and_is_counted():
     fitter = fitter_of("box", warm_iterations=5)
     fitted = fitter.begin(rung("rounded_box"), None)
     before = fitted.evidence.mean, fitted.evidence.evaluations
-    fitter.fit(fitted, 30, schedule="ramped", looks=True)
+    fitter.fit(fitted, 30, looks=True)
     assert fitted.evidence.mean < before[0]
     assert fitted.evidence.iterations == 30
     assert fitted.evidence.evaluations > before[1] + 30 * 256
@@ -316,7 +316,7 @@ def test_what_the_renderer_does_not_take_is_a_rung_without_an_error():
     )
     fitter = fitter_of("ball", strict, warm_iterations=5)
     fitted = fitter.begin(rung("superquadric"), None)
-    fitter.fit(fitted, 5, schedule="ramped", looks=False)
+    fitter.fit(fitted, 5, looks=False)
     assert (fitted.evidence.status, fitted.evidence.error, fitted.evidence.iterations) == ("unsupported", None, 0)
     assert "needs a distance field" in fitted.evidence.reason
     assert fitter.begin(rung("sphere"), None).evidence.error is not None
@@ -331,15 +331,15 @@ def test_rays_follow_the_error_that_is_left():
     spent = []
     for fitter in (coarse, whole):
         fitted = fitter.begin(rung("sphere"), None)
-        fitter.fit(fitted, 10, schedule="ramped", looks=False)
+        fitter.fit(fitted, 10, looks=False)
         spent.append(fitted.evidence.evaluations)
     assert spent[0] < 0.6 * spent[1]
 
 
 def test_half_a_pixel_is_that_of_epsilon_auto():
     assert views_of("ball").footprint == pytest.approx(epsilon(SAMPLER, OmegaConf.create({}), AutoSettings(10.0)))
-    with pytest.raises(ValueError, match="outside of the sphere"):
-        replace(SAMPLER, distance=0.5).camera(0.0, 0.0).half_pixel(1.0)
+    with pytest.raises(ValueError, match="outside of the unit sphere"):
+        _ = replace(views_of("ball"), sampler=replace(SAMPLER, distance=0.5)).footprint
 
 
 def test_further_views_are_others():

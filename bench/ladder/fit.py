@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.auto import rays_share
@@ -25,9 +25,7 @@ from renderers.field import Counts, Field, Meter
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # of an evidence
 NEAR_ENOUGH = 0.1  # loss: a warm start may begin below it, and then that is what divergence is measured from
-SCREENING = (
-    4  # where there are several starts: each has one of so many parts of a warm start, then the best a whole one
-)
+SCREENING = 4  # of several starts each has one of so many parts of a warm start, then the best a whole one
 EIKONAL_SEED = 7  # of the points; those of iterations differ
 LOOKS = {4**power for power in range(1, 12)}  # iterations
 PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids
@@ -42,7 +40,7 @@ class Fitted:
 
     @property
     def failed(self) -> bool:
-        """Whether its loss became NaN or diverged."""
+        """Whether its loss became NaN or diverged, the renderer does not take it, or nothing was seen of it."""
         return self.evidence.status is not RunStatus.OK
 
 
@@ -92,19 +90,20 @@ class Fitter:
         except Unsupported as error:
             fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
         target = previous.frozen() if rung.follows and previous is not None else None
-        return fitted, WarmStart.of(model, self.observations, target, count=self.settings.warm_points, seed=self.seed)
+        surface, free = self.observations.points, self.observations.free(self.seed)
+        return fitted, WarmStart(model, surface, free, target, self.settings.warm_points, self.seed)
 
     def _warm(self, fitted: Fitted, start: WarmStart, iterations: int) -> None:
         if iterations and not fitted.failed:
             rate = PARTS_RATE if fitted.model.metric else WHOLE_RATE
             self._run(fitted, start, OptimiserSettings(iterations, rate, "cosine"), looks=False)
 
-    def fit(self, fitted: Fitted, iterations: int, *, schedule: str, looks: bool) -> None:
+    def fit(self, fitted: Fitted, iterations: int, *, looks: bool) -> None:
         """Goes on with a rung for so many iterations, and judges it; with `looks` on the way, too."""
         if fitted.failed or iterations < 1:
             return
         problem = RungProblem(fitted.model, self.observations, self.settings, fitted.evidence.iterations)
-        settings = OptimiserSettings(iterations, fitted.model.learning_rate, schedule)
+        settings = OptimiserSettings(iterations, fitted.model.learning_rate, "ramped")
         self._run(fitted, problem, settings, looks=looks)
         fitted.evidence.iterations += iterations
         self._judge(fitted)
@@ -113,7 +112,7 @@ class Fitter:
         self, fitted: Fitted, problem: "RungProblem | WarmStart", settings: OptimiserSettings, *, looks: bool
     ) -> None:
         """Runs the one loop, and adds what it cost to the evidence."""
-        course, evidence = Course(least_reference=NEAR_ENOUGH), fitted.evidence
+        course, evidence = Course(), fitted.evidence
         before = {name: getattr(evidence, name) for name in SPENT}
 
         def on_step(line: dict[str, Any]) -> None:
@@ -124,10 +123,11 @@ class Fitter:
             step = line["iteration"] + 1
             if looks and course.status is RunStatus.OK and step in LOOKS and step < settings.iterations:
                 self._judge(fitted)
-            self.on_line(evidence.rung, {**line, "iteration": fitted.evidence.iterations + line["iteration"]})
+            own = {"phase": problem.phase, "iteration": fitted.evidence.iterations + line["iteration"]}
+            self.on_line(evidence.rung, {**line, **own})
 
         try:
-            optimise(problem, settings, self.device, course=course, on_step=on_step)
+            optimise(problem, settings, self.device, course=course, on_step=on_step, least_reference=NEAR_ENOUGH)
         except NotReached as error:
             course.status, course.reason = RunStatus.NOT_REACHED, str(error)
         for name, seconds in course.seconds.items():
@@ -146,7 +146,7 @@ class Fitter:
 
 @dataclass
 class RungProblem:
-    """The free numbers of a rung; see `bench.tasks.problem.Problem`."""
+    """The free numbers of a rung; see `bench.tasks.problem.Descent`."""
 
     model: Model
     observations: Observations
@@ -154,22 +154,12 @@ class RungProblem:
     begun: int  # iterations that were before
     error: float = inf  # at the last iteration, in scene units: the loss over its weight
     counts: Counts = field(default_factory=Counts)
-    photographs: None = None
+    phase: ClassVar[str] = "fit"
 
     @property
     def parameters(self) -> list[Tensor]:
         """What is free."""
         return self.model.parameters
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """That are drawn, at most."""
-        return self.observations.rays
-
-    @property
-    def observed(self) -> Bool[Tensor, " n"]:
-        """Points of the surface that are known."""
-        return torch.ones(len(self.observations.points), dtype=torch.bool)
 
     def loss(self, iteration: int) -> Terms:
         """The renderer's terms, that of the gradient's length, and their sum."""
@@ -181,13 +171,6 @@ class RungProblem:
             points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, own))
             terms["eikonal"] = settings.eikonal_weight * _slope_error(counted, points)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
-
-    def objective(self) -> None:
-        """Losses of different iterations are comparable."""
-
-    def field(self) -> Field:
-        """As it stands."""
-        return self.model.frozen()
 
 
 def _slope_error(shape: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:

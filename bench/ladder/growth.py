@@ -78,7 +78,7 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     trial = max(ceil(settings.trial * whole), 1)
     now, rung = fitter.begin(rungs[0], None), rungs[0]
     first = now.model.frozen()
-    fitter.fit(now, trial, schedule="ramped", looks=False)
+    fitter.fit(now, trial, looks=False)
     tried, fields, vain, others = [now.evidence], {rung.name: now.model.frozen()}, 0, 0.0
     for larger in rungs[1:]:
         enough = now.evidence.mean <= fitter.observations.footprint
@@ -86,7 +86,7 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
         if enough or vain == settings.patience or others + cost(larger, trial, fitter) > budget:
             break
         fitted = fitter.begin(larger, now.model)
-        fitter.fit(fitted, trial, schedule="ramped", looks=False)
+        fitter.fit(fitted, trial, looks=False)
         tried.append(fitted.evidence)
         better = _is_better(fitted, now)
         others += cost(rung if better else larger, trial, fitter)
@@ -94,7 +94,7 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
         if better:
             now, rung = fitted, larger
             fields[rung.name] = now.model.frozen()
-    fitter.fit(now, whole - trial, schedule="ramped", looks=True)
+    fitter.fit(now, whole - trial, looks=True)
     return Growth(now, first, tried, fields | {rung.name: now.model.frozen()})
 
 

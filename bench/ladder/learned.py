@@ -57,12 +57,15 @@ class Network:
         return [Model(self.name, parameters, self._bound, min(FASTEST, RATE_OF_WIDTH / self.width), metric=False)]
 
     def _decoder(self) -> Decoder:
-        skip = self.layers // 2 if self.layers >= DEEP else 0
-        return Decoder(layers=self.layers, width=self.width, code_length=0, skip=skip, narrow=True)
+        return Decoder(layers=self.layers, width=self.width, code_length=0, skip=self._skip, narrow=True)
+
+    @property
+    def _skip(self) -> int:
+        return self.layers // 2 if self.layers >= DEEP else 0
 
     def _bound(self, free: list[Tensor]) -> BoundDecoder:
         pairs = list(zip(free[::2], free[1::2], strict=True))
-        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], self.layers // 2 if self.layers >= DEEP else 0)
+        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], self._skip)
 
 
 @dataclass(frozen=True)

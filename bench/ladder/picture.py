@@ -15,6 +15,6 @@ def draw_ladder(folder: Path, metrics: dict[str, Any], title: str) -> None:
     matplotlib.use("Agg")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-        panels(figure.subplots(1, 2, sharey=True), Ladder.of(metrics), legend=True)
+        panels(figure.subplots(1, 2, sharey=True), Ladder.of(metrics))
         figure.suptitle(title)
         figure.savefig(folder / "ladder.png", dpi=110)

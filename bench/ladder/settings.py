@@ -16,8 +16,8 @@ class FitSettings:
 
     Args:
         iterations: of the renderer's loss.
-        fewest_rays: share of the rays that it begins with where their number follows the loss (`bench.auto.rays`); 1:
-            always all.
+        fewest_rays: share of the rays that it begins with, where their number follows the loss (`bench.auto.rays_share`);
+            1 takes all from the start on.
         warm_iterations, warm_points: of the start without a renderer, to the observed points and the previous field.
         eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are no distance by
             themselves.

@@ -10,15 +10,16 @@ import torch
 from bench.film import Film
 from bench.gallery import draw_run
 from bench.judge import judge
-from bench.ladder.fit import Fitter
+from bench.ladder.fit import Fitter, RungProblem
 from bench.ladder.growth import Growth, grow
 from bench.ladder.observations import Observations
+from bench.ladder.settings import PRIOR
 from bench.metrics import DEFINITIONS
 from bench.pictures import Given
 from bench.records import RunStatus, plain
-from bench.solve import COSTS
+from bench.solve import COSTS, solve
 from bench.stage import Cell
-from bench.tasks.problem import OptimiserSettings, check_field_gradient
+from bench.tasks.problem import InverseTask, check_field_gradient
 from datasets.scene import Scene
 from renderers.rendering import Renderer
 
@@ -33,17 +34,26 @@ ENDED = {
 
 
 @runtime_checkable
-class Grows(Protocol):
+class Grows(InverseTask, Protocol):
     """A task whose unknown may be any field: each is fitted for the task's iterations, at a rate of its own."""
-
-    @property
-    def optimiser(self) -> OptimiserSettings: ...
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[Observations, Given]:
         """What a field is fitted to, of which some is held out, and what is shown of it in pictures."""
         ...
+
+
+def solve_shape(task: Grows, cell: Cell) -> None:
+    """Executes a task whose unknown is a shape: with a prior's code, or with the field that the run asks for.
+
+    Raises:
+        Unsupported: where the renderer cannot do what the task or its field needs.
+    """
+    if cell.stage.field == PRIOR:
+        solve(task, cell)
+    else:
+        solve_by_growth(task, cell)
 
 
 def solve_by_growth(task: Grows, cell: Cell) -> None:
@@ -89,8 +99,8 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
 
 def rendered(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The lines of all fits through the renderer, one after the other, with their common terms."""
-    fits = [line for line in lines if set(line) - {"eikonal"} == set(lines[-1]) - {"eikonal"}]
-    common = [{name: value for name, value in line.items() if name != "eikonal"} for line in fits]
+    fits = [line for line in lines if line["phase"] == RungProblem.phase]
+    common = [{name: value for name, value in line.items() if name not in ("eikonal", "phase")} for line in fits]
     return [{**line, "iteration": place} for place, line in enumerate(common)]
 
 

@@ -46,14 +46,14 @@ class Study:
         observations: through the renderer as it was asked for.
         fitter: of these observations.
         frugal: the same renderer, no more precise than a pixel.
-        fewest_rays: share of the rays that the frugal fit begins with.
+        frugal_rays: share of the rays that the frugal fit begins with.
         on_rung: is told of each rung that was fitted, and how many there are.
     """
 
     observations: RayObservations
     fitter: Fitter
     frugal: Renderer
-    fewest_rays: float
+    frugal_rays: float
     on_rung: Callable[[Fitted, int], None]
     fits: list[Fitted] = field(default_factory=list)
 
@@ -86,7 +86,7 @@ class Study:
 
     def refit(self, rung: Rung) -> Evidence:
         """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for."""
-        settings = replace(self.fitter.settings, fewest_rays=self.fewest_rays)
+        settings = replace(self.fitter.settings, fewest_rays=self.frugal_rays)
         observations = self.observations.through(self.frugal)
         fitter = replace(self.fitter, settings=settings, observations=observations, spent={})
         place = next(place for place, fitted in enumerate(self.fits) if fitted.evidence.rung == rung.name)
@@ -114,7 +114,7 @@ class Study:
 
     def _fitted(self, fitter: Fitter, rung: Rung, previous: Fitted | None) -> Fitted:
         fitted = fitter.begin(rung, None if previous is None else previous.model)
-        fitter.fit(fitted, fitter.settings.iterations, schedule="ramped", looks=True)
+        fitter.fit(fitted, fitter.settings.iterations, looks=True)
         return fitted
 
 

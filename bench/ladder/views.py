@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from bench.auto import RADIUS
+from bench.auto import footprint
 from bench.ladder.held_out import HeldOut
 from bench.ladder.observations import Holdout, RayObservations, hold_out, together
 from bench.ladder.settings import ViewSettings
@@ -45,7 +45,7 @@ class Views:
     @property
     def footprint(self) -> float:
         """Half a pixel where the shape may be nearest (DIST, Eq. 10), in scene units."""
-        return self.sampler.camera(0.0, 0.0).half_pixel(RADIUS)
+        return footprint(self.sampler.focal_length, self.sampler.distance)
 
     def observations(self, seed: int) -> RayObservations:
         """Evenly spread views to fit and, between them, views to hold out."""

@@ -1,14 +1,15 @@
 """The start of a rung without a renderer: towards the observed points, or towards the field that was there before."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.autodecoder import near_surface_first
 from bench.ladder.model import Model
-from bench.ladder.observations import Observations, generator
+from bench.ladder.observations import generator
 from renderers.field import Counts, Field, Meter
 
 SURFACE_WIDTH = 0.05  # scene units: of `near_surface_first`
@@ -18,7 +19,7 @@ BALL = 1.1  # radius of the ball that holds the others: rays start on the unit s
 
 @dataclass
 class WarmStart:
-    """A model's free numbers, to be fitted to points; see `bench.tasks.problem.Problem`.
+    """A model's free numbers, to be fitted to points; see `bench.tasks.problem.Descent`.
 
     A field with a formula is fitted to the observed points, where it should be 0, and to points that are known to be
     free, where it should not be negative. Another takes over a field as a whole.
@@ -38,12 +39,7 @@ class WarmStart:
     count: int
     seed: int
     counts: Counts = field(default_factory=Counts)
-    photographs: None = None
-
-    @staticmethod
-    def of(model: Model, observations: Observations, target: Field | None, *, count: int, seed: int) -> "WarmStart":
-        """The start that observations, or a field, allow."""
-        return WarmStart(model, observations.points, observations.free(seed), target, count, seed)
+    phase: ClassVar[str] = "warm start"
 
     @torch.no_grad()
     def error(self) -> float:
@@ -54,16 +50,6 @@ class WarmStart:
     def parameters(self) -> list[Tensor]:
         """What is free."""
         return self.model.parameters
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """None: no ray is rendered; points are counted in their place."""
-        return self.count
-
-    @property
-    def observed(self) -> Bool[Tensor, " n"]:
-        """The points of the surface."""
-        return torch.ones(len(self.surface), dtype=torch.bool)
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The mean error of the values."""
@@ -79,13 +65,6 @@ class WarmStart:
         off = [shape(_some(self.surface, self.count, draw)).abs()] if len(self.surface) else []
         inside = [(-shape(_some(self.free, self.count, draw))).clamp_min(0)] if len(self.free) else []
         return sum((part.mean() for part in [*off, *inside]), 0 * self.parameters[0].sum())
-
-    def objective(self) -> None:
-        """Losses of different iterations are comparable."""
-
-    def field(self) -> Field:
-        """As it stands."""
-        return self.model.frozen()
 
 
 def scattered(surface: Float[Tensor, "n 3"], count: int, draw: torch.Generator) -> Float[Tensor, "count 3"]:

@@ -85,14 +85,17 @@ def _machine(record: dict[str, Any]) -> tuple[str, str]:
 
 
 def _definition(definitions: dict[str, str], name: str) -> str:
-    """The definition of a metric: a key may name several, and stand for those of every band, rung or kind."""
-    if name in definitions:
-        return definitions[name]
-    last = name.rsplit(".", 1)[-1]
-    for key, text in definitions.items():
-        parts = [part.strip().rsplit(".", 1)[-1] for part in key.split(",")]
-        if last in parts or any(part.endswith("_...") and last.startswith(part[:-3]) for part in parts):
-            return text
+    """The definition of a metric. A key names some, `saved_...` all that begin so, `RUNG.error` those of any rung."""
+    keys = [([part.strip() for part in key.split(",")], text) for key, text in definitions.items()]
+    last = name.rsplit(".", 1)[-1] if "." in name else None
+    for fits in (
+        lambda part: part == name,
+        lambda part: part.endswith("...") and name.startswith(part[:-3]),
+        lambda part: "." in part and part.rsplit(".", 1)[-1] == last,
+    ):
+        for parts, text in keys:
+            if any(fits(part) for part in parts):
+                return text
     return ""
 
 

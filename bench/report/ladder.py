@@ -77,16 +77,15 @@ class Ladder:
         return self.rung(self.metrics.get("best_field", ""))
 
 
-def panels(axes: np.ndarray, ladder: Ladder, *, legend: bool) -> None:
+def panels(axes: np.ndarray, ladder: Ladder) -> None:
     """Error over free numbers and over FLOPs a query, with the recommended rung ringed."""
     for axis, (key, heading) in zip(axes, AXES.items(), strict=True):
         panel(axis, ladder, key)
         name_chosen(axis, ladder, key)
         axis.set_xlabel(heading)
     axes[0].set_ylabel("held-out error (scene units)")
-    if legend:
-        handles, labels = axes[-1].get_legend_handles_labels()
-        axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    handles, labels = axes[-1].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=4)
 
 
 def panel(axis: Axes, ladder: Ladder, key: str) -> None:

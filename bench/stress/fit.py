@@ -95,14 +95,13 @@ class FitTrial:
 
 @dataclass
 class BallProblem:
-    """Four numbers to be found; see `bench.tasks.problem.Problem`."""
+    """Four numbers to be found; see `bench.tasks.problem.Descent`."""
 
     free: Float[Tensor, "4"]
     given: GivenView
     limits: Limits
     counts: Counts = field(default_factory=Counts)
     started: float = field(default_factory=time.perf_counter)
-    photographs: None = None
 
     @property
     def parameters(self) -> list[Tensor]:
@@ -114,20 +113,12 @@ class BallProblem:
         """All pixels."""
         return self.given.observed.numel()
 
-    @property
-    def observed(self) -> Bool[Tensor, "height width"]:
-        """Pixels whose depth is given."""
-        return self.given.observed
-
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The terms and their sum."""
         shape = self.limits.watch(_ball(self.free).field, self.free.device)
         shape.started = self.started  # the limit is on the whole fit
         terms = self.given.compare(Meter(shape, self.counts), iteration)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
-
-    def objective(self) -> None:
-        """Losses of different iterations are comparable."""
 
     def field(self) -> Field:
         """The ball as it stands."""

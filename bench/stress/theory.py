@@ -103,7 +103,7 @@ def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Predicti
     nearest = scenes.DISTANCE - scenes.CUBE * sqrt(3)
     return [
         Prediction(criteria.false_hits * sqrt(3) / 4 * around, "a ring as wide as epsilon has 1 % of the cube's area"),
-        Prediction(half_pixel(view, nearest), "half a pixel: DIST, Eq. 10, at theta = 0"),
+        Prediction(half_pixel(view.focal_length, nearest), "half a pixel: DIST, Eq. 10, at theta = 0"),
     ]
 
 

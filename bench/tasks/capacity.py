@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.film import Film
 from bench.judge import judge
@@ -23,21 +23,22 @@ from renderers.checks import check_positive, check_share
 
 TINY = 1e-9  # seconds: a clock that did not move
 NEEDS = {
-    "recommended_field, recommended_parameters": "the smallest rung of the ladder, by free numbers, whose held-out "
-    "error is within one standard error of the best rung's or under the footprint",
+    "recommended_field, recommended_parameters, recommended_error": "the smallest rung of the ladder, by free numbers, "
+    "whose held-out error is within one standard error of the best rung's or under the footprint; its numbers, its error",
     "recommended_within, recommended_enough": "1 where the first, the second of these holds",
     "best_field": "the rung of the least held-out error",
     "footprint": "half a pixel where the shape may be nearest (DIST, Eq. 10, theta = 0), in scene units",
     "RUNG.error": "of held-out rays: distance along the field's normal between the observed and the rendered point, at "
     "most 10 footprints; 10 footprints where only one hits; mean over the rays on which either hits, in scene units",
     "RUNG.standard_error": "of that mean, by the jackknife over views",
+    "RUNG.failed": "why its fit failed",
     "RUNG.parameters, RUNG.bytes, RUNG.flops_per_query": "free numbers; what it takes to keep the field in float32; "
     "floating-point operations of a value, for formulas an estimate",
     "RUNG.seconds, RUNG.evaluations, RUNG.flops": "of its fit, with its warm start, without looks",
-    "RUNG.seconds_at_auto, RUNG.flops_at_auto": "when a look first found the error of field=auto, or less than "
-    "a standard error more; none where none did",
+    "RUNG.seconds_at_auto, RUNG.flops_at_auto, RUNG.evaluations_at_auto": "when a look first found the error of "
+    "field=auto, or less than a standard error more; none where none did",
     "saved_...": "of the papers' network, over that of the recommended rung; seconds only where the network was fitted",
-    "auto.field, auto.error, ...": "what early growth (field=auto) ends on; its costs are of all rungs that it tried",
+    "auto....": "what early growth (field=auto) ends on; its costs are of all rungs that it tried",
     "auto.overhead": "seconds of early growth over those of the fit that it ended on",
     "frugal....": "the recommended rung fitted again with renderer.epsilon=auto, renderer.steps=auto and the rays of "
     "an iteration from the loss",
@@ -54,19 +55,17 @@ class Capacity:
 
     Args:
         depth_weight, silhouette_weight: see `bench.tasks.completion.Completion`.
-        fewest_rays: share of the rays that the frugal fit of the recommended rung begins with.
+        frugal_rays: share of the rays that the frugal fit of the recommended rung begins with.
         checks: by which the choice is checked afterwards.
     """
 
     depth_weight: float
     silhouette_weight: float
-    fewest_rays: float
+    frugal_rays: float
     checks: CheckSettings
 
-    takes_field: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
-        check_share("task.fewest_rays", self.fewest_rays, "0.125 begins with an eighth of the rays")
+        check_share("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
         for name in ("depth_weight", "silhouette_weight"):
             check_positive(f"task.{name}", getattr(self, name), "10 works for both")
 
@@ -84,14 +83,15 @@ class Capacity:
                 curve.write(json.dumps(plain({"rung": name, **line}), allow_nan=False) + "\n")
 
             def on_rung(fitted: Fitted, count: int) -> None:
+                record.metrics |= costs(fitted.evidence.rung, fitted.evidence)  # should the run be stopped
                 film.shoot(fitted.evidence.rung, fitted.model.frozen(), stage.scene.view.camera)
                 cell.progress("climbing", len(study.fits), count, fitted.evidence.mean)
 
             fitter = Fitter(observations, ladder.fit, stage.seed, stage.device, on_line)
-            study = Study(observations, fitter, stage.frugal, self.fewest_rays, on_rung)
+            study = Study(observations, fitter, stage.frugal, self.frugal_rays, on_rung)
             growth = study.grow(ladder.all(), ladder.growth)
             evidence = study.climb(ladder.all())
-            self._note_costs(cell, study, evidence)
+            self._note_costs(cell, study, [*growth.tried, *evidence])
             choice = study.choose()
             chosen = study.of(choice.chosen)
             metrics = needs(choice, evidence, growth) | study.precision(chosen)
@@ -111,7 +111,7 @@ class Capacity:
             draw_ladder(cell.folder, record.metrics, title)
 
     def _note_costs(self, cell: Cell, study: Study, evidence: list[Evidence]) -> None:
-        rays = sum(fitted.evidence.iterations for fitted in study.fits) * cell.stage.ladder.views.rays
+        rays = sum(rung.iterations for rung in evidence) * cell.stage.ladder.views.rays
         values = sum(rung.evaluations for rung in evidence)
         cell.record.seconds |= study.fitter.spent
         cell.record.flops = sum(rung.flops for rung in evidence)

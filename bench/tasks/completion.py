@@ -7,13 +7,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from bench.auto import RADIUS
+from bench.auto import footprint
 from bench.autodecoder import Prior
 from bench.ladder.observations import Holdout, Observations, hold_out, together
-from bench.ladder.settings import PRIOR
-from bench.ladder.solve import solve_by_growth
+from bench.ladder.solve import solve_shape
 from bench.pictures import Given
-from bench.solve import solve
 from bench.stage import Cell
 from bench.tasks.code import CodePenalty, CodeProblem, code_problem
 from bench.tasks.given import GivenView
@@ -67,10 +65,7 @@ class Completion:
 
     def execute(self, cell: Cell) -> None:
         """Optimises the code, or the field that is asked for, and judges the shape before and after."""
-        if cell.stage.field == PRIOR:
-            solve(self, cell)
-        else:
-            solve_by_growth(self, cell)
+        solve_shape(self, cell)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -86,14 +81,13 @@ class Completion:
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[Observations, Given]:
         """What a field without a prior is fitted to; a fifth of it is held out, in the tiles of the view."""
-        view, given_part = self._given(scene.view, renderer, seed=seed, device=device)
-        rows, columns = given_part.shape
+        view, observed = self._given(scene.view, renderer, seed=seed, device=device)
+        camera, (rows, columns) = scene.view.camera, observed.shape
         tile = (torch.arange(rows) * TILES // rows)[:, None] * TILES + torch.arange(columns) * TILES // columns
-        split = Holdout(HELD_OUT, (), scene.view.camera.half_pixel(RADIUS), seed)
-        return (
-            hold_out(together([view]), tile.flatten(), split, rays=given_part.numel()),
-            Given(scene.view, given_part.numpy()),
-        )
+        half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
+        split = Holdout(HELD_OUT, (), half_pixel, seed)
+        held = hold_out(together([view]), tile.flatten(), split, rays=observed.numel())
+        return held, Given(scene.view, observed.numpy())
 
     def _given(
         self, view: View, renderer: Renderer, *, seed: int, device: torch.device

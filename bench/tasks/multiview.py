@@ -11,10 +11,8 @@ from torch import Tensor
 
 from bench.autodecoder import Prior
 from bench.ladder.observations import Observations
-from bench.ladder.settings import PRIOR
-from bench.ladder.solve import solve_by_growth
+from bench.ladder.solve import solve_shape
 from bench.pictures import Given
-from bench.solve import solve
 from bench.stage import Cell
 from bench.starts import StartSettings
 from bench.tasks.code import CodePenalty, CodeProblem, code_problem
@@ -114,10 +112,7 @@ class Multiview:
         if apart > FAR_APART:
             told = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             cell.record.notes = [*cell.record.notes, told]
-        if cell.stage.field == PRIOR:
-            solve(self, cell)
-        else:
-            solve_by_growth(self, cell)
+        solve_shape(self, cell)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device

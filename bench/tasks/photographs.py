@@ -63,9 +63,7 @@ class GivenPhotographs:
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
         """The views that an iteration compares, each with its neighbour."""
-        count = len(self.cameras)
-        views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
-        return [(view, (view + self.settings.neighbour) % count) for view in views]
+        return spaced(neighbours(len(self.cameras), self.settings.neighbour), self.per_step, iteration)
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
@@ -192,9 +190,7 @@ class PhotographObservations:
         Raises:
             NotReached: where no point is seen by two views.
         """
-        count, per_step = len(self.fitted), min(self.given.per_step, len(self.fitted))
-        chosen = [self.fitted[(iteration + round(k * count / per_step)) % count] for k in range(per_step)]
-        return self.given.over(field, iteration, chosen)
+        return self.given.over(field, iteration, spaced(self.fitted, self.given.per_step, iteration))
 
     @torch.no_grad()
     def error(self, field: Field) -> HeldOutError:
@@ -206,9 +202,20 @@ class PhotographObservations:
         return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
 
 
+def neighbours(count: int, apart: int) -> list[tuple[int, int]]:
+    """Each of so many views on a circle with one of its neighbours."""
+    return [(view, (view + apart) % count) for view in range(count)]
+
+
+def spaced(pairs: list[tuple[int, int]], most: int, iteration: int) -> list[tuple[int, int]]:
+    """The pairs of an iteration, evenly spaced; they move on by one with each."""
+    count = min(most, len(pairs))
+    return [pairs[(iteration + round(k * len(pairs) / count)) % len(pairs)] for k in range(count)]
+
+
 def split_pairs(count: int, *, neighbour: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Pairs of neighbouring views that a field is fitted to, and pairs that judge it; no view is in both."""
-    pairs = [(view, (view + neighbour) % count) for view in range(count)]
+    pairs = neighbours(count, neighbour)
     held_out = pairs[::HELD_OUT_EVERY]
     hidden = {view for pair in held_out for view in pair}
     return [pair for pair in pairs if not hidden & set(pair)], held_out

@@ -56,18 +56,24 @@ class OptimiserSettings:
 
 
 @runtime_checkable
-class Problem(Protocol):
-    """An inverse problem. Every evaluation that `loss` makes is counted in `counts`."""
+class Descent(Protocol):
+    """What the one loop descends. Every evaluation that `loss` makes is counted in `counts`."""
 
     parameters: list[Tensor]
     counts: Counts
-    rays_per_iteration: int
-    observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
-    photographs: Float[np.ndarray, "views height width 3"] | None  # that are given, for pictures
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The loss at an iteration, counted from 0, as "total", beside its weighted terms."""
         ...
+
+
+@runtime_checkable
+class Problem(Descent, Protocol):
+    """An inverse problem."""
+
+    rays_per_iteration: int
+    observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
+    photographs: Float[np.ndarray, "views height width 3"] | None  # that are given, for pictures
 
     def objective(self) -> float | None:
         """The loss as it stands, not counted, where that of different iterations is not comparable; else None."""
