@@ -6,7 +6,7 @@ number of samples follows from the shape, so that it changes on the way: see `be
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil, inf, log, radians, sin
+from math import ceil, inf, isnan, log, radians, sin
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -86,7 +86,9 @@ def rays_share(least: float, footprint: float, error: float) -> float:
         footprint: half a pixel of the whole image, in scene units.
         error: in scene units.
     """
-    return min(max((footprint / max(error, footprint)) ** 2, least), 1.0) if footprint else 1.0
+    if not footprint or isnan(error):
+        return 1.0
+    return min(max((footprint / max(error, footprint)) ** 2, least), 1.0)
 
 
 def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:

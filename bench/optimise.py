@@ -87,7 +87,8 @@ def _failed(course: Course, problem: Descent, least_reference: float) -> bool:
         course.status, course.reason = RunStatus.NAN, f"{what} is not a number at iteration {iteration}"
     elif loss > DIVERGED * first:
         course.status = RunStatus.DIVERGED
-        course.reason = f"the loss rose from {first:.3g} to {loss:.3g} by iteration {iteration}"
+        begun = course.curve[0]["total"]
+        course.reason = f"the loss rose from {begun:.3g} to {loss:.3g} by iteration {iteration}"
     return course.status is not RunStatus.OK
 
 

@@ -22,6 +22,7 @@ from bench.report.records import read_record
 SCHEMA = 1
 PLAN = "plan.json"
 TOLD = (  # metric, what it is called, factor
+    ("recommended_field", "needs", 1.0),
     ("chamfer_l2", "Chamfer (x1000)", 1000.0),
     ("rotation_error_deg", "rotation error (degrees)", 1.0),
 )

@@ -78,12 +78,12 @@ def _ladder(record: Record) -> Table:
     ladder = Ladder.of(record.metrics)
     title = f"{record.task}, {record.name}, {record.scene}; half a pixel is {number(1000 * ladder.footprint)} (x1000)"
     table = Table(box=box.SIMPLE_HEAD, title=escape(title))
-    for heading in ("", "field", "numbers", "FLOPs a query", "error (x1000)", "its noise", "fit"):
-        table.add_column(heading, justify="left" if heading in ("", "field") else "right")
+    for heading in ("", "field", "numbers", "bytes", "FLOPs a query", "error (x1000)", "s.e.", "fit"):
+        table.add_column(heading, justify="left" if heading in ("", "field") else "right", no_wrap=heading == "field")
     for rung in ladder.rungs:
         own = rung.numbers
         mark = "=>" if rung is ladder.chosen else "best" if rung is ladder.best else ""
-        size = f"{own['parameters']:,}", count(own["flops_per_query"])
+        size = f"{own['parameters']:,}", count(own["bytes"]), count(own["flops_per_query"])
         error = number(own.get("error"), 1000), number(own.get("standard_error"), 1000)
         table.add_row(mark, rung.label, *size, *error, seconds(own["seconds"]))
     return table

@@ -58,7 +58,12 @@ class Following:
         return self.inner.with_samples(self.samples)
 
     def at_iteration(self, iteration: int) -> "Following":
-        """Looks at its renderings, through the inner renderer as it is at that iteration."""
+        """Looks at its renderings, through the inner renderer as it is at that iteration.
+
+        An optimisation begins at 0, with nothing seen: one run may have several.
+        """
+        if iteration == 0:
+            self.seen.thinnest = inf
         return replace(self, inner=cast(Spaced, at_iteration(self.inner, iteration)), looks=True)
 
     def render(self, field: Field, rays: Rays) -> Rendering:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from bench.execute import execute
 from bench.ladder.choice import Evidence
@@ -17,7 +18,7 @@ from bench.records import Record, RunStatus
 from bench.report.records import read_record
 from bench.summary import show
 from bench.tasks.capacity import Capacity, saved
-from bench.tasks.photographs import split_pairs
+from bench.tasks.photographs import photographic_error, split_pairs
 from bench.tasks.problem import Unsupported
 from tests.test_ladder import FIT, GROWTH, VIEWS
 from tests.tiny import Blind, ball_prior, camera_of, cell_of, silent
@@ -166,3 +167,9 @@ def test_the_shipped_ladders_begin_with_a_sphere_and_reach_the_papers_network(co
         names = list(compose_config(f"scale={scale}").ladder.rungs)
         assert names[0] == "sphere"
         assert names[-1] == last
+
+
+def test_photographs_without_a_common_point_count_as_wholly_wrong():
+    """A field that two photographs of a pair do not both see costs as much as the largest difference of colours."""
+    error = photographic_error([torch.full((50,), 0.1), torch.zeros(0)])
+    assert error.mean == pytest.approx((0.1 + 1) / 2)

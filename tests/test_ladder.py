@@ -29,7 +29,7 @@ from datasets.scene import see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
-from renderers.fields.analytic import box, capsule, sphere, superquadric
+from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
 from tests.tiny import CPU
 
 DIST = load("renderer", "dist", samples=1)
@@ -105,7 +105,7 @@ def test_the_papers_network_has_1_8_million():
 @pytest.mark.parametrize(
     ("name", "told"),
     [("unoin_3", "did you mean union_3"), ("union_1", "union_2 is the least"), ("network_4", "unknown field"),
-     ("network_4x2", "width must be at least 4"), ("grid_x", "unknown field"), ("grid_4", "grid must be at least 8")],
+     ("network_4x2", "width must be at least 4"), ("grid_x", "unknown field"), ("grid_4", "between 8 and 256")],
 )  # fmt: skip
 def test_a_name_without_a_rung_is_told(name, told):
     with pytest.raises(ValueError, match=told):
@@ -223,7 +223,7 @@ def test_without_a_mask_only_known_depths_judge():
     view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
     some = view.mask & (torch.arange(24) % 2 == 0)
     given = GivenView.of(view, WEIGHTS, DIST, observed=some, mask=None, device=CPU)
-    found = hold_out(together([given]), torch.zeros(24 * 24, dtype=torch.long), Holdout(0.5, (), 0.02, 0), rays=64)
+    found = hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.5, (), 0.02, 0), rays=64)
     assert len(found.held_out.distance) == pytest.approx(0.5 * some.sum(), abs=1)
     assert bool(found.held_out.mask.all())
 
@@ -303,7 +303,7 @@ def test_growth_ends_with_patience_and_budget():
     patient = grow(fitter, rungs, replace(asked, patience=1))
     assert [evidence.rung for evidence in patient.tried] == ["sphere", "box", "box"]
     assert grow(fitter, rungs, asked).fitted.evidence.rung == "rounded_box"
-    two_more = 2.5 * cost(rung("box"), 2, fitter) / cost(rung("box"), 10, fitter)
+    two_more = 2.5 * cost(rung("box"), 3, fitter) / cost(rung("box"), 10, fitter)
     tight = grow(fitter, rungs, replace(asked, budget=1 + two_more))
     assert len(tight.tried) == 3
 
@@ -358,3 +358,61 @@ def test_further_views_are_others():
 def test_views_that_cannot_be_are_told(changed, told):
     with pytest.raises(ValueError, match=told):
         replace(VIEWS, **changed)
+
+
+def test_a_renderers_own_draws_are_the_same_for_every_fit():
+    dvr = load("renderer", "dvr", samples=16, doublings=[])
+    fitter, means = fitter_of("ball", dvr, warm_iterations=10), []
+    for _ in range(2):
+        fitted = fitter.begin(rung("sphere"), None)
+        fitter.fit(fitted, 4, looks=False)
+        means.append(fitted.model.parameters[0].tolist())
+        torch.rand(3)
+    assert means[0] == means[1]
+
+
+def test_too_few_depths_to_hold_some_out_are_told():
+    view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
+    few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
+    given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
+    with pytest.raises(ValueError, match="2 leave too few of them: give more depth"):
+        hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.2, (), 0.02, 0), rays=64)
+
+
+def test_a_field_that_hits_no_known_depth_is_all_wrong():
+    nothing = HeldOutError(np.array([[0.0, 0, 2, 40]] * 3), 0.1)
+    assert nothing.mean == pytest.approx(0.1)
+    flat = Model("sphere", [torch.zeros(1)], lambda free: Shape(lambda p: 1e-6 + 0 * p[..., 0]), 0.1, metric=True)
+    assert views_of("ball").observations(0).error(flat.frozen()).mean > views_of("ball").footprint
+
+
+def test_a_warm_start_counts_what_it_asks_of_the_field_before_it():
+    fitter = fitter_of("ball", warm_iterations=10)
+    ball = fitter.begin(rung("sphere"), None)
+    grid = fitter.begin(rung("grid_16"), ball.model)
+    asked = 12 * 128 + 16**3  # of the ball: in each iteration, the warm-up and the last look, and on the grid
+    assert grid.evidence.evaluations == 10 * 128 + asked
+    network = fitter.begin(rung("network_1x16"), ball.model)
+    assert network.evidence.evaluations == 10 * 128 + 12 * 128
+    assert network.evidence.flops > 10 * 128 * (10 + rung("network_1x16").flops)
+
+
+def test_unions_without_points_have_parts_of_their_own():
+    nothing = torch.zeros(0, 3)
+    (model,) = rung("union_3").starts(Seen(nothing, None, 0, CPU))
+    assert len(model.parameters[0].unique(dim=0)) == 3
+    (larger,) = rung("union_5").starts(Seen(nothing, model, 0, CPU))
+    assert torch.equal(larger.parameters[0][:3], model.parameters[0])
+    two = torch.cat([torch.randn(30, 3) * 0.02 + 0.6, torch.tensor([[-0.7] * 3, [-0.72] * 3])])
+    for start in rung("union_2").starts(Seen(two, None, 0, CPU)):
+        middles = start.parameters[0][:, :3].mean(1).sort().values
+        assert middles.tolist() == pytest.approx([-0.71, 0.6], abs=0.05)
+
+
+def test_a_loss_that_is_not_a_number_asks_for_all_rays():
+    assert rays_share(0.1, 0.01, float("nan")) == 1.0
+
+
+def test_a_rung_stands_in_a_ladder_once():
+    with pytest.raises(ValueError, match="name each rung once"):
+        LadderSettings(("sphere", "box", "sphere"), FIT, GROWTH, VIEWS)

@@ -124,7 +124,7 @@ class UnionOf:
     tries: ClassVar[int] = STARTS + 1
 
     def __post_init__(self) -> None:
-        check_at_least("union", self.count, 2, "union_2 is the least")
+        check_at_least("K of union_K", self.count, 2, "union_2 is the least")
 
     @property
     def name(self) -> str:
@@ -136,15 +136,17 @@ class UnionOf:
 
     def starts(self, seen: Seen) -> list[Model]:
         """Of several clusterings, and after the union that was before, if there is one."""
-        points = _or_unit(seen.points)
-        choices = [_clustered(points, self.count, seen.seed + start) for start in range(STARTS)]
         old = [] if seen.previous is None else _parts_of(seen.previous)
-        if 0 < len(old) < self.count:
-            with torch.no_grad():
-                error = seen.previous.frozen()(points.to(seen.device)).abs().cpu()
-            missed = points[error >= error.quantile(WORST)]
-            choices.append([*old, *_clustered(missed, self.count - len(old), seen.seed)])
-
+        kept = old if len(old) < self.count else []
+        if not len(seen.points):
+            choices = [[*kept, *_anywhere(self.count - len(kept), seen.seed)]]
+        else:
+            points = _or_unit(seen.points)
+            choices = [_clustered(points, self.count, seen.seed + start) for start in range(STARTS)]
+            if kept:
+                error = seen.ask(points).abs()
+                missed = points[error >= error.quantile(WORST)]
+                choices.append([*kept, *_clustered(missed, self.count - len(kept), seen.seed)])
         return [
             _model(self.name, torch.stack(parts), lambda free: union(free[0]), self.flops, seen) for parts in choices
         ]
@@ -198,7 +200,23 @@ def _clustered(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Floa
 
     _, labels = kmeans2(points.numpy().astype(np.float64), count, minit="++", rng=np.random.default_rng(seed))
     clusters = [points[torch.from_numpy(labels == label)] for label in range(count)]
-    return [torch.cat([_fitting_box(_or_unit(cluster)), torch.tensor([EDGED])]) for cluster in clusters]
+    return [torch.cat([_around(cluster, points), torch.tensor([EDGED])]) for cluster in clusters]
+
+
+def _around(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, "9"]:
+    """The smallest box about a cluster; a small one in its middle where it has too few points for a box."""
+    if len(cluster) >= 4:
+        return _fitting_box(cluster)
+    middle = cluster.mean(0) if len(cluster) else points.mean(0)
+    return torch.cat([middle, torch.zeros(3), torch.full((3,), LEAST).log()])
+
+
+def _anywhere(count: int, seed: int) -> list[Float[Tensor, "10"]]:
+    """Rounded boxes in places of their own, where no point is known."""
+    draw = torch.Generator().manual_seed(seed)
+    sizes = torch.full((3,), CORNER).log()
+    places = CORNER * (2 * torch.rand(count, 3, generator=draw) - 1)
+    return [torch.cat([place, torch.zeros(3), sizes, torch.tensor([EDGED])]) for place in places]
 
 
 def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:

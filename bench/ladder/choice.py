@@ -19,6 +19,7 @@ class Evidence:
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without looks.
+        wall: seconds of all that it took, with starts and looks.
         iterations: of the fit, without its warm start.
         looks: on the way: seconds, evaluations, flops and error at each.
     """
@@ -34,6 +35,7 @@ class Evidence:
     evaluations: int = 0
     gradients: int = 0
     flops: int = 0
+    wall: float = 0.0
     iterations: int = 0
     looks: list[dict[str, float]] = field(default_factory=list)
 

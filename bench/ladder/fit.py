@@ -1,5 +1,6 @@
 """Fits a rung: a warm start without a renderer, then the renderer's loss; every rung with the same rays and budget."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
@@ -54,6 +55,7 @@ class Fitter:
         seed: of what is drawn.
         device: where.
         on_line: is told of each iteration: the rung and a line of the curve.
+        part: of the run, that the lines are of.
     """
 
     observations: Observations
@@ -61,13 +63,14 @@ class Fitter:
     seed: int
     device: torch.device
     on_line: Callable[[str, dict[str, Any]], None]
+    part: str = "growth"
     spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by what they were for
 
-    def begin(self, rung: Rung, previous: Model | None) -> Fitted:
-        """A rung's model after its warm start, judged."""
-        ball = None
+    def begin(self, rung: Rung, previous: Model | None, *, look: bool = True) -> Fitted:
+        """A rung's model after its warm start, and judged if it is to be looked at."""
+        clock, ball = time.perf_counter(), None
         if previous is None and rung.follows:
-            ball = self.begin(OnePart("sphere"), None)
+            ball = self.begin(OnePart("sphere"), None, look=False)
             previous = ball.model
         seen = Seen(self.observations.points.cpu(), previous, self.seed, self.device)
         starts = [self._start(rung, model, previous) for model in rung.starts(seen)]
@@ -79,7 +82,13 @@ class Fitter:
         spent = [other.evidence for other, _ in starts] + ([] if ball is None else [ball.evidence])
         for name in SPENT:
             setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in spent))
-        self._judge(fitted)
+        if previous is not None:
+            asked = [seen.counts, *(start.asked for _, start in starts)]
+            fitted.evidence.evaluations += sum(counts.value for counts in asked)
+            fitted.evidence.flops += sum(counts.flops(previous.frozen()) or 0 for counts in asked)
+        if look:
+            self._judge(fitted)
+        fitted.evidence.wall += time.perf_counter() - clock
         return fitted
 
     def _start(self, rung: Rung, model: Model, previous: Model | None) -> tuple[Fitted, WarmStart]:
@@ -102,16 +111,17 @@ class Fitter:
         """Goes on with a rung for so many iterations, and judges it; with `looks` on the way, too."""
         if fitted.failed or iterations < 1:
             return
+        clock = time.perf_counter()
         problem = RungProblem(fitted.model, self.observations, self.settings, fitted.evidence.iterations)
         settings = OptimiserSettings(iterations, fitted.model.learning_rate, "ramped")
-        self._run(fitted, problem, settings, looks=looks)
-        fitted.evidence.iterations += iterations
+        fitted.evidence.iterations += self._run(fitted, problem, settings, looks=looks)
         self._judge(fitted)
+        fitted.evidence.wall += time.perf_counter() - clock
 
     def _run(
         self, fitted: Fitted, problem: "RungProblem | WarmStart", settings: OptimiserSettings, *, looks: bool
-    ) -> None:
-        """Runs the one loop, and adds what it cost to the evidence."""
+    ) -> int:
+        """Runs the one loop, adds what it cost to the evidence, and gives how many iterations it came to."""
         course, evidence = Course(), fitted.evidence
         before = {name: getattr(evidence, name) for name in SPENT}
 
@@ -123,7 +133,11 @@ class Fitter:
             step = line["iteration"] + 1
             if looks and course.status is RunStatus.OK and step in LOOKS and step < settings.iterations:
                 self._judge(fitted)
-            own = {"phase": problem.phase, "iteration": fitted.evidence.iterations + line["iteration"]}
+            own = {
+                "part": self.part,
+                "phase": problem.phase,
+                "iteration": fitted.evidence.iterations + line["iteration"],
+            }
             self.on_line(evidence.rung, {**line, **own})
 
         try:
@@ -135,6 +149,7 @@ class Fitter:
         evidence.status, evidence.reason = course.status, course.reason
         if fitted.failed:
             evidence.error = None
+        return len(course.curve)
 
     def _judge(self, fitted: Fitted) -> None:
         """Looks at a rung as it stands."""
@@ -164,6 +179,7 @@ class RungProblem:
     def loss(self, iteration: int) -> Terms:
         """The renderer's terms, that of the gradient's length, and their sum."""
         counted, own, settings = Meter(self.model.field(), self.counts), self.begun + iteration, self.settings
+        self.error = self.error if iteration else inf  # the first is run twice: once before the clock
         share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
         terms = self.observations.terms(counted, own, share)
         self.error = float(sum(terms.values()).detach()) / self.observations.weight

@@ -10,6 +10,7 @@ from bench.ladder.settings import GrowthSettings
 from renderers.field import Field
 
 OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
+LEAST_TRIAL = 8  # iterations, where a quarter of the fit is more than that
 WARM = 1 / 12  # of an iteration's time: one of a warm start (measured: 1.5 ms of 16)
 
 
@@ -21,6 +22,8 @@ class Growth:
         fitted: the rung that it ended on, fitted to the end.
         first: the field of the first rung as it began.
         tried: every rung in its turn, as far as it was fitted.
+        footprint: half a pixel, in scene units, under which growth ends.
+        end: why no larger rung was tried, where the error is above the footprint.
         fields: those of the rungs that it stood on, by name, one after the other; the last one at its end.
     """
 
@@ -28,18 +31,28 @@ class Growth:
     first: Field
     tried: list[Evidence]
     fields: dict[str, Field]
+    footprint: float
+    end: str
 
     def told(self, asked: str) -> str:
         """What it came to, in words."""
         error = self.fitted.evidence.mean
-        return (
+        told = (
             f"field={asked}: {' -> '.join(self.fields)}, {self.fitted.model.size} numbers, held-out error {error:.3g}"
         )
+        if not self.footprint or error <= self.footprint:
+            return told
+        return f"{told}, above half a pixel ({self.footprint:.3g}): {self.end}; more iterations may help"
 
     @property
     def overhead(self) -> float:
         """Seconds of all fits together over those of the fit that it ended on, which are its whole budget."""
         return self.seconds / max(self.fitted.evidence.seconds, 1e-9)
+
+    @property
+    def overhead_judged(self) -> float:
+        """The same of all that was done: with looks at held-out rays, and with what it takes to begin."""
+        return sum(evidence.wall for evidence in self.tried) / max(self.fitted.evidence.wall, 1e-9)
 
     @property
     def seconds(self) -> float:
@@ -66,8 +79,8 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
     """Tries rungs from the smallest on, keeps those that are better, and fits the last to the end.
 
     A rung is better where its held-out error is less than that of the one before by more than the standard error of the
-    difference, over the same rays. Growth ends where the error is below the footprint, where patience ends, or where
-    another trial would take the whole above its budget.
+    difference, over the same rays. Growth ends where the error is below the footprint or patience ends; rungs whose
+    trial would take the whole above its budget are passed over.
 
     Args:
         fitter: fits them.
@@ -75,17 +88,19 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
         settings: how far to look ahead.
     """
     whole = fitter.settings.iterations
-    trial = max(ceil(settings.trial * whole), 1)
-    now, rung = fitter.begin(rungs[0], None), rungs[0]
+    trial = min(max(ceil(settings.trial * whole), LEAST_TRIAL), ceil(whole / 4))
+    now, rung, end = fitter.begin(rungs[0], None, look=False), rungs[0], "the ladder has no more"
     first = now.model.frozen()
     fitter.fit(now, trial, looks=False)
     tried, fields, vain, others = [now.evidence], {rung.name: now.model.frozen()}, 0, 0.0
     for larger in rungs[1:]:
-        enough = now.evidence.mean <= fitter.observations.footprint
-        budget = (settings.budget - 1) * cost(rung, whole, fitter)
-        if enough or vain == settings.patience or others + cost(larger, trial, fitter) > budget:
+        if now.evidence.mean <= fitter.observations.footprint or vain == settings.patience:
             break
-        fitted = fitter.begin(larger, now.model)
+        kept, gone = (cost(one, whole, fitter) * (settings.budget - 1) for one in (rung, larger))
+        if others + cost(larger, trial, fitter) > kept or others + cost(rung, trial, fitter) > gone:
+            end = "others would take more than ladder.growth.budget"
+            continue
+        fitted = fitter.begin(larger, now.model, look=False)
         fitter.fit(fitted, trial, looks=False)
         tried.append(fitted.evidence)
         better = _is_better(fitted, now)
@@ -94,8 +109,10 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
         if better:
             now, rung = fitted, larger
             fields[rung.name] = now.model.frozen()
+    end = f"{vain} larger ones were no better" if vain == settings.patience else end
     fitter.fit(now, whole - trial, looks=True)
-    return Growth(now, first, tried, fields | {rung.name: now.model.frozen()})
+    fields[rung.name] = now.model.frozen()
+    return Growth(now, first, tried, fields, fitter.observations.footprint, end)
 
 
 def cost(rung: Rung, iterations: int, fitter: Fitter) -> float:

@@ -37,7 +37,10 @@ class HeldOutError:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean, by the jackknife over groups, whose rays are not independent (Efron and Tibshirani 1993)."""
+        """Of the mean, by the jackknife over groups, whose rays are not independent (Efron and Tibshirani 1993).
+
+        Groups count alike, whole views and what is held out of fitted ones.
+        """
         return _jackknife(self._without_each())
 
     def noise_of_difference(self, other: "HeldOutError") -> float:
@@ -80,7 +83,8 @@ class HeldOut:
         compared = rendering.hit & self.observed
         apart = torch.zeros_like(self.distance)
         normals = autograd_normals(field, rendering.points[compared])
-        cosine = (normals * self.rays.directions[compared]).sum(-1).abs()
+        flat = torch.linalg.vector_norm(normals, dim=-1) < 0.5  # no normal: the distance along the ray counts
+        cosine = torch.where(flat, 1.0, (normals * self.rays.directions[compared]).sum(-1).abs())
         apart[compared] = ((rendering.distance - self.distance)[compared].abs() * cosine).clamp_max(missed)
         parts = [apart, compared, rendering.hit ^ self.mask, rendering.hit | self.mask]
         sums = [torch.bincount(self.group, part.double()) for part in parts]
@@ -91,7 +95,8 @@ def _means(sums: Float[np.ndarray, "n 4"], missed: float) -> Float[np.ndarray, "
     """Errors of hits and of misses, each by its share of the rays on which either hits."""
     errors, hits, disagree, either = sums.T
     share = disagree / np.maximum(either, 1)
-    return (1 - share) * errors / np.maximum(hits, 1) + share * missed
+    of_hits = np.where(hits > 0, errors / np.maximum(hits, 1), missed)  # where no known distance is hit, all is wrong
+    return (1 - share) * of_hits + share * missed
 
 
 def _jackknife(values: Float[np.ndarray, " groups"]) -> float:

@@ -5,6 +5,7 @@ from bench.ladder.growth import grow
 from bench.ladder.views import Views
 from bench.stage import Cell
 from bench.tasks.given import Weights
+from bench.tasks.problem import check_field_gradient
 from datasets.truth import Truth
 from renderers.field import Field
 
@@ -17,10 +18,17 @@ def grown_shape(cell: Cell, weights: Weights) -> Field:
     Args:
         cell: the run, whose record notes what was grown.
         weights: of a view's loss.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+        ValueError: where no field could be fitted.
     """
+    check_field_gradient(cell.stage.renderer)
     stage, ladder = cell.stage, cell.stage.ladder
     views = Views(Truth(stage.scene.mesh), stage.views, ladder.views, weights, stage.renderer, stage.device)
     fitter = Fitter(views.observations(stage.seed), ladder.fit, stage.seed, stage.device, lambda name, line: None)
     growth = grow(fitter, ladder.asked(stage.field), ladder.growth)
+    if growth.fitted.failed:
+        raise ValueError(f"no field was found for the known shape: {growth.fitted.evidence.reason}")
     cell.record.notes = [*cell.record.notes, growth.told(stage.field)]
     return growth.fitted.model.frozen()

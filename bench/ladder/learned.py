@@ -18,6 +18,7 @@ FASTEST, RATE_OF_WIDTH = 2e-3, 0.4  # Adam's rate falls as the width grows (Yang
 START_RADIUS = 0.5  # of the ball that a network begins near, in scene units
 REACH = 1.05  # of the sampled cube: the unit sphere and a little more
 BAND = 2.0  # cells to both sides of the surface whose samples are free
+MOST_SAMPLES = 256  # along an axis: 64 MiB of values
 GRID_RATE = 1e-3  # scene units
 
 
@@ -77,7 +78,8 @@ class NarrowBand:
     tries: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        check_at_least("grid", self.resolution, 8, "grid_32 is that of the default ladder")
+        if not 8 <= self.resolution <= MOST_SAMPLES:
+            raise ValueError(f"N of grid_N must lie between 8 and {MOST_SAMPLES}, not {self.resolution}: grid_32")
 
     @property
     def name(self) -> str:
@@ -90,10 +92,9 @@ class NarrowBand:
     @torch.no_grad()
     def starts(self, seen: Seen) -> list[Model]:
         """The previous field's values; free ones lie near its surface or near the observed points."""
-        assert seen.previous is not None
         axis = torch.linspace(-REACH, REACH, self.resolution, device=seen.device)
         corners = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-        values = seen.previous.frozen()(corners.view(-1, 3))
+        values = seen.ask(corners.view(-1, 3)).to(seen.device)
         cell = 2 * REACH / (self.resolution - 1)
         near = values.abs() < BAND * cell
         near[self._around(seen.points.to(seen.device), cell)] = True

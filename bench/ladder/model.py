@@ -1,14 +1,14 @@
 """A field with free numbers: what a rung of the ladder is fitted as."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderers.field import Field
+from renderers.field import Counts, Field, Meter
 
 FLOAT = 4  # bytes of a float32
 
@@ -67,6 +67,13 @@ class Seen:
     previous: Model | None
     seed: int
     device: torch.device
+    counts: Counts = field(default_factory=Counts)  # of the previous model's values that were asked for
+
+    @torch.no_grad()
+    def ask(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """The previous model's values, counted, on the CPU."""
+        assert self.previous is not None
+        return Meter(self.previous.frozen(), self.counts)(points.to(self.device)).cpu()
 
 
 @runtime_checkable

@@ -111,7 +111,10 @@ class RayObservations:
         """The weighted loss of the rays that are drawn for an iteration."""
         count = max(round(share * self.rays), 1)
         drawn = torch.randint(len(self.through_sphere), (count,), generator=generator(self.seed, iteration))
-        return self.given.some(self.through_sphere[drawn.to(self.through_sphere.device)]).compare(field, iteration)
+        some = self.given.some(self.through_sphere[drawn.to(self.through_sphere.device)])
+        with torch.random.fork_rng():  # a renderer's own draws are the same for every rung, too
+            torch.manual_seed(self.seed * 1_000_003 + iteration)
+            return some.compare(field, iteration)
 
     def error(self, field: Field) -> HeldOutError:
         """Of the rays that are held out."""
@@ -155,6 +158,9 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
         group: which view, or part of one, a ray belongs to, from 0.
         split: what is held out.
         rays: to be drawn in an iteration.
+
+    Raises:
+        ValueError: where too little is given to hold some out.
     """
     draw = torch.Generator().manual_seed(split.seed)
     out = torch.isin(group, torch.tensor(split.whole))
@@ -164,7 +170,13 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
         out[places[torch.randperm(len(places), generator=draw)[:count]]] = True
     out = out.to(view.observed.device)
     given = view.some((~out).nonzero().squeeze(-1))
-    return RayObservations(given, _held(view, out, group, split.footprint), rays, split.seed)
+    held_out = held(view, out, group, split.footprint)
+    if len(held_out.group[held_out.observed].unique()) < 2:
+        raise ValueError(
+            f"a field without a prior is judged by depths that it was not fitted to, and {int(view.observed.sum())} "
+            "leave too few of them: give more depth (task.points=100), or set field=prior"
+        )
+    return RayObservations(given, held_out, rays, split.seed)
 
 
 def together(views: list[GivenView]) -> GivenView:
@@ -179,7 +191,7 @@ def together(views: list[GivenView]) -> GivenView:
     return replace(views[0], rays=rays, **parts, mask=torch.cat(masks) if masks else None)
 
 
-def _held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:
+def held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:
     """Of the rays that are held out, those of which something is known."""
     known = (out & view.observed if view.mask is None else out).nonzero().squeeze(-1)
     part = view.some(known)

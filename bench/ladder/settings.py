@@ -16,8 +16,8 @@ class FitSettings:
 
     Args:
         iterations: of the renderer's loss.
-        fewest_rays: share of the rays that it begins with, where their number follows the loss (`bench.auto.rays_share`);
-            1 takes all from the start on.
+        fewest_rays: share of the rays that it begins with where their number follows the loss; 1 takes all from the
+            start on. See `bench.auto.rays_share`.
         warm_iterations, warm_points: of the start without a renderer, to the observed points and the previous field.
         eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are no distance by
             themselves.
@@ -104,6 +104,8 @@ class LadderSettings:
 
     def __post_init__(self) -> None:
         check_at_least("the length of ladder.rungs", len(self.rungs), 1, "conf/scale has whole ones")
+        if len(set(self.rungs)) < len(self.rungs):
+            raise ValueError(f"ladder.rungs must name each rung once, not {', '.join(self.rungs)}")
         self.all()
 
     def all(self) -> list[Rung]:

@@ -26,9 +26,12 @@ from renderers.rendering import Renderer
 ENDED = {
     "field": "the rung that field=auto ended on, or the one that was asked for",
     "field_parameters": "its free numbers",
-    "field_error, field_standard_error": "of what was held out of the observations, see bench/ladder/held_out.py",
-    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends",
-    "field_overhead": "seconds of all rungs that were tried over those of the one that it ended on",
+    "field_error, field_standard_error": "of what was held out of the observations: as RUNG.error of task=capacity, in "
+    "scene units; of photographs the mean difference of colours from 0 to 1",
+    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends; 0 for photographs",
+    "field_overhead": "seconds of all fits, also of rungs that were tried in vain, over those of the last rung's; "
+    "without looks at what is held out",
+    "field_overhead_judged": "the same with looks and with what it takes to begin",
     "fields_tried": "rungs that were tried",
 }
 
@@ -71,8 +74,8 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
     with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
 
         def on_line(name: str, line: dict[str, Any]) -> None:
-            lines.append({**line, "iteration": len(lines)})
-            curve.write(json.dumps(plain({**lines[-1], "rung": name}), allow_nan=False) + "\n")
+            lines.append({**line, "rung": name})
+            curve.write(json.dumps(plain(lines[-1]), allow_nan=False) + "\n")
             cell.progress(name, line["iteration"] + 1, task.optimiser.iterations, line["total"])
 
         settings = replace(stage.ladder.fit, iterations=task.optimiser.iterations)
@@ -82,14 +85,14 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
     _note_costs(cell, fitter, growth)
     first, last = growth.first, growth.fitted.model.frozen()
     record.metrics_start, after = judge(first, stage).metrics, judge(last, stage)
-    record.metrics = after.metrics | ended(growth, observations)
+    record.metrics = after.metrics | ended(growth)
     record.status, record.reason = _verdict(growth, empty=after.mesh is None)
     record.notes = [*record.notes, growth.told(stage.field)]
     if after.mesh is not None:
         after.mesh.save(cell.folder / "mesh.ply")
     title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
     if stage.evaluation.picture is not None:
-        draw_run(cell.folder, stage, (first, last), given, rendered(lines), title)
+        draw_run(cell.folder, stage, (first, last), given, rendered(lines, growth.fitted.evidence.rung), title)
     film = Film(stage, "by rung")
     for name, field in growth.fields.items():
         film.shoot(name, field, stage.scene.view.camera)
@@ -97,14 +100,19 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
     record.seconds["evaluation"] = time.perf_counter() - clock
 
 
-def rendered(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The lines of all fits through the renderer, one after the other, with their common terms."""
-    fits = [line for line in lines if line["phase"] == RungProblem.phase]
-    common = [{name: value for name, value in line.items() if name not in ("eikonal", "phase")} for line in fits]
-    return [{**line, "iteration": place} for place, line in enumerate(common)]
+def rendered(lines: list[dict[str, Any]], rung: str) -> list[dict[str, Any]]:
+    """The lines of a rung's fit through the renderer, its trial and the rest, with one clock."""
+    fit = [line for line in lines if line["phase"] == RungProblem.phase and line["rung"] == rung]
+    clock, told = 0.0, []
+    for place, line in enumerate(fit):
+        own = line["seconds"] - (fit[place - 1]["seconds"] if place else 0.0)
+        clock += own if own > 0 else line["seconds"]
+        numbers = {name: value for name, value in line.items() if name not in ("part", "phase", "rung", "eikonal")}
+        told.append({**numbers, "iteration": place, "seconds": clock})
+    return told
 
 
-def ended(growth: Growth, observations: Observations) -> dict[str, Any]:
+def ended(growth: Growth) -> dict[str, Any]:
     """What growth ended on, as metrics."""
     evidence = growth.fitted.evidence
     error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
@@ -113,23 +121,29 @@ def ended(growth: Growth, observations: Observations) -> dict[str, Any]:
         "field_parameters": evidence.parameters,
         "field_error": evidence.mean,
         **error,
-        "field_footprint": observations.footprint,
+        "field_footprint": growth.footprint,
         "field_overhead": growth.overhead,
+        "field_overhead_judged": growth.overhead_judged,
         "fields_tried": len(growth.tried),
     }
 
 
 def _verdict(growth: Growth, *, empty: bool) -> tuple[RunStatus, str]:
-    evidence = growth.fitted.evidence
+    evidence, first = growth.fitted.evidence, growth.tried[0].looks[:1]
     if evidence.error is None:
         return evidence.status, evidence.reason
-    return (RunStatus.EMPTY, "the field has no surface in the unit sphere") if empty else (RunStatus.OK, "")
+    if empty:
+        return RunStatus.EMPTY, "the field has no surface in the unit sphere"
+    if evidence.mean > growth.footprint and first and evidence.mean >= first[0]["error"]:
+        ends = f"{first[0]['error']:.4g} at first, {evidence.mean:.4g} at last"
+        return RunStatus.NOT_REACHED, f"the held-out error did not fall: {ends}"
+    return RunStatus.OK, ""
 
 
 def _note_costs(cell: Cell, fitter: Fitter, growth: Growth) -> None:
     record, iterations = cell.record, sum(evidence.iterations for evidence in growth.tried)
     rays = max(iterations * fitter.observations.rays, 1)
-    record.seconds |= fitter.spent
+    record.seconds |= {"forward": 0.0, "backward": 0.0} | fitter.spent
     record.flops = growth.flops
     record.evaluations = {
         "value": growth.evaluations,

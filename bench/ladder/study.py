@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from bench.ladder.choice import Choice, Evidence, choose, is_as_good
 from bench.ladder.fit import Fitted, Fitter
@@ -59,8 +60,9 @@ class Study:
 
     def climb(self, rungs: list[Rung]) -> list[Evidence]:
         """Fits every rung, each begun with the best before it where that helps."""
+        fitter = replace(self.fitter, part="climb")
         for rung in rungs:
-            self.fits.append(self._fitted(self.fitter, rung, self._best(self.fits)))
+            self.fits.append(self._fitted(fitter, rung, self._best(self.fits)))
             self.on_rung(self.fits[-1], len(rungs))
         return [fitted.evidence for fitted in self.fits]
 
@@ -85,13 +87,20 @@ class Study:
         return shares(own, errors, settings, footprint=self.observations.footprint, seed=self.fitter.seed)
 
     def refit(self, rung: Rung) -> Evidence:
-        """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for."""
+        """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for.
+
+        It is judged as all others are.
+        """
         settings = replace(self.fitter.settings, fewest_rays=self.frugal_rays)
         observations = self.observations.through(self.frugal)
-        fitter = replace(self.fitter, settings=settings, observations=observations, spent={})
+        fitter = replace(self.fitter, settings=settings, observations=observations, part="frugal", spent={})
         place = next(place for place, fitted in enumerate(self.fits) if fitted.evidence.rung == rung.name)
-        return self._fitted(fitter, rung, self._best(self.fits[:place])).evidence
+        fitted = self._fitted(fitter, rung, self._best(self.fits[:place]))
+        if not fitted.failed:
+            fitted.evidence.error = self.observations.error(fitted.model.frozen())
+        return fitted.evidence
 
+    @torch.no_grad()
     def precision(self, fitted: Fitted) -> dict[str, float]:
         """What rendering the held-out rays costs with either renderer, and hits that only one has."""
         rays, shape = self.observations.held_out.rays, fitted.model.frozen()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.auto import footprint
 from bench.ladder.held_out import HeldOut
-from bench.ladder.observations import Holdout, RayObservations, hold_out, together
+from bench.ladder.observations import Holdout, RayObservations, held, hold_out, together
 from bench.ladder.settings import ViewSettings
 from bench.tasks.given import GivenView, Weights
 from datasets.scene import see
@@ -59,9 +59,8 @@ class Views:
         """So many views more, that no choice has seen, each drawn at random."""
         draw, highest = np.random.default_rng([seed, 3]), sin(radians(self.settings.elevation))
         angles = [(draw.uniform(0, 360), degrees(asin(draw.uniform(-highest, highest)))) for _ in range(count)]
-        cameras = [self.sampler.camera(*pair) for pair in angles]
-        everything = Holdout(0.0, tuple(range(count)), self.footprint, seed)
-        return hold_out(*self._seen(cameras), everything, rays=self.settings.rays).held_out
+        view, group = self._seen([self.sampler.camera(*pair) for pair in angles])
+        return held(view, torch.ones_like(view.observed), group, self.footprint)
 
     def _spread(self, count: int, turn: float) -> list[Camera]:
         """Cameras of even spacing over the belt of a sphere between the largest elevations (Fibonacci's lattice)."""

@@ -39,6 +39,7 @@ class WarmStart:
     count: int
     seed: int
     counts: Counts = field(default_factory=Counts)
+    asked: Counts = field(default_factory=Counts)  # of the target's values
     phase: ClassVar[str] = "warm start"
 
     @torch.no_grad()
@@ -60,7 +61,7 @@ class WarmStart:
         if self.target is not None:
             points = scattered(self.surface, self.count, draw)
             with torch.no_grad():
-                wanted = self.target(points)
+                wanted = Meter(self.target, self.asked)(points)
             return near_surface_first((shape(points) - wanted).abs(), wanted, SURFACE_WIDTH).mean()
         off = [shape(_some(self.surface, self.count, draw)).abs()] if len(self.surface) else []
         inside = [(-shape(_some(self.free, self.count, draw))).clamp_min(0)] if len(self.free) else []

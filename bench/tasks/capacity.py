@@ -16,6 +16,7 @@ from bench.ladder.study import CheckSettings, Study
 from bench.ladder.views import Views
 from bench.metrics import DEFINITIONS
 from bench.records import RunStatus, plain
+from bench.solve import COSTS
 from bench.stage import Cell
 from bench.tasks.problem import check_field_gradient
 from datasets.truth import Truth
@@ -24,7 +25,7 @@ from renderers.checks import check_positive, check_share
 TINY = 1e-9  # seconds: a clock that did not move
 NEEDS = {
     "recommended_field, recommended_parameters, recommended_error": "the smallest rung of the ladder, by free numbers, "
-    "whose held-out error is within one standard error of the best rung's or under the footprint; its numbers, its error",
+    "whose held-out error is within one standard error of the best rung's or under the footprint; its size, its error",
     "recommended_within, recommended_enough": "1 where the first, the second of these holds",
     "best_field": "the rung of the least held-out error",
     "footprint": "half a pixel where the shape may be nearest (DIST, Eq. 10, theta = 0), in scene units",
@@ -39,7 +40,9 @@ NEEDS = {
     "field=auto, or less than a standard error more; none where none did",
     "saved_...": "of the papers' network, over that of the recommended rung; seconds only where the network was fitted",
     "auto....": "what early growth (field=auto) ends on; its costs are of all rungs that it tried",
-    "auto.overhead": "seconds of early growth over those of the fit that it ended on",
+    "auto.overhead": "seconds of all fits of early growth over those of the one that it ended on, without looks at "
+    "what is held out",
+    "auto.overhead_judged": "the same with looks and with what it takes to begin",
     "frugal....": "the recommended rung fitted again with renderer.epsilon=auto, renderer.steps=auto and the rays of "
     "an iteration from the loss",
     "precision....": "held-out rays rendered at the renderer's own epsilon and steps, and at auto (Eqs. 8, 10)",
@@ -73,7 +76,7 @@ class Capacity:
         """Fits, chooses, checks, and lets the truth judge what was chosen."""
         stage, record = cell.stage, cell.record
         check_field_gradient(stage.renderer)
-        record.definitions = DEFINITIONS | NEEDS
+        record.definitions = DEFINITIONS | COSTS | NEEDS
         ladder, film = stage.ladder, Film(stage, "by rung")
         views = Views(Truth(stage.scene.mesh), stage.views, ladder.views, self, stage.renderer, stage.device)
         observations = views.observations(stage.seed)
@@ -94,9 +97,8 @@ class Capacity:
             self._note_costs(cell, study, [*growth.tried, *evidence])
             choice = study.choose()
             chosen = study.of(choice.chosen)
-            metrics = needs(choice, evidence, growth) | study.precision(chosen)
-            metrics |= study.check(choice, views, self.checks)
-            metrics |= costs("frugal", study.refit(rung(choice.chosen.rung)))
+            metrics = needs(choice, evidence, growth) | study.check(choice, views, self.checks)
+            metrics |= costs("frugal", study.refit(rung(choice.chosen.rung))) | study.precision(chosen)
         judged = judge(chosen.model.frozen(), stage)
         record.metrics = judged.metrics | {"footprint": views.footprint} | metrics
         record.status, record.reason = RunStatus.OK, ""
@@ -146,6 +148,7 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
     for one in evidence:
         metrics |= costs(one.rung, one)
     metrics |= {"auto.field": last.rung, **costs("auto", last), "auto.overhead": growth.overhead}
+    metrics["auto.overhead_judged"] = growth.overhead_judged
     metrics |= {f"auto.{name}": getattr(growth, name) for name in ("seconds", "evaluations", "flops")}
     if last.error is not None:
         target = last.mean + last.error.standard_error
@@ -169,8 +172,10 @@ def told(choice: Choice, growth: Growth) -> str:
     chosen, best = choice.chosen, choice.best
     rules = {"within one standard error of the best": choice.within, "under half a pixel": choice.enough}
     why = " and ".join(rule for rule, holds in rules.items() if holds)
+    short = "; no rung is under half a pixel: longer fits or more rungs may be" if best.mean > growth.footprint else ""
+    noise = best.error.standard_error
     return (
-        f"needs {chosen.rung}, {chosen.parameters} numbers: its held-out error {chosen.mean:.4f} is {why} "
-        f"({best.rung}, {best.mean:.4f} +- {best.error.standard_error:.4f}); field=auto ends on "
-        f"{growth.fitted.evidence.rung}, {growth.fitted.evidence.mean:.4f}"
+        f"needs {chosen.rung}, {chosen.parameters} numbers: its held-out error (x1000) {1000 * chosen.mean:.3g} is "
+        f"{why} ({best.rung}, {1000 * best.mean:.3g} +- {1000 * noise:.2g}){short}; field=auto ends on "
+        f"{growth.fitted.evidence.rung}, {1000 * growth.fitted.evidence.mean:.3g}"
     )

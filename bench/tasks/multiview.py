@@ -117,7 +117,13 @@ class Multiview:
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[Observations, Given]:
-        """What a field without a prior is fitted to; some photographs are held out."""
+        """What a field without a prior is fitted to; some photographs are held out.
+
+        Raises:
+            ValueError: for settings of a prior's code, and for too few photographs.
+        """
+        if self.scale != 1 or self.degrees or self.shift or self.starts > 1:
+            raise ValueError("task.scale, degrees, shift and starts are those of a prior's shape: set field=prior")
         own = scene.seed(seed)
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=own)
         given = GivenPhotographs(self, renderer, photographs, device)

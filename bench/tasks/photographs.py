@@ -173,7 +173,9 @@ class PhotographObservations:
     @property
     def rays(self) -> int:
         """Of both views of each pair."""
-        return 2 * self.given.per_step * self.given.colours.shape[1] * self.given.colours.shape[2]
+        return (
+            2 * min(self.given.per_step, len(self.fitted)) * self.given.colours.shape[1] * self.given.colours.shape[2]
+        )
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -194,12 +196,14 @@ class PhotographObservations:
 
     @torch.no_grad()
     def error(self, field: Field) -> HeldOutError:
-        """The mean difference of colours over held-out pairs; 1, the largest, where a pair shows nothing in common."""
-        rows = []
-        for pair in self.held_out:
-            (found,) = self.given.differences(field, self.renderer, [pair], self.given.colours)
-            rows.append([float(found.sum()), len(found), 0, len(found)] if len(found) else [0, 0, 1, 1])
-        return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
+        """Of the pairs that are held out."""
+        return photographic_error(self.given.differences(field, self.renderer, self.held_out, self.given.colours))
+
+
+def photographic_error(differences: list[Float[Tensor, "_"]]) -> HeldOutError:
+    """The mean over pairs of the mean difference of colours; 1, the largest, where two photographs share no point."""
+    rows = [[float(found.mean()), 1, 0, 1] if len(found) else [0, 0, 1, 1] for found in differences]
+    return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
 
 
 def neighbours(count: int, apart: int) -> list[tuple[int, int]]:
@@ -216,7 +220,7 @@ def spaced(pairs: list[tuple[int, int]], most: int, iteration: int) -> list[tupl
 def split_pairs(count: int, *, neighbour: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Pairs of neighbouring views that a field is fitted to, and pairs that judge it; no view is in both."""
     pairs = neighbours(count, neighbour)
-    held_out = pairs[::HELD_OUT_EVERY]
+    held_out = [pair for pair in pairs[::HELD_OUT_EVERY] if max(pair) < count - 1 or min(pair) > 0]
     hidden = {view for pair in held_out for view in pair}
     return [pair for pair in pairs if not hidden & set(pair)], held_out
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
-LEAST_SHARE = 1e-6  # of the larger part of a norm: what is less than that changes no float32 value
+LEAST_SHARE = 1e-6  # of the larger part of a norm: what is less counts as that, an error of a millionth at most
 
 
 @dataclass(frozen=True)
