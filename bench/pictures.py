@@ -42,18 +42,20 @@ class Given:
         view: the scene's.
         observed: its pixels whose depth was given.
         photographs: all of them, or None.
+        mask: whether the silhouette was given, too.
     """
 
     view: View
     observed: Bool[np.ndarray, "height width"]
     photographs: Float[np.ndarray, "views height width 3"] | None = None
+    mask: bool = True
 
     @property
     def told(self) -> str:
         """What it was, in words."""
         if self.photographs is not None:
             return f"{len(self.photographs)} photographs"
-        return f"mask and {int(self.observed.sum())} depths"
+        return f"{'mask and ' if self.mask else ''}{int(self.observed.sum())} depths"
 
 
 def draw_all(

@@ -87,7 +87,7 @@ class Completion:
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         split = Holdout(HELD_OUT, (), half_pixel, seed)
         held = hold_out(together([view]), tile.flatten(), split, rays=observed.numel())
-        return held, Given(scene.view, observed.numpy())
+        return held, Given(scene.view, observed.numpy(), mask=view.mask is not None)
 
     def _given(
         self, view: View, renderer: Renderer, *, seed: int, device: torch.device
