@@ -33,21 +33,21 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     register()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
     begun: list[DictConfig] = []
-    unwritable: list[OSError] = []
+    raised: list[OSError | ValueError] = []
 
     def guarded(config: DictConfig) -> None:
         begun.append(config)
         try:
             job(config)
-        except OSError as error:  # Hydra would print a line of its own about it
-            unwritable.append(error)
+        except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
+            raised.append(error)
 
     signal.signal(signal.SIGTERM, _stop)  # as Ctrl-C: the record says what happened
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         _call(program)
-        if unwritable:
-            raise unwritable[0]
+        if raised:
+            raise raised[0]
     except KeyboardInterrupt as error:
         return _tell(str(error) or "stopped by Ctrl-C", INTERRUPTED)
     except OverrideParseException as error:

@@ -53,7 +53,14 @@ class Identity:
 
 
 def identify(config: DictConfig, choices: DictConfig) -> Identity:
-    """The identity of a configuration; `choices` are those of `hydra.runtime`."""
+    """The identity of a configuration; `choices` are those of `hydra.runtime`.
+
+    Raises:
+        ValueError: where the command line takes a part out that every run has.
+    """
+    for part in ("task", "renderer", "dataset"):
+        if part not in choices:
+            raise ValueError(f"every run has a {part}: leave ~{part} out")
     # As far as it can be resolved: a value that is missing is an error of the run, not of its record.
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     seen = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
