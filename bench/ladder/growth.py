@@ -11,7 +11,7 @@ from renderers.field import Field
 
 OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
 LEAST_TRIAL = 8  # iterations, where a quarter of the fit is more than that
-WARM = 1 / 12  # of an iteration's time: one of a warm start (measured: 1.5 ms of 16)
+WARM, STEP, RAY = 1.8, 9.0, 0.0055  # milliseconds, measured on a core: an iteration of a warm start, of a fit, its rays
 
 
 @dataclass
@@ -118,8 +118,8 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
 def cost(rung: Rung, iterations: int, fitter: Fitter) -> float:
     """About what a warm start and so many iterations cost, in iterations of a field that costs nothing to ask."""
     starts = 1 + (rung.tries / SCREENING if rung.tries > 1 else 0)
-    warm = fitter.settings.warm_iterations * starts
-    return (iterations + WARM * warm) * (1 + rung.flops / OVERHEAD)
+    warm = WARM / (STEP + RAY * fitter.observations.rays) * fitter.settings.warm_iterations * starts
+    return (iterations + warm) * (1 + rung.flops / OVERHEAD)
 
 
 def _is_better(new: Fitted, old: Fitted) -> bool:

@@ -19,7 +19,7 @@ START_RADIUS = 0.5  # of the ball that a network begins near, in scene units
 REACH = 1.05  # of the sampled cube: the unit sphere and a little more
 BAND = 2.0  # cells to both sides of the surface whose samples are free
 MOST_SAMPLES = 256  # along an axis: 64 MiB of values
-GRID_RATE = 1e-3  # scene units
+GRID_RATE = 2e-3  # scene units
 
 
 @dataclass(frozen=True)
