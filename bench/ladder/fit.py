@@ -73,7 +73,9 @@ class Fitter:
             ball = self.begin(OnePart("sphere"), None, look=False)
             previous = ball.model
         seen = Seen(self.observations.points.cpu(), previous, self.seed, self.device)
-        starts = [self._start(rung, model, previous) for model in rung.starts(seen)]
+        target = previous.frozen() if rung.follows and previous is not None else None
+        free = self.observations.free(self.seed)
+        starts = [(self._taken(rung, model), self._start(model, free, target)) for model in rung.starts(seen)]
         screened = self.settings.warm_iterations // SCREENING if len(starts) > 1 else 0
         for fitted, start in starts:
             self._warm(fitted, start, screened)
@@ -91,16 +93,17 @@ class Fitter:
         fitted.evidence.wall += time.perf_counter() - clock
         return fitted
 
-    def _start(self, rung: Rung, model: Model, previous: Model | None) -> tuple[Fitted, WarmStart]:
-        """A model that the renderer takes, and how it starts."""
+    def _start(self, model: Model, free: Float[Tensor, "n 3"], target: Field | None) -> WarmStart:
+        return WarmStart(model, self.observations.points, free, target, self.settings.warm_points, self.seed)
+
+    def _taken(self, rung: Rung, model: Model) -> Fitted:
+        """A rung's model; it has failed where the renderer does not take it."""
         fitted = Fitted(model, Evidence(rung.name, model.size, model.bytes, rung.flops))
         try:
             check_kind(self.observations.renderer, model.frozen())
         except Unsupported as error:
             fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
-        target = previous.frozen() if rung.follows and previous is not None else None
-        surface, free = self.observations.points, self.observations.free(self.seed)
-        return fitted, WarmStart(model, surface, free, target, self.settings.warm_points, self.seed)
+        return fitted
 
     def _warm(self, fitted: Fitted, start: WarmStart, iterations: int) -> None:
         if iterations and not fitted.failed:
@@ -123,11 +126,11 @@ class Fitter:
     ) -> int:
         """Runs the one loop, adds what it cost to the evidence, and gives how many iterations it came to."""
         course, evidence = Course(), fitted.evidence
-        before = {name: getattr(evidence, name) for name in SPENT}
+        before, shape = {name: getattr(evidence, name) for name in SPENT}, fitted.model.field()
 
         def on_step(line: dict[str, Any]) -> None:
             spent = {"evaluations": course.counts.value, "gradients": course.counts.gradient}
-            spent |= {"seconds": line["seconds"], "flops": course.counts.flops(fitted.model.field()) or 0}
+            spent |= {"seconds": line["seconds"], "flops": course.counts.flops(shape) or 0}
             for name, amount in spent.items():
                 setattr(evidence, name, before[name] + amount)
             step = line["iteration"] + 1

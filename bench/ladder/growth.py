@@ -52,27 +52,30 @@ class Growth:
     @property
     def overhead_judged(self) -> float:
         """The same of all that was done: with looks at held-out rays, and with what it takes to begin."""
-        return sum(evidence.wall for evidence in self.tried) / max(self.fitted.evidence.wall, 1e-9)
+        return self._total("wall") / max(self.fitted.evidence.wall, 1e-9)
 
     @property
     def seconds(self) -> float:
         """Of all fits together, without looks."""
-        return sum(evidence.seconds for evidence in self.tried)
+        return self._total("seconds")
 
     @property
     def evaluations(self) -> int:
         """Field values of all fits together."""
-        return sum(evidence.evaluations for evidence in self.tried)
+        return int(self._total("evaluations"))
 
     @property
     def gradients(self) -> int:
         """Gradient evaluations of all fits together."""
-        return sum(evidence.gradients for evidence in self.tried)
+        return int(self._total("gradients"))
 
     @property
     def flops(self) -> int:
         """Of all fits together."""
-        return sum(evidence.flops for evidence in self.tried)
+        return int(self._total("flops"))
+
+    def _total(self, name: str) -> float:
+        return sum(getattr(evidence, name) for evidence in self.tried)
 
 
 def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:

@@ -85,7 +85,7 @@ class RayObservations:
         """Half a pixel, in scene units (DIST, Eq. 10)."""
         return self.held_out.footprint
 
-    @property
+    @cached_property
     def points(self) -> Float[Tensor, "n 3"]:
         """Of the surface, at the pixels whose depth is given."""
         observed = self.given.observed
@@ -113,7 +113,7 @@ class RayObservations:
         drawn = torch.randint(len(self.through_sphere), (count,), generator=generator(self.seed, iteration))
         some = self.given.some(self.through_sphere[drawn.to(self.through_sphere.device)])
         with torch.random.fork_rng():  # a renderer's own draws are the same for every rung, too
-            torch.manual_seed(self.seed * 1_000_003 + iteration)
+            torch.manual_seed(generator(self.seed, iteration).initial_seed())
             return some.compare(field, iteration)
 
     def error(self, field: Field) -> HeldOutError:

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from bench.ladder.choice import Choice, Evidence, choose, is_as_good
+from bench.ladder.choice import Choice, Evidence, is_as_good
 from bench.ladder.fit import Fitted, Fitter
-from bench.ladder.growth import Growth, grow
 from bench.ladder.held_out import HeldOutError
 from bench.ladder.model import Rung
 from bench.ladder.observations import RayObservations
-from bench.ladder.settings import GrowthSettings
 from bench.ladder.views import Views
 from renderers.checks import check_at_least
 from renderers.field import Counts, Meter
@@ -65,14 +63,6 @@ class Study:
             self.fits.append(self._fitted(fitter, rung, self._best(self.fits)))
             self.on_rung(self.fits[-1], len(rungs))
         return [fitted.evidence for fitted in self.fits]
-
-    def grow(self, rungs: list[Rung], settings: GrowthSettings) -> Growth:
-        """What early growth alone would end on."""
-        return grow(self.fitter, rungs, settings)
-
-    def choose(self) -> Choice:
-        """The rung that the shape needs."""
-        return choose([fitted.evidence for fitted in self.fits], self.observations.footprint)
 
     def of(self, evidence: Evidence) -> Fitted:
         """The fit that an evidence is of."""

@@ -6,9 +6,9 @@ from typing import Any
 
 from bench.film import Film
 from bench.judge import judge
-from bench.ladder.choice import Choice, Evidence
+from bench.ladder.choice import Choice, Evidence, choose
 from bench.ladder.fit import Fitted, Fitter
-from bench.ladder.growth import Growth
+from bench.ladder.growth import Growth, grow
 from bench.ladder.model import FLOAT
 from bench.ladder.picture import draw_ladder
 from bench.ladder.rungs import PAPERS, rung
@@ -92,10 +92,10 @@ class Capacity:
 
             fitter = Fitter(observations, ladder.fit, stage.seed, stage.device, on_line)
             study = Study(observations, fitter, stage.frugal, self.frugal_rays, on_rung)
-            growth = study.grow(ladder.all(), ladder.growth)
+            growth = grow(fitter, ladder.all(), ladder.growth)
             evidence = study.climb(ladder.all())
             self._note_costs(cell, study, [*growth.tried, *evidence])
-            choice = study.choose()
+            choice = choose(evidence, views.footprint)
             chosen = study.of(choice.chosen)
             metrics = needs(choice, evidence, growth) | study.check(choice, views, self.checks)
             metrics |= costs("frugal", study.refit(rung(choice.chosen.rung))) | study.precision(chosen)
