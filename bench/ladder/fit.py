@@ -26,7 +26,7 @@ from renderers.field import Counts, Field, Meter
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # of an evidence
 NEAR_ENOUGH = 0.1  # loss: a warm start may begin below it, and then that is what divergence is measured from
-SCREENING = 4  # of several starts each has one of so many parts of a warm start, then the best a whole one
+SCREENING = 8  # of several starts each has one of so many parts of a warm start, then the best a whole one
 EIKONAL_SEED = 7  # of the points; those of iterations differ
 LOOKS = {4**power for power in range(1, 12)}  # iterations
 PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids

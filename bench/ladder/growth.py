@@ -4,14 +4,17 @@ from dataclasses import dataclass
 from math import ceil
 
 from bench.ladder.choice import Evidence
-from bench.ladder.fit import SCREENING, Fitted, Fitter
+from bench.ladder.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.ladder.model import Rung
 from bench.ladder.settings import GrowthSettings
 from renderers.field import Field
 
-OVERHEAD = 30_000  # FLOPs: what a query costs besides its field's own (measured on two cores: 0.6 us at 50 GFLOP/s)
 LEAST_TRIAL = 8  # iterations, where a quarter of the fit is more than that
-WARM, STEP, RAY = 1.8, 9.0, 0.0055  # milliseconds, measured on a core: an iteration of a warm start, of a fit, its rays
+# What `cost` counts by, in milliseconds of a core: measured on nine rungs at 256, 1,024 and 4,096 rays, within a third
+WARM, FIT = 1.0, 11.0  # an iteration of a warm start and of a fit, whatever it asks of the field
+FLOP = 2e-8
+OVERHEAD = 12_000  # FLOPs: what asking for a value costs besides the field's own
+PER_RAY, PER_POINT, PER_WARM_POINT = 6.6, 6, 2  # values' worth that are asked, the way back with them
 
 
 @dataclass
@@ -119,10 +122,11 @@ def grow(fitter: Fitter, rungs: list[Rung], settings: GrowthSettings) -> Growth:
 
 
 def cost(rung: Rung, iterations: int, fitter: Fitter) -> float:
-    """About what a warm start and so many iterations cost, in iterations of a field that costs nothing to ask."""
-    starts = 1 + (rung.tries / SCREENING if rung.tries > 1 else 0)
-    warm = WARM / (STEP + RAY * fitter.observations.rays) * fitter.settings.warm_iterations * starts
-    return (iterations + warm) * (1 + rung.flops / OVERHEAD)
+    """About what a warm start and so many iterations cost, in milliseconds; no clock is asked."""
+    settings, starts = fitter.settings, 1 + (rung.tries / SCREENING if rung.tries > 1 else 0)
+    asked = PER_RAY * fitter.observations.rays + PER_POINT * EIKONAL_POINTS
+    warm = WARM + PER_WARM_POINT * settings.warm_points * rung.flops * FLOP
+    return iterations * (FIT + asked * (rung.flops + OVERHEAD) * FLOP) + settings.warm_iterations * starts * warm
 
 
 def _is_better(new: Fitted, old: Fitted) -> bool:
