@@ -57,10 +57,23 @@ def half_pixel(focal_length: float, depth: float) -> float:
 
 
 def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
-    """What a ray needs from a unit away to a surface at the grazing angle (DIST, Eq. 8)."""
-    alpha = float(renderer.get("alpha", 1.0))
-    shrinks = abs(1 - alpha * sin(radians(settings.grazing)))
-    return ceil(log(float(renderer.epsilon) / RADIUS) / log(shrinks))
+    """What a ray needs from a unit away to a surface at the grazing angle or any above it (DIST, Eq. 8).
+
+    A step leaves |1 - alpha sin(theta)| of the way, which for alpha > 1 grows again towards the head-on ray.
+
+    Raises:
+        ValueError: where there is no epsilon to reach, or no number of steps reaches it.
+    """
+    if "epsilon" not in renderer:
+        raise ValueError(
+            "renderer.steps=auto is what reaches renderer.epsilon, which this renderer has not: give a number"
+        )
+    alpha, epsilon = float(renderer.get("alpha", 1.0)), float(renderer.epsilon)
+    check_positive("renderer.epsilon", epsilon, "renderer.epsilon=auto is half a pixel")
+    left = max(abs(1 - alpha * sin(radians(settings.grazing))), alpha - 1)
+    if left >= 1:
+        raise ValueError(f"renderer.alpha must lie between 0 and 2, not {alpha:g}: steps of others do not converge")
+    return max(ceil(log(epsilon / RADIUS) / log(left)), 1) if left > 0 else 1
 
 
 def samples(thinnest: float, radius: float) -> int:
@@ -127,5 +140,6 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
 
 
 def frugal(renderer: DictConfig) -> DictConfig:
-    """The renderer's node with `auto` for all that it has of `OF_A_PIXEL`."""
-    return cast(DictConfig, OmegaConf.merge(renderer, {name: AUTO for name in OF_A_PIXEL if name in renderer}))
+    """The renderer's node with `auto` for all that it has of `OF_A_PIXEL`; as it is where it has no epsilon."""
+    names = [name for name in OF_A_PIXEL if name in renderer and "epsilon" in renderer]
+    return cast(DictConfig, OmegaConf.merge(renderer, dict.fromkeys(names, AUTO)))

@@ -17,7 +17,7 @@ from bench.ladder.settings import PRIOR, LadderSettings
 from bench.prior_store import prior_for
 from bench.progress import Report
 from bench.records import Record
-from bench.thickness import Following, follow
+from bench.thickness import ending, follow
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
@@ -38,7 +38,7 @@ class Stage:
     device: torch.device
     cache: Path  # where what is slow to make is kept
     notes: tuple[str, ...] = ()  # what settings came to that follow from others
-    make_frugal: Callable[[], Renderer] | None = None
+    make_frugal: Callable[[], tuple[Renderer, list[str]]] | None = None
     ladder: LadderSettings | None = None  # the fields to choose from, where none is a prior's
     field: str = PRIOR  # what a shape that is looked for is made of
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
@@ -49,15 +49,15 @@ class Stage:
         return self.make_scene()
 
     @cached_property
-    def frugal(self) -> Renderer:
-        """The renderer with no more precision than a pixel, and no more steps than that takes."""
-        return self.renderer if self.make_frugal is None else self.make_frugal()
+    def frugal(self) -> tuple[Renderer, list[str]]:
+        """The renderer with no more precision than a pixel, and no more steps than that takes; these, in words."""
+        return (self.renderer, []) if self.make_frugal is None else self.make_frugal()
 
     @property
     def last_notes(self) -> list[str]:
         """What is known at the end: repairs of the scene's mesh, if it was made, and what settings came to."""
         repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
-        return [*repairs, *([self.renderer.ending()] if isinstance(self.renderer, Following) else [])]
+        return [*repairs, *ending(self.renderer)]
 
     @cached_property
     def prior(self) -> Prior:
@@ -117,7 +117,7 @@ def set_up(config: DictConfig, progress: Report) -> Stage:
         renderer=renderer,
         views=views,
         scene_name=scene_name(dataset, Split(config.split), config.index),
-        make_frugal=lambda: _renderer(config, frugal(config.renderer), views)[0],
+        make_frugal=lambda: _renderer(config, frugal(config.renderer), views),
         make_scene=shape_and_view,
         make_prior=make_prior,
         evaluation=evaluation,

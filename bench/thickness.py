@@ -80,11 +80,9 @@ class Following:
         """That of the inner renderer."""
         return self.current().silhouette_loss(field, rays, rendering, mask)
 
-    def ending(self) -> str:
-        """What the setting has come to, in words."""
-        if self.seen.thinnest == inf:
-            return f"renderer.samples=auto stayed at {self.samples}: no optimisation saw how thick the shape is"
-        return f"renderer.samples=auto came to {self.samples}, for a part {self.seen.thinnest:.3g} scene units thick"
+    def finest(self) -> Spaced:
+        """The inner renderer with as many samples as there may be."""
+        return self.inner.with_samples(MOST)
 
 
 def follow(renderer: Renderer) -> Following:
@@ -99,6 +97,24 @@ def follow(renderer: Renderer) -> Following:
         f"renderer.samples=auto is for samples spaced along the ray (DVR, Eq. 9), which {type(renderer).__name__} has "
         "not, whatever it calls samples: give a number"
     )
+
+
+def own(renderer: Renderer) -> Renderer:
+    """The renderer for one of several optimisations: with what is seen in that one, where it follows a shape."""
+    return replace(renderer, seen=Seen()) if isinstance(renderer, Following) else renderer
+
+
+def finest(renderer: Renderer) -> Renderer:
+    """The renderer for judging fields by the same measure, whatever was seen of each."""
+    return renderer.finest() if isinstance(renderer, Following) else renderer
+
+
+def ending(renderer: Renderer) -> list[str]:
+    """What `renderer.samples=auto` has come to, in words; nothing before a shape was seen, and for other renderers."""
+    if not isinstance(renderer, Following) or renderer.seen.thinnest == inf:
+        return []
+    part = f"a part {renderer.seen.thinnest:.3g} scene units thick"
+    return [f"renderer.samples=auto came to {renderer.samples}, for {part}"]
 
 
 def thinnest(field: Field, rendering: Rendering, *, radius: float) -> float:

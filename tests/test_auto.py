@@ -29,6 +29,22 @@ def test_steps_are_those_of_the_papers_example():
     assert steps(VIEW, OmegaConf.create({"epsilon": 5e-5, "alpha": 1.5}), TEN) == 33
 
 
+@pytest.mark.parametrize(
+    ("alpha", "grazing", "expected"),
+    [(1.5, 30.0, 15), (1.5, 41.81, 15), (1.0, 90.0, 1), (1.0, 30.0, 15), (0.5, 90.0, 15), (1.0, 89.9, 1)],
+)
+def test_steps_reach_every_surface_that_is_met_at_the_angle_or_above(alpha, grazing, expected):
+    node = OmegaConf.create({"epsilon": 5e-5, "alpha": alpha})
+    assert steps(VIEW, node, AutoSettings(grazing)) == expected
+
+
+def test_steps_that_nothing_follows_from_are_told():
+    with pytest.raises(ValueError, match=r"alpha must lie between 0 and 2, not 2"):
+        steps(VIEW, OmegaConf.create({"epsilon": 5e-5, "alpha": 2.0}), TEN)
+    with pytest.raises(ValueError, match=r"which this renderer has not: give a number"):
+        steps(VIEW, OmegaConf.create({"steps": "auto"}), TEN)
+
+
 def test_both_follow_each_other_and_are_told():
     node, notes = resolved(OmegaConf.create({"epsilon": "auto", "steps": "auto", "alpha": 1.5}), VIEW, TEN)
     assert node.epsilon == pytest.approx(1.5 / (2 * 137.25), rel=1e-3)

@@ -38,7 +38,13 @@ def climbed(
     known |= {"recommended_field": needs, "recommended_parameters": SIZES[needs], "best_field": best}
     known |= {"recommended_error": known[f"{needs}.error"], "saved_parameters": PAPERS / SIZES[needs]}
     known |= {"auto.field": needs, "auto.parameters": SIZES[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
-    known |= {"auto.seconds": 4.0, "auto.evaluations": 500, "auto.flops": 100_000, "auto.overhead": 1.5}
+    known |= {
+        "auto.seconds": 4.0,
+        "auto.evaluations": 500,
+        "auto.flops": 100_000,
+        "auto.overhead": 1.5,
+        "auto.overhead_judged": 2.5,
+    }
     known |= {"frugal.parameters": SIZES[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
     known |= {"frugal.seconds": 1.0, "precision.evaluations": 1000, "precision.evaluations_auto": 400}
     known |= {"precision.hits": 100, "precision.lost": 1, "precision.gained": 7} | metrics
@@ -212,8 +218,8 @@ def test_what_frugality_saves_stands_beside_what_it_costs(four):
     assert told["Error in half pixels: plain, frugal"] == "0.500, 1.50"
     assert told["Precision: evaluations saved"] == "60 %"
     assert list(told[["Hits lost", "Hits gained", "Hits"]]) == ["1", "7", "100"]
-    assert told["Overhead"] == "1.50"
-    assert "The overhead is at most 2 on 3 of 3 scenes." in made_of(four, parsimony_auto.make).caption
+    assert (told["Overhead"], told["Overhead, judged"]) == ("1.50", "2.50")
+    assert "The overhead is at most 2 on 3 of 3 scenes; judged, on 0." in made_of(four, parsimony_auto.make).caption
 
 
 def test_a_frugal_fit_that_failed_has_no_ratio(tmp_path):
@@ -224,7 +230,7 @@ def test_a_frugal_fit_that_failed_has_no_ratio(tmp_path):
     assert made.table["Error in half pixels: plain, frugal"].item() == "0.900, nan"
     assert made.notes == ["car, the frugal fit: nan: why"]
     assert [text.get_text() for text in made.figure.axes[1].texts] == ["frugal fit failed: nan"]
-    assert "The overhead is at most 2 on 0 of 1 scenes." in made.caption
+    assert "The overhead is at most 2 on 0 of 1 scenes; judged, on 0." in made.caption
 
 
 def test_scenes_that_differ_in_their_shape_have_it_in_their_names(tmp_path):

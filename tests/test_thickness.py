@@ -11,7 +11,7 @@ from bench.config import load
 from bench.execute import execute
 from bench.records import Record
 from bench.stage import set_up
-from bench.thickness import Following, Seen, follow, thickness, thinnest
+from bench.thickness import Following, Seen, ending, finest, follow, own, thickness, thinnest
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Renderer, Scheduled, at_iteration
@@ -168,5 +168,14 @@ def test_a_run_tells_how_it_began_and_what_it_came_to(compose_config, tmp_path):
     assert last.startswith("renderer.samples=auto came to 16, for a part 1.") and last.endswith(" scene units thick")
 
 
-def test_a_run_without_renderings_says_so():
-    assert follow(DVR).ending() == "renderer.samples=auto stayed at 16: no optimisation saw how thick the shape is"
+def test_each_of_several_fits_has_what_it_has_seen_itself_and_all_are_judged_alike():
+    shared = follow(DVR)
+    assert ending(shared) == ending(DVR) == []
+    plate, ball = own(shared), own(shared)
+    for renderer, shape in ((plate, PLATE), (ball, sphere(0.6)), (plate, PLATE)):
+        at_iteration(renderer, 0).render(shape, RAYS)
+    assert [renderer.samples for renderer in (shared, plate, ball)] == [16, 81, 16]
+    assert ending(plate) == ["renderer.samples=auto came to 81, for a part 0.05 scene units thick"]
+    for renderer in (shared, plate, ball):
+        assert torch.equal(finest(renderer).render(PLATE, RAYS).hit, hits_of(PLATE, RAYS, 128).hit)
+    assert finest(DVR) is own(DVR) is DVR

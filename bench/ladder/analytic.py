@@ -6,7 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float
+from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from bench.ladder.model import Model, Seen
@@ -18,7 +20,7 @@ from renderers.fields.analytic import box as exact_box
 
 LEARNING_RATE = 0.01  # scene units, radians or a share of a size: what a step of Adam may change
 LEAST = 0.01  # scene units: half size of a part at its start
-AROUND = 3000  # points that parts are found among
+AROUND, OF_CLUSTER = 3000, 200  # points that parts are found among, and the box of one cluster about, at most
 CORNER = 0.3  # scene units: of a cube that stands for points where none are known
 STARTS = 6  # clusterings
 WORST = 0.75  # share of the points that a smaller union shows better than those where new parts begin
@@ -101,7 +103,7 @@ class OnePart:
     def starts(self, seen: Seen) -> list[Model]:
         """The ball about the points' middle, or the part in their oriented box."""
         part = PARTS[self.name]
-        around = _or_unit(seen.points)
+        around = _thinned(seen.points)
         if self.name == "sphere":
             middle = (around.amax(0) + around.amin(0)) / 2
             radius = torch.linalg.vector_norm(around - middle, dim=-1).mean()
@@ -141,7 +143,7 @@ class UnionOf:
         if not len(seen.points):
             choices = [[*kept, *_anywhere(self.count - len(kept), seen.seed)]]
         else:
-            points = _or_unit(seen.points)
+            points = _thinned(seen.points)
             choices = [_clustered(points, self.count, seen.seed + start) for start in range(STARTS)]
             if kept:
                 error = seen.ask(points).abs()
@@ -170,7 +172,7 @@ def _turn(numbers: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
     return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
 
 
-def _or_unit(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
+def _thinned(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
     """The points, some of many; the corners of a cube in the middle of the scene where there are too few for a box."""
     if len(points) < 4:
         return CORNER * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -180,8 +182,6 @@ def _or_unit(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
 
 def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
     """Placing and logarithmic half sizes of the smallest box about the points."""
-    import trimesh
-
     to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + _jitter(len(points)))
     place = np.linalg.inv(to_box)
     angle, axis, _ = trimesh.transformations.rotation_from_matrix(place)
@@ -196,8 +196,6 @@ def _jitter(count: int) -> Float[np.ndarray, "n 3"]:
 
 def _clustered(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Float[Tensor, "10"]]:
     """A rounded box about each of so many clusters of the points (k-means)."""
-    from scipy.cluster.vq import kmeans2
-
     _, labels = kmeans2(points.numpy().astype(np.float64), count, minit="++", rng=np.random.default_rng(seed))
     clusters = [points[torch.from_numpy(labels == label)] for label in range(count)]
     return [torch.cat([_around(cluster, points), torch.tensor([EDGED])]) for cluster in clusters]
@@ -206,7 +204,7 @@ def _clustered(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Floa
 def _around(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, "9"]:
     """The smallest box about a cluster; a small one in its middle where it has too few points for a box."""
     if len(cluster) >= 4:
-        return _fitting_box(cluster)
+        return _fitting_box(cluster[:: -(-len(cluster) // OF_CLUSTER)])
     middle = cluster.mean(0) if len(cluster) else points.mean(0)
     return torch.cat([middle, torch.zeros(3), torch.full((3,), LEAST).log()])
 

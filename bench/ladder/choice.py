@@ -67,7 +67,9 @@ def choose(evidence: list[Evidence], footprint: float) -> Choice:
     """
     known = [rung for rung in evidence if rung.error is not None]
     if not known:
-        raise ValueError(f"all fits failed; the last: {evidence[-1].reason}")
+        raise ValueError(
+            f"all fits failed; the last: {evidence[-1].reason}; other ladder.rungs or another renderer may do"
+        )
     best = min(known, key=lambda rung: rung.mean)
     fit = [rung for rung in known if is_as_good(rung.error, best.error) or rung.mean <= footprint]
     chosen = min(fit, key=lambda rung: (rung.parameters, rung.mean))

@@ -13,6 +13,7 @@ from torch import Tensor
 from bench.auto import rays_share
 from bench.ladder.analytic import OnePart
 from bench.ladder.choice import Evidence
+from bench.ladder.held_out import HeldOutError
 from bench.ladder.model import Model, Rung, Seen
 from bench.ladder.observations import Observations, generator
 from bench.ladder.settings import FitSettings
@@ -21,7 +22,9 @@ from bench.optimise import Course, optimise
 from bench.records import RunStatus
 from bench.tasks.code import Terms
 from bench.tasks.problem import NotReached, OptimiserSettings, Unsupported, check_kind
+from bench.thickness import own
 from renderers.field import Counts, Field, Meter
+from renderers.rendering import Renderer
 
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # of an evidence
@@ -32,12 +35,25 @@ LOOKS = {4**power for power in range(1, 12)}  # iterations
 PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids
 
 
-@dataclass
+@dataclass(eq=False)
 class Fitted:
-    """A rung under way."""
+    """A rung under way.
 
+    Args:
+        rung: what it is.
+        previous: the model that it began with, if any.
+        model: its field, as it stands.
+        renderer: through which it is fitted: its own, where that follows the shape.
+        evidence: what it has come to.
+        begun: its error before it was fitted, where that was looked at.
+    """
+
+    rung: Rung
+    previous: Model | None
     model: Model
+    renderer: Renderer
     evidence: Evidence
+    begun: HeldOutError | None = None
 
     @property
     def failed(self) -> bool:
@@ -68,14 +84,17 @@ class Fitter:
 
     def begin(self, rung: Rung, previous: Model | None, *, look: bool = True) -> Fitted:
         """A rung's model after its warm start, and judged if it is to be looked at."""
-        clock, ball = time.perf_counter(), None
+        clock, ball, points = time.perf_counter(), None, self.observations.points
         if previous is None and rung.follows:
             ball = self.begin(OnePart("sphere"), None, look=False)
             previous = ball.model
-        seen = Seen(self.observations.points.cpu(), previous, self.seed, self.device)
+        started = time.perf_counter()
+        seen = Seen(points.cpu(), previous, self.seed, self.device)
+        models = rung.starts(seen)
+        placing = time.perf_counter() - started
         target = previous.frozen() if rung.follows and previous is not None else None
-        free = self.observations.free(self.seed)
-        starts = [(self._taken(rung, model), self._start(model, free, target)) for model in rung.starts(seen)]
+        free = self.observations.free
+        starts = [(self._taken(rung, model, previous), self._start(model, free, target)) for model in models]
         screened = self.settings.warm_iterations // SCREENING if len(starts) > 1 else 0
         for fitted, start in starts:
             self._warm(fitted, start, screened)
@@ -84,21 +103,24 @@ class Fitter:
         spent = [other.evidence for other, _ in starts] + ([] if ball is None else [ball.evidence])
         for name in SPENT:
             setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in spent))
+        fitted.evidence.seconds += placing
         if previous is not None:
             asked = [seen.counts, *(start.asked for _, start in starts)]
             fitted.evidence.evaluations += sum(counts.value for counts in asked)
             fitted.evidence.flops += sum(counts.flops(previous.frozen()) or 0 for counts in asked)
         if look:
             self._judge(fitted)
+            fitted.begun = fitted.evidence.error
         fitted.evidence.wall += time.perf_counter() - clock
         return fitted
 
     def _start(self, model: Model, free: Float[Tensor, "n 3"], target: Field | None) -> WarmStart:
         return WarmStart(model, self.observations.points, free, target, self.settings.warm_points, self.seed)
 
-    def _taken(self, rung: Rung, model: Model) -> Fitted:
+    def _taken(self, rung: Rung, model: Model, previous: Model | None) -> Fitted:
         """A rung's model; it has failed where the renderer does not take it."""
-        fitted = Fitted(model, Evidence(rung.name, model.size, model.bytes, rung.flops))
+        evidence = Evidence(rung.name, model.size, model.bytes, rung.flops)
+        fitted = Fitted(rung, previous, model, own(self.observations.renderer), evidence)
         try:
             check_kind(self.observations.renderer, model.frozen())
         except Unsupported as error:
@@ -115,7 +137,8 @@ class Fitter:
         if fitted.failed or iterations < 1:
             return
         clock = time.perf_counter()
-        problem = RungProblem(fitted.model, self.observations, self.settings, fitted.evidence.iterations)
+        through = self.observations.through(fitted.renderer)
+        problem = RungProblem(fitted.model, through, self.settings, fitted.evidence.iterations)
         settings = OptimiserSettings(iterations, fitted.model.learning_rate, "ramped")
         fitted.evidence.iterations += self._run(fitted, problem, settings, looks=looks)
         self._judge(fitted)
@@ -136,12 +159,9 @@ class Fitter:
             step = line["iteration"] + 1
             if looks and course.status is RunStatus.OK and step in LOOKS and step < settings.iterations:
                 self._judge(fitted)
-            own = {
-                "part": self.part,
-                "phase": problem.phase,
-                "iteration": fitted.evidence.iterations + line["iteration"],
-            }
-            self.on_line(evidence.rung, {**line, **own})
+            where = {"part": self.part, "phase": problem.phase, "iteration": evidence.iterations + line["iteration"]}
+            share = {"rays_share": problem.share} if isinstance(problem, RungProblem) else {}
+            self.on_line(evidence.rung, {**line, **where, **share})
 
         try:
             optimise(problem, settings, self.device, course=course, on_step=on_step, least_reference=NEAR_ENOUGH)
@@ -170,7 +190,8 @@ class RungProblem:
     observations: Observations
     settings: FitSettings
     begun: int  # iterations that were before
-    error: float = inf  # at the last iteration, in scene units: the loss over its weight
+    share: float = 0.0  # of the rays, in an iteration
+    error: float = inf  # that was left at the one before, in scene units
     counts: Counts = field(default_factory=Counts)
     phase: ClassVar[str] = "fit"
 
@@ -181,13 +202,13 @@ class RungProblem:
 
     def loss(self, iteration: int) -> Terms:
         """The renderer's terms, that of the gradient's length, and their sum."""
-        counted, own, settings = Meter(self.model.field(), self.counts), self.begun + iteration, self.settings
+        counted, place, settings = Meter(self.model.field(), self.counts), self.begun + iteration, self.settings
         self.error = self.error if iteration else inf  # the first is run twice: once before the clock
-        share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
-        terms = self.observations.terms(counted, own, share)
-        self.error = float(sum(terms.values()).detach()) / self.observations.weight
+        self.share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
+        terms = self.observations.terms(counted, place, self.share)
+        self.error = self.observations.left(terms)
         if not self.model.metric and settings.eikonal_weight:
-            points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, own))
+            points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, place))
             terms["eikonal"] = settings.eikonal_weight * _slope_error(counted, points)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 

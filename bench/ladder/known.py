@@ -29,6 +29,8 @@ def grown_shape(cell: Cell, weights: Weights) -> Field:
     fitter = Fitter(views.observations(stage.seed), ladder.fit, stage.seed, stage.device, lambda name, line: None)
     growth = grow(fitter, ladder.asked(stage.field), ladder.growth)
     if growth.fitted.failed:
-        raise ValueError(f"no field was found for the known shape: {growth.fitted.evidence.reason}")
-    cell.record.notes = [*cell.record.notes, growth.told(stage.field)]
+        raise ValueError(
+            f"no field was found for the known shape: {growth.fitted.evidence.reason}; field=prior takes it whole"
+        )
+    cell.record.notes = [*cell.record.notes, *growth.told(stage.field)]
     return growth.fitted.model.frozen()

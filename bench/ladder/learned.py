@@ -1,6 +1,7 @@
 """Rungs without a formula: networks of one shape, and a grid whose samples near the surface are free."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -39,26 +40,26 @@ class Network:
     def name(self) -> str:
         return f"network_{self.layers}x{self.width}"
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Free numbers."""
-        return sum(parameter.numel() for parameter in self._decoder().parameters())
+        return sum(parameter.numel() for parameter in self._decoder(0).parameters())
 
-    @property
+    @cached_property
     def flops(self) -> int:
-        return self._bound(list(self._decoder().parameters())).flops.value
+        return self._bound(list(self._decoder(0).parameters())).flops.value
 
     def starts(self, seen: Seen) -> list[Model]:
         """Near a ball's distance; what was there before is taken over by the warm start."""
-        with torch.random.fork_rng():
-            torch.manual_seed(seen.seed)
-            decoder = self._decoder()
-            initialise_to_sphere(decoder, START_RADIUS)
+        decoder = self._decoder(seen.seed)
+        initialise_to_sphere(decoder, START_RADIUS)
         parameters = [parameter.detach().to(seen.device).requires_grad_() for parameter in decoder.parameters()]
         return [Model(self.name, parameters, self._bound, min(FASTEST, RATE_OF_WIDTH / self.width), metric=False)]
 
-    def _decoder(self) -> Decoder:
-        return Decoder(layers=self.layers, width=self.width, code_length=0, skip=self._skip, narrow=True)
+    def _decoder(self, seed: int) -> Decoder:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return Decoder(layers=self.layers, width=self.width, code_length=0, skip=self._skip, narrow=True)
 
     @property
     def _skip(self) -> int:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf
+from math import inf, nan
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from bench.ladder.held_out import HeldOut, HeldOutError
 from bench.tasks.code import Terms
 from bench.tasks.given import GivenView
+from bench.thickness import finest
 from renderers.camera import Rays, sphere_span
 from renderers.field import Field
 from renderers.rendering import Renderer
@@ -37,21 +38,25 @@ class Observations(Protocol):
         ...
 
     @property
-    def weight(self) -> float:
-        """What a scene unit of error weighs in the loss; infinite where errors have another unit."""
-        ...
-
-    @property
     def points(self) -> Float[Tensor, "n 3"]:
         """Of the surface, where they are known."""
         ...
 
-    def free(self, seed: int) -> Float[Tensor, "n 3"]:
+    @property
+    def free(self) -> Float[Tensor, "n 3"]:
         """Points that are known to lie outside."""
+        ...
+
+    def through(self, renderer: Renderer) -> "Observations":
+        """The same, compared through another renderer."""
         ...
 
     def terms(self, field: Field, iteration: int, share: float) -> Terms:
         """The weighted loss of an iteration, at some share of its rays."""
+        ...
+
+    def left(self, terms: Terms) -> float:
+        """The error that an iteration's terms show, in scene units; NaN where they have another unit."""
         ...
 
     def error(self, field: Field) -> HeldOutError:
@@ -92,11 +97,6 @@ class RayObservations:
         distance = self.given.depth[observed] / self.given.depth_of_distance[observed]
         return self.given.rays[observed].at(distance)
 
-    @property
-    def weight(self) -> float:
-        """That of the depth."""
-        return self.given.settings.depth_weight or inf
-
     @cached_property
     def through_sphere(self) -> Int[Tensor, " n"]:
         """The given rays that meet the unit sphere: the others say nothing of a shape in it."""
@@ -118,17 +118,23 @@ class RayObservations:
 
     def error(self, field: Field) -> HeldOutError:
         """Of the rays that are held out."""
-        return self.held_out.error(field, self.renderer)
+        return self.held_out.error(field, finest(self.renderer))
 
-    def free(self, seed: int) -> Float[Tensor, "n 3"]:
+    def left(self, terms: Terms) -> float:
+        """That of the depth alone: what a silhouette costs is a length for some renderers only."""
+        weight = self.given.settings.depth_weight
+        return (float(terms["depth"].detach()) / weight or inf) if weight else nan  # 0: nothing was hit
+
+    @cached_property
+    def free(self) -> Float[Tensor, "n 3"]:
         """Points that are known to lie outside: in front of what was seen, and where nothing was."""
         given = self.given
         entry, leave, meets = sphere_span(given.rays)
         seen_to = torch.where(given.observed, given.depth / given.depth_of_distance, leave)
         empty = given.observed if given.mask is None else given.observed | ~given.mask
         chosen = (meets & empty).nonzero().squeeze(-1)
-        generator = torch.Generator().manual_seed(seed)
-        share = torch.rand(FREE, len(chosen), generator=generator).to(entry.device)
+        draw = torch.Generator().manual_seed(self.seed)
+        share = torch.rand(FREE, len(chosen), generator=draw).to(entry.device)
         distance = entry[chosen] + share * (seen_to[chosen] - entry[chosen])
         return given.rays[chosen].at(distance).reshape(-1, 3)
 

@@ -53,7 +53,7 @@ class GrowthSettings:
     budget: float
 
     def __post_init__(self) -> None:
-        check_share("ladder.growth.trial", self.trial, "1/16 tells whether a rung is better than the one before")
+        check_share("ladder.growth.trial", self.trial, "1/40 tells whether a rung is better than the one before")
         check_at_least("ladder.growth.patience", self.patience, 1, "5 finds a grid behind small networks")
         check_at_least("ladder.growth.budget", self.budget, 1, "2 is twice the fit of the rung that it ends on")
 

@@ -82,12 +82,12 @@ def solve_by_growth(task: Grows, cell: Cell) -> None:
         fitter = Fitter(observations, settings, stage.seed, stage.device, on_line)
         growth = grow(fitter, rungs, stage.ladder.growth)
     clock = time.perf_counter()
-    _note_costs(cell, fitter, growth)
+    _note_costs(cell, fitter, growth, observed=int(given.observed.sum()))
     first, last = growth.first, growth.fitted.model.frozen()
     record.metrics_start, after = judge(first, stage).metrics, judge(last, stage)
     record.metrics = after.metrics | ended(growth)
-    record.status, record.reason = _verdict(growth, empty=after.mesh is None)
-    record.notes = [*record.notes, growth.told(stage.field)]
+    record.status, record.reason = verdict(growth, empty=after.mesh is None)
+    record.notes = [*record.notes, *growth.told(stage.field)]
     if after.mesh is not None:
         after.mesh.save(cell.folder / "mesh.ply")
     title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
@@ -107,7 +107,11 @@ def rendered(lines: list[dict[str, Any]], rung: str) -> list[dict[str, Any]]:
     for place, line in enumerate(fit):
         own = line["seconds"] - (fit[place - 1]["seconds"] if place else 0.0)
         clock += own if own > 0 else line["seconds"]
-        numbers = {name: value for name, value in line.items() if name not in ("part", "phase", "rung", "eikonal")}
+        numbers = {
+            name: value
+            for name, value in line.items()
+            if name not in ("part", "phase", "rung", "eikonal", "rays_share")
+        }
         told.append({**numbers, "iteration": place, "seconds": clock})
     return told
 
@@ -128,31 +132,34 @@ def ended(growth: Growth) -> dict[str, Any]:
     }
 
 
-def _verdict(growth: Growth, *, empty: bool) -> tuple[RunStatus, str]:
-    evidence, first = growth.fitted.evidence, growth.tried[0].looks[:1]
+def verdict(growth: Growth, *, empty: bool) -> tuple[RunStatus, str]:
+    """What became of a run: a rung that cannot come nearer than its start without a renderer has not failed."""
+    evidence, begun = growth.fitted.evidence, growth.begun
     if evidence.error is None:
         return evidence.status, evidence.reason
     if empty:
         return RunStatus.EMPTY, "the field has no surface in the unit sphere"
-    if evidence.mean > growth.footprint and first and evidence.mean >= first[0]["error"]:
-        ends = f"{first[0]['error']:.4g} at first, {evidence.mean:.4g} at last"
-        return RunStatus.NOT_REACHED, f"the held-out error did not fall: {ends}"
+    if begun is not None and evidence.mean > growth.footprint:
+        noise = evidence.error.noise_of_difference(begun)
+        if evidence.mean - begun.mean > noise:
+            ends = f"{begun.mean:.4g} before the first fit, {evidence.mean:.4g} at last"
+            return RunStatus.NOT_REACHED, f"the held-out error rose by more than its noise: {ends}"
     return RunStatus.OK, ""
 
 
-def _note_costs(cell: Cell, fitter: Fitter, growth: Growth) -> None:
+def _note_costs(cell: Cell, fitter: Fitter, growth: Growth, *, observed: int) -> None:
     record, iterations = cell.record, sum(evidence.iterations for evidence in growth.tried)
     rays = max(iterations * fitter.observations.rays, 1)
     record.seconds |= {"forward": 0.0, "backward": 0.0} | fitter.spent
-    record.flops = growth.flops
+    record.flops = int(growth.total("flops"))
     record.evaluations = {
-        "value": growth.evaluations,
-        "gradient": growth.gradients,
-        "per_ray": growth.evaluations / rays,
+        "value": int(growth.total("evaluations")),
+        "gradient": int(growth.total("gradients")),
+        "per_ray": growth.total("evaluations") / rays,
         "rays_per_iteration": fitter.observations.rays,
-        "observed": len(fitter.observations.points),
+        "observed": observed,
         "iterations": iterations,
     }
     seconds = record.seconds["forward"] + record.seconds["backward"]
     if seconds > 0:
-        record.gemm_fraction = growth.flops / seconds / record.environment["gemm_peak_flops"]
+        record.gemm_fraction = record.flops / seconds / record.environment["gemm_peak_flops"]

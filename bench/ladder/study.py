@@ -1,17 +1,18 @@
 """Fits a ladder of fields to one shape, and says which rung the shape needs, and what that saves."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
-from bench.ladder.choice import Choice, Evidence, is_as_good
+from bench.ladder.choice import Choice, Evidence, choose, is_as_good
 from bench.ladder.fit import Fitted, Fitter
 from bench.ladder.held_out import HeldOutError
 from bench.ladder.model import Rung
-from bench.ladder.observations import RayObservations
 from bench.ladder.views import Views
+from bench.thickness import finest
+from renderers.camera import Rays
 from renderers.checks import check_at_least
 from renderers.field import Counts, Meter
 from renderers.rendering import Renderer
@@ -42,62 +43,60 @@ class Study:
     """The fits of all rungs to the same observations.
 
     Args:
-        observations: through the renderer as it was asked for.
-        fitter: of these observations.
+        fitter: to rays, through the renderer as it was asked for.
         frugal: the same renderer, no more precise than a pixel.
         frugal_rays: share of the rays that the frugal fit begins with.
-        on_rung: is told of each rung that was fitted, and how many there are.
     """
 
-    observations: RayObservations
     fitter: Fitter
     frugal: Renderer
     frugal_rays: float
-    on_rung: Callable[[Fitted, int], None]
     fits: list[Fitted] = field(default_factory=list)
 
-    def climb(self, rungs: list[Rung]) -> list[Evidence]:
+    def climb(self, rungs: list[Rung]) -> Iterator[Fitted]:
         """Fits every rung, each begun with the best before it where that helps."""
         fitter = replace(self.fitter, part="climb")
         for rung in rungs:
-            self.fits.append(self._fitted(fitter, rung, self._best(self.fits)))
-            self.on_rung(self.fits[-1], len(rungs))
-        return [fitted.evidence for fitted in self.fits]
+            best = min(self._sound, key=lambda fitted: fitted.evidence.mean, default=None)
+            fitted = fitter.begin(rung, None if best is None else best.model)
+            fitter.fit(fitted, fitter.settings.iterations, looks=True)
+            self.fits.append(fitted)
+            yield fitted
 
-    def of(self, evidence: Evidence) -> Fitted:
-        """The fit that an evidence is of."""
-        return next(fitted for fitted in self.fits if fitted.evidence is evidence)
+    def choose(self) -> tuple[Choice, Fitted]:
+        """The rung that is recommended, and its fit."""
+        choice = choose([fitted.evidence for fitted in self.fits], self.fitter.observations.footprint)
+        return choice, next(fitted for fitted in self.fits if fitted.evidence is choice.chosen)
 
-    def check(self, choice: Choice, views: Views, settings: CheckSettings) -> dict[str, float]:
+    def check(self, chosen: Fitted, views: Views, settings: CheckSettings) -> dict[str, float]:
         """On what share of draws of views, unseen by the choice, it holds; the best rung is that of each draw."""
-        further = views.further(settings.views, self.fitter.seed)
-        sound = _sound(self.fits)
-        errors = [further.error(fitted.model.frozen(), self.observations.renderer) for fitted in sound]
-        own = errors[sound.index(self.of(choice.chosen))]
-        return shares(own, errors, settings, footprint=self.observations.footprint, seed=self.fitter.seed)
+        observations, further = self.fitter.observations, views.further(settings.views, self.fitter.seed)
+        renderer = finest(observations.renderer)
+        errors = {fitted: further.error(fitted.model.frozen(), renderer) for fitted in self._sound}
+        footprint, seed = observations.footprint, self.fitter.seed
+        return shares(errors[chosen], list(errors.values()), settings, footprint=footprint, seed=seed)
 
-    def refit(self, rung: Rung) -> Evidence:
+    def refit(self, chosen: Fitted) -> Evidence:
         """A rung again from where it began, no more precise than a pixel, with the rays that the loss asks for.
 
         It is judged as all others are.
         """
         settings = replace(self.fitter.settings, fewest_rays=self.frugal_rays)
-        observations = self.observations.through(self.frugal)
+        observations = self.fitter.observations.through(self.frugal)
         fitter = replace(self.fitter, settings=settings, observations=observations, part="frugal", spent={})
-        place = next(place for place, fitted in enumerate(self.fits) if fitted.evidence.rung == rung.name)
-        fitted = self._fitted(fitter, rung, self._best(self.fits[:place]))
+        fitted = fitter.begin(chosen.rung, chosen.previous, look=False)
+        fitter.fit(fitted, settings.iterations, looks=False)
         if not fitted.failed:
-            fitted.evidence.error = self.observations.error(fitted.model.frozen())
+            fitted.evidence.error = self.fitter.observations.error(fitted.model.frozen())
         return fitted.evidence
 
     @torch.no_grad()
-    def precision(self, fitted: Fitted) -> dict[str, float]:
-        """What rendering the held-out rays costs with either renderer, and hits that only one has."""
-        rays, shape = self.observations.held_out.rays, fitted.model.frozen()
-        counts = Counts(), Counts()
+    def precision(self, fitted: Fitted, rays: Rays) -> dict[str, float]:
+        """What rendering rays costs with either renderer, and hits that only one has."""
+        plain, shape, counts = self.fitter.observations.renderer, fitted.model.frozen(), (Counts(), Counts())
         hits = [
-            renderer.render(Meter(shape, count), rays).hit
-            for renderer, count in zip((self.observations.renderer, self.frugal), counts, strict=True)
+            finest(renderer).render(Meter(shape, count), rays).hit
+            for renderer, count in zip((plain, self.frugal), counts, strict=True)
         ]
         lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
         return {
@@ -108,17 +107,9 @@ class Study:
             "precision.gained": gained,
         }
 
-    def _best(self, fits: list[Fitted]) -> Fitted | None:
-        return min(_sound(fits), key=lambda fitted: fitted.evidence.mean, default=None)
-
-    def _fitted(self, fitter: Fitter, rung: Rung, previous: Fitted | None) -> Fitted:
-        fitted = fitter.begin(rung, None if previous is None else previous.model)
-        fitter.fit(fitted, fitter.settings.iterations, looks=True)
-        return fitted
-
-
-def _sound(fits: list[Fitted]) -> list[Fitted]:
-    return [fitted for fitted in fits if fitted.evidence.error is not None]
+    @property
+    def _sound(self) -> list[Fitted]:
+        return [fitted for fitted in self.fits if fitted.evidence.error is not None]
 
 
 def shares(

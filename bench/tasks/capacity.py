@@ -6,12 +6,13 @@ from typing import Any
 
 from bench.film import Film
 from bench.judge import judge
-from bench.ladder.choice import Choice, Evidence, choose
-from bench.ladder.fit import Fitted, Fitter
+from bench.ladder.choice import Choice, Evidence
+from bench.ladder.fit import Fitter
 from bench.ladder.growth import Growth, grow
 from bench.ladder.model import FLOAT
+from bench.ladder.observations import RayObservations
 from bench.ladder.picture import draw_ladder
-from bench.ladder.rungs import PAPERS, rung
+from bench.ladder.rungs import PAPERS
 from bench.ladder.study import CheckSettings, Study
 from bench.ladder.views import Views
 from bench.metrics import DEFINITIONS
@@ -19,6 +20,7 @@ from bench.records import RunStatus, plain
 from bench.solve import COSTS
 from bench.stage import Cell
 from bench.tasks.problem import check_field_gradient
+from bench.thickness import ending
 from datasets.truth import Truth
 from renderers.checks import check_positive, check_share
 
@@ -30,12 +32,14 @@ NEEDS = {
     "best_field": "the rung of the least held-out error",
     "footprint": "half a pixel where the shape may be nearest (DIST, Eq. 10, theta = 0), in scene units",
     "RUNG.error": "of held-out rays: distance along the field's normal between the observed and the rendered point, at "
-    "most 10 footprints; 10 footprints where only one hits; mean over the rays on which either hits, in scene units",
+    "most 10 footprints; 10 footprints where only one hits; mean over the rays on which either hits, in scene units. "
+    "Which rung a later one begins with is chosen by it, too; held_out_seeds are free of that",
     "RUNG.standard_error": "of that mean, by the jackknife over views",
     "RUNG.failed": "why its fit failed",
     "RUNG.parameters, RUNG.bytes, RUNG.flops_per_query": "free numbers; what it takes to keep the field in float32; "
     "floating-point operations of a value, for formulas an estimate",
-    "RUNG.seconds, RUNG.evaluations, RUNG.flops": "of its fit, with its warm start, without looks",
+    "RUNG.seconds, RUNG.evaluations, RUNG.flops": "of its fit, with finding its start and the warm start, "
+    "without looks",
     "RUNG.seconds_at_auto, RUNG.flops_at_auto, RUNG.evaluations_at_auto": "when a look first found the error of "
     "field=auto, or less than a standard error more; none where none did",
     "saved_...": "of the papers' network, over that of the recommended rung; seconds only where the network was fitted",
@@ -85,20 +89,19 @@ class Capacity:
             def on_line(name: str, line: dict[str, Any]) -> None:
                 curve.write(json.dumps(plain({"rung": name, **line}), allow_nan=False) + "\n")
 
-            def on_rung(fitted: Fitted, count: int) -> None:
-                record.metrics |= costs(fitted.evidence.rung, fitted.evidence)  # should the run be stopped
-                film.shoot(fitted.evidence.rung, fitted.model.frozen(), stage.scene.view.camera)
-                cell.progress("climbing", len(study.fits), count, fitted.evidence.mean)
-
-            fitter = Fitter(observations, ladder.fit, stage.seed, stage.device, on_line)
-            study = Study(observations, fitter, stage.frugal, self.frugal_rays, on_rung)
-            growth = grow(fitter, ladder.all(), ladder.growth)
-            evidence = study.climb(ladder.all())
-            self._note_costs(cell, study, [*growth.tried, *evidence])
-            choice = choose(evidence, views.footprint)
-            chosen = study.of(choice.chosen)
-            metrics = needs(choice, evidence, growth) | study.check(choice, views, self.checks)
-            metrics |= costs("frugal", study.refit(rung(choice.chosen.rung))) | study.precision(chosen)
+            rungs, fitter = ladder.all(), Fitter(observations, ladder.fit, stage.seed, stage.device, on_line)
+            frugal, settled = stage.frugal
+            study = Study(fitter, frugal, self.frugal_rays)
+            growth = grow(fitter, rungs, ladder.growth)
+            for fitted in study.climb(rungs):
+                record.metrics |= costs(fitted.rung.name, fitted.evidence)  # should the run be stopped
+                film.shoot(fitted.rung.name, fitted.model.frozen(), stage.scene.view.camera)
+                cell.progress("climbing", len(study.fits), len(rungs), fitted.evidence.mean)
+            evidence = [fitted.evidence for fitted in study.fits]
+            _note_costs(cell, fitter, observations, [*growth.tried, *evidence])
+            choice, chosen = study.choose()
+            metrics = needs(choice, evidence, growth) | study.check(chosen, views, self.checks)
+            metrics |= costs("frugal", study.refit(chosen)) | study.precision(chosen, observations.held_out.rays)
         judged = judge(chosen.model.frozen(), stage)
         record.metrics = judged.metrics | {"footprint": views.footprint} | metrics
         record.status, record.reason = RunStatus.OK, ""
@@ -106,22 +109,25 @@ class Capacity:
             record.status, record.reason = RunStatus.EMPTY, "the recommended field has no surface in the unit sphere"
         else:
             judged.mesh.save(cell.folder / "mesh.ply")
-        record.notes = [*record.notes, told(choice, growth)]
+        frugality = [f"frugal: {note}" for note in settled]
+        record.notes = [*record.notes, told(choice, growth), *ending(chosen.renderer), *frugality]
         title = f"{record.task}, {record.name}, {record.scene}"
         film.save(cell.folder, title)
         if stage.evaluation.picture is not None:
             draw_ladder(cell.folder, record.metrics, title)
 
-    def _note_costs(self, cell: Cell, study: Study, evidence: list[Evidence]) -> None:
-        rays = sum(rung.iterations for rung in evidence) * cell.stage.ladder.views.rays
-        values = sum(rung.evaluations for rung in evidence)
-        cell.record.seconds |= study.fitter.spent
-        cell.record.flops = sum(rung.flops for rung in evidence)
-        cell.record.evaluations = {
-            "value": values,
-            "per_ray": values / max(rays, 1),
-            "observed": int(study.observations.given.observed.sum()),
-        }
+
+def _note_costs(cell: Cell, fitter: Fitter, observations: RayObservations, evidence: list[Evidence]) -> None:
+    rays = sum(rung.iterations for rung in evidence) * observations.rays
+    values = sum(rung.evaluations for rung in evidence)
+    cell.record.seconds |= fitter.spent
+    cell.record.flops = sum(rung.flops for rung in evidence)
+    cell.record.evaluations = {
+        "value": values,
+        "gradient": sum(rung.gradients for rung in evidence),
+        "per_ray": values / max(rays, 1),
+        "observed": int(observations.given.observed.sum() + observations.held_out.observed.sum()),
+    }
 
 
 def costs(name: str, evidence: Evidence) -> dict[str, Any]:
@@ -149,7 +155,7 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
         metrics |= costs(one.rung, one)
     metrics |= {"auto.field": last.rung, **costs("auto", last), "auto.overhead": growth.overhead}
     metrics["auto.overhead_judged"] = growth.overhead_judged
-    metrics |= {f"auto.{name}": getattr(growth, name) for name in ("seconds", "evaluations", "flops")}
+    metrics |= {f"auto.{name}": growth.total(name) for name in ("seconds", "evaluations", "flops")}
     if last.error is not None:
         target = last.mean + last.error.standard_error
         for one in evidence:

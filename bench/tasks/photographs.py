@@ -1,7 +1,8 @@
 """Photographs with known cameras: their loss, and what is held out of them where a field has no prior."""
 
-from dataclasses import dataclass
-from math import inf
+from copy import copy
+from dataclasses import dataclass, replace
+from math import nan
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +14,7 @@ from bench.ladder.held_out import HeldOutError
 from bench.starts import StartSettings
 from bench.tasks.code import Terms
 from bench.tasks.problem import NotReached
+from bench.thickness import finest
 from bench.warp import project, sample
 from datasets.photographs import Photograph
 from renderers.camera import Rays
@@ -147,7 +149,6 @@ class PhotographObservations:
     held_out: list[tuple[int, int]]
 
     footprint: ClassVar[float] = 0.0
-    weight: ClassVar[float] = inf
 
     @staticmethod
     def of(given: GivenPhotographs) -> "PhotographObservations":
@@ -161,7 +162,8 @@ class PhotographObservations:
         if len(held_out) < 2 or not fitted:
             least = 2 * HELD_OUT_EVERY
             raise ValueError(
-                f"task.images.views must be at least {least}, not {count}: some are held out where no prior is used"
+                f"{count} photographs leave no pairs to hold out where no prior is used: task.images.views={least}, "
+                "with task.neighbour=1, or field=prior"
             )
         return PhotographObservations(given, fitted, held_out)
 
@@ -182,9 +184,20 @@ class PhotographObservations:
         """None are known."""
         return self.given.colours.new_zeros(0, 3)
 
-    def free(self, seed: int) -> Float[Tensor, "n 3"]:
+    @property
+    def free(self) -> Float[Tensor, "n 3"]:
         """None are known."""
         return self.points
+
+    def through(self, renderer: Renderer) -> "PhotographObservations":
+        """The same, compared through another renderer."""
+        given = copy(self.given)
+        given.renderer = renderer
+        return replace(self, given=given)
+
+    def left(self, terms: Terms) -> float:
+        """A difference of colours is no length."""
+        return nan
 
     def terms(self, field: Field, iteration: int, share: float) -> Terms:
         """The photometric loss of an iteration's pairs.
@@ -197,7 +210,9 @@ class PhotographObservations:
     @torch.no_grad()
     def error(self, field: Field) -> HeldOutError:
         """Of the pairs that are held out."""
-        return photographic_error(self.given.differences(field, self.renderer, self.held_out, self.given.colours))
+        return photographic_error(
+            self.given.differences(field, finest(self.renderer), self.held_out, self.given.colours)
+        )
 
 
 def photographic_error(differences: list[Float[Tensor, "_"]]) -> HeldOutError:
