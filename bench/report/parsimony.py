@@ -106,7 +106,7 @@ def draw(runs: list[SceneRun], key: str) -> Figure:
         axis.tick_params(labelbottom=True)
         axis.set_xlabel(AXES[key])
     figure.supylabel("held-out error (scene units)", fontsize=style.RC["axes.labelsize"])
-    named = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    named = style.labelled(*axes)
     kinds = [label for label, _, _ in KINDS.values()]
     labels = sorted(named, key=lambda label: kinds.index(label) if label in kinds else len(kinds))
     handles = [named[label] for label in labels]
@@ -119,7 +119,7 @@ def draw(runs: list[SceneRun], key: str) -> Figure:
 
 def _panel(axis: Axes, run: SceneRun, key: str) -> None:
     panel(axis, run.ladder, key)
-    axis.set_title(f"{run.name}\nneeds {run.ladder.chosen.label if run.ladder.chosen else 'none'}")
+    axis.set_title(f"{run.name}\nneeds {run.ladder.chosen.label}")
     lost = [rung for rung in run.ladder.rungs if rung.error is None]
     for rung in lost:
         axis.plot(rung.numbers[key], 0.97, "x", color=KINDS[rung.kind][1], transform=axis.get_xaxis_transform())

@@ -106,7 +106,7 @@ def draw(savings: list[Saving]) -> Figure:
 
 def _legend(axis: Axes) -> tuple[list[Any], list[str]]:
     """Each label once, in alphabetical order."""
-    named = {label: handle for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    named = style.labelled(axis)
     return [named[label] for label in sorted(named)], sorted(named)
 
 

@@ -55,7 +55,7 @@ def draw(grid: Atlas, shares: dict[tuple[str, str], pd.DataFrame]) -> Figure:
         _panel(panel, grid, axis, shares)
     for panel in panels[len(grid.axes) :]:
         panel.set_visible(False)
-    handles = {label: h for p in panels for h, label in zip(*p.get_legend_handles_labels(), strict=True)}
+    handles = style.labelled(*panels)
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
     return figure
 

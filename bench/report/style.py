@@ -163,6 +163,11 @@ def needs_log(values: Any, factor: float = 20.0) -> bool:
     return bool(positive) and max(positive) > factor * min(positive)
 
 
+def labelled(*axes: Axes) -> dict[str, Any]:
+    """What stands in a legend for each label of some axes, each label once."""
+    return {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
+
+
 def bare(axis: Any) -> Any:
     """The axes of a picture: a thin frame, no ticks, no grid."""
     axis.set(xticks=[], yticks=[])
