@@ -179,6 +179,29 @@ def test_names_of_near_points_do_not_cover_each_other(tmp_path):
     assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
+def test_a_name_beside_a_point_at_the_left_stays_clear_of_the_axis(tmp_path):
+    for scene in ("sphere", "box", "capsule", "rounded_box"):
+        climbed(tmp_path, scene, {"sphere": 8, "box": 0.1}, needs="box")
+    figure = parsimony_needs.make(chosen(tmp_path)).figure
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert min(text.get_window_extent().x0 for text in axes.texts) >= axes.get_window_extent().x0
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (("a/spot.obj", "a/cow.obj"), ["cow", "spot"]),
+        (("a/spot.obj", "b/spot.obj"), ["a/spot.obj", "b/spot.obj"]),
+    ],
+)
+def test_a_mesh_goes_by_the_name_of_its_file_where_that_is_its_own(tmp_path, paths, names):
+    for path in paths:
+        settings = {**CONFIG, "dataset": {"path": f"/somewhere/{path}"}}
+        climbed(tmp_path, path.replace("/", "-"), {"sphere": 8, "box": 0.5}, needs="box", settings=settings)
+    assert sorted(parsimony.make(chosen(tmp_path)).table["Scene"]) == names
+
+
 def test_not_reached_is_not_not_fitted_and_not_failed(tmp_path):
     small, whole = {"sphere": 8, "box": 0.9}, {"sphere": 8, "box": 0.9, NETWORK: 3}
     climbed(tmp_path, "unfitted", small, needs="box")

@@ -102,14 +102,17 @@ _SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color":
 
 
 def _name(figure: Figure, axes: Axes, needs: list[Need]) -> None:
-    """Writes each scene's name beside its point, on the first side where it covers no point and no other name."""
+    """Writes each scene's name beside its point, on the first side where it covers no point, name or axis."""
     figure.draw_without_rendering()  # places the axes
     points = axes.transData.transform([(need.complexity, need.numbers) for need in needs] or np.empty((0, 2)))
     points = points * 72 / figure.dpi
+    inside = Bbox(axes.get_window_extent().get_points() * 72 / figure.dpi)
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in points]
     for need, at, own in zip(needs, points, list(taken), strict=True):
         boxes = [_box(at, side, len(need.run.name)) for side in SIDES]
-        free = [not any(box.overlaps(other) for other in taken if other is not own) for box in boxes]
+        free = [
+            inside.x0 <= box.x0 and not any(box.overlaps(other) for other in taken if other is not own) for box in boxes
+        ]
         place = free.index(True) if True in free else 0
         dx, dy, side = SIDES[place]
         where = need.complexity, need.numbers

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 from bench.report import format
@@ -64,11 +65,17 @@ class SceneRun:
 
 
 def scene_runs(experiment: Experiment) -> list[SceneRun]:
-    """All runs, the smallest need first, then by name; those that did not end ok come last."""
+    """All runs, the smallest need first, then by name; those that did not end ok come last.
+
+    A mesh goes by the name of its file, where no two scenes would have the same.
+    """
+    families = {family(record) for record in experiment.records}
+    stems = {name: PurePath(name).stem for name in families}
+    short = stems if len(set(stems.values())) == len(families) else {name: name for name in families}
     telling = [(part, told) for part, told in TELLING if len({part(record) for record in experiment.records}) > 1]
     runs = []
     for record in experiment.records:
-        name = ", ".join([family(record), *(told.format(part(record)) for part, told in telling)])
+        name = ", ".join([short[family(record)], *(told.format(part(record)) for part, told in telling)])
         runs.append(SceneRun(name, record, Ladder.of(record["metrics"] if record["status"] == "ok" else {})))
     return sorted(runs, key=lambda run: (not run.ok, run.number("recommended_parameters") or 0, run.name))
 
