@@ -41,26 +41,34 @@ class Film:
         if self.stage.evaluation.picture is not None:
             self.frames[name] = look(field, self._fine(camera), self.stage)
 
-    def save(self, folder: Path, title: str) -> None:
-        """Writes strip.png into a run folder, and film.gif or film.webp where one is asked for."""
+    def save(self, folder: Path, title: str, chosen: str | None = None) -> None:
+        """Writes strip.png into a run folder, and film.gif or film.webp where one is asked for.
+
+        Args:
+            folder: the run's.
+            title: of the strip.
+            chosen: the frame that the run comes to, where that is not the last one: it is shown, its name in bold.
+        """
         if not self.frames:
             return
         truth = see(Truth(self.stage.scene.mesh), self._fine(self.stage.scene.view.camera))
         matplotlib.use("Agg")
         with matplotlib.rc_context(STYLE):
-            _strip(self._shown(), truth, f"{title}; {self.over}").savefig(
-                folder / "strip.png", dpi=110, bbox_inches="tight"
-            )
+            strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
+            strip.savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
         if self.stage.evaluation.film is not None:
             _animate(folder / f"film.{self.stage.evaluation.film}", list(self.frames.values()), truth)
 
-    def _shown(self) -> dict[int | str, View]:
-        """Some frames, evenly chosen; without the last look, where that is a step before the end."""
+    def _shown(self, chosen: str | None) -> dict[int | str, View]:
+        """Some frames, evenly spread, the chosen one in its neighbour's place; without a look a step before the end."""
         names = list(self.frames)
         last = names[-2:]
         if len(names) > 2 and all(isinstance(name, int) for name in last) and int(last[1]) - int(last[0]) == 1:
             del names[-2]
         places = np.unique(np.linspace(0, len(names) - 1, min(MOST, len(names))).round().astype(int))
+        if chosen is not None and names.index(chosen) not in places:
+            inner = places[1:-1]
+            inner[np.abs(inner - names.index(chosen)).argmin()] = names.index(chosen)
         return {names[place]: self.frames[names[place]] for place in places}
 
     def _fine(self, camera: Camera) -> Camera:
@@ -68,7 +76,7 @@ class Film:
         return camera.resized(size, size)
 
 
-def _strip(frames: dict[int | str, View], truth: View, title: str) -> Figure:
+def _strip(frames: dict[int | str, View], truth: View, title: str, chosen: str | None) -> Figure:
     """A column for each frame and for the truth: normals above, silhouette error below.
 
     One picture on one axis: a figure of twenty axes takes a second to draw.
@@ -85,6 +93,8 @@ def _strip(frames: dict[int | str, View], truth: View, title: str) -> Figure:
     axis.set_xticks([size * (place + 0.5) for place in range(len(shown))], list(shown))
     axis.set_yticks([size * 0.5, size * 1.5], ["normals", "silhouette error"], rotation=90, va="center")
     axis.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    if chosen is not None:
+        axis.xaxis.get_major_ticks()[list(frames).index(chosen)].label2.set_fontweight("bold")
     figure.suptitle(f"{title} (red lost, blue false)")
     return figure
 

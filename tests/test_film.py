@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
 
 from bench.config import load
@@ -53,6 +54,22 @@ def test_a_strip_alone_is_the_default(stage, tmp_path):
     assert [path.name for path in tmp_path.glob("*.*")] == ["strip.png"]
     with Image.open(tmp_path / "strip.png") as strip:
         assert strip.width < 1.35 * 110 * (MOST + 1)
+
+
+@pytest.mark.parametrize("own", [1, 9, 3 * MOST - 2, 0])
+def test_the_frame_that_a_run_comes_to_is_among_those_that_are_shown_in_bold(stage, tmp_path, monkeypatch, own):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    film = Film(stage, "by rung")
+    for name in range(3 * MOST):
+        film.shoot(f"rung_{name}", sphere(0.5), CAMERA)
+    film.save(tmp_path, "a ball", f"rung_{own}")
+    labels = [tick.label2 for tick in drawn[0].axes[0].xaxis.get_major_ticks()]  # those at the top
+    names = [label.get_text() for label in labels]
+    assert len(names) == MOST + 1
+    assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MOST - 1}", "truth")
+    assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {own}"]
+    assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
 
 
 def test_nothing_is_drawn_where_pictures_are_off(stage, tmp_path):

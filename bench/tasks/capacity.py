@@ -112,7 +112,7 @@ class Capacity:
         frugality = [f"frugal: {note}" for note in settled]
         record.notes = [*record.notes, told(choice, growth), *ending(chosen.renderer), *frugality]
         title = f"{record.task}, {record.name}, {record.scene}"
-        film.save(cell.folder, title)
+        film.save(cell.folder, f"{title}: needs {chosen.rung.name.replace('_', ' ')}", chosen.rung.name)
         if stage.evaluation.picture is not None:
             draw_ladder(cell.folder, record.metrics, title)
 
