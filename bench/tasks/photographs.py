@@ -67,21 +67,18 @@ class GivenPhotographs:
         """The views that an iteration compares, each with its neighbour."""
         return spaced(neighbours(len(self.cameras), self.settings.neighbour), self.per_step, iteration)
 
-    def compare(self, field: Field, iteration: int) -> Terms:
+    def compare(self, field: Field, iteration: int, pairs: list[tuple[int, int]] | None = None) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
-        Raises:
-            NotReached: where there is no such pixel.
-        """
-        return self.over(field, iteration, self.pairs(iteration))
-
-    def over(self, field: Field, iteration: int, pairs: list[tuple[int, int]]) -> Terms:
-        """The same over pairs of views.
+        Args:
+            field: of the shape.
+            iteration: at which it is compared.
+            pairs: of views; None for those of the iteration.
 
         Raises:
             NotReached: where there is no such pixel.
         """
-        renderer = at_iteration(self.renderer, iteration)
+        renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration) if pairs is None else pairs
         together = torch.cat(self.differences(field, renderer, pairs, self._blurred(iteration)))
         if not len(together):
             raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
@@ -205,7 +202,7 @@ class PhotographObservations:
         Raises:
             NotReached: where no point is seen by two views.
         """
-        return self.given.over(field, iteration, spaced(self.fitted, self.given.per_step, iteration))
+        return self.given.compare(field, iteration, spaced(self.fitted, self.given.per_step, iteration))
 
     @torch.no_grad()
     def error(self, field: Field) -> HeldOutError:
