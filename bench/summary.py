@@ -12,7 +12,6 @@ from bench.plan import Plan
 from bench.records import Record, RunStatus
 from bench.report.format import count, number, seconds
 from bench.report.html import write_index
-from bench.report.ladder import Ladder
 from bench.report.planned import NOT_RUN
 
 ROWS = (  # metric, what it is called, factor, better when
@@ -75,6 +74,8 @@ def show_sweep(plan: Plan) -> list[str]:
 
 def _ladder(record: Record) -> Table:
     """What each rung of a capacity run came to; the recommended one is marked."""
+    from bench.report.ladder import Ladder  # only here: it loads matplotlib, which the command can do without
+
     ladder = Ladder.of(record.metrics)
     title = f"{record.task}, {record.name}, {record.scene}; half a pixel is {number(1000 * ladder.footprint)} (x1000)"
     table = Table(box=box.SIMPLE_HEAD, title=escape(title))

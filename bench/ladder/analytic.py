@@ -6,9 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
-from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from bench.ladder.model import Model, Seen
@@ -182,6 +180,8 @@ def _thinned(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
 
 def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
     """Placing and logarithmic half sizes of the smallest box about the points."""
+    import trimesh  # here: most runs do without it, and it takes a second
+
     to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + _jitter(len(points)))
     place = np.linalg.inv(to_box)
     angle, axis, _ = trimesh.transformations.rotation_from_matrix(place)
@@ -196,6 +196,8 @@ def _jitter(count: int) -> Float[np.ndarray, "n 3"]:
 
 def _clustered(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Float[Tensor, "10"]]:
     """A rounded box about each of so many clusters of the points (k-means)."""
+    from scipy.cluster.vq import kmeans2
+
     _, labels = kmeans2(points.numpy().astype(np.float64), count, minit="++", rng=np.random.default_rng(seed))
     clusters = [points[torch.from_numpy(labels == label)] for label in range(count)]
     return [torch.cat([_around(cluster, points), torch.tensor([EDGED])]) for cluster in clusters]

@@ -119,7 +119,10 @@ def cost(rung: Rung, iterations: int, fitter: Fitter) -> float:
 
 
 def _load() -> None:
-    """Loads what the first optimiser of a process loads, a second or two that the first rung is not charged with."""
+    """Loads what is loaded at the first use, seconds that the first rung is not charged with."""
+    import scipy.cluster.vq  # noqa: F401
+    import trimesh  # noqa: F401
+
     torch.optim.Adam([torch.zeros(1)])
 
 
