@@ -63,7 +63,7 @@ def test_views_move_on_and_are_spread_evenly(scene):
 def test_it_finds_the_ball(scene):
     problem = problem_of(scene)
     problem.code.data += torch.tensor([0.0, 0.05, 0.0, 0.15])  # higher and larger
-    optimise(problem, OptimiserSettings(80, 0.03, "cosine"), CPU, course=Course(), on_step=lambda line: None)
+    optimise(problem, OptimiserSettings(45, 0.04, "cosine"), CPU, course=Course(), on_step=lambda line: None)
     assert problem.code.detach().norm().item() < 0.01  # of 0.16
     assert problem.counts.value > 0
 
@@ -89,7 +89,7 @@ def test_a_misplaced_ball_is_put_back(scene):
     assert first[:3].norm().item() == pytest.approx(0.1)
     assert first[6].exp().item() == pytest.approx(1.1)
     problem.codes[0].requires_grad_(False)  # a ball that moves could be put back by its code as well
-    optimise(problem, OptimiserSettings(60, 0.01, "cosine"), CPU, course=Course(), on_step=lambda line: None)
+    optimise(problem, OptimiserSettings(36, 0.015, "cosine"), CPU, course=Course(), on_step=lambda line: None)
     assert problem.similarity[:3].norm() < 0.3 * first[:3].norm()
     assert problem.similarity[6].abs() < 0.3 * first[6]
     assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
