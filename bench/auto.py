@@ -134,6 +134,7 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     for name in [name for name in FORMULAS if name in asked]:
         node[name] = FORMULAS[name](view, node, settings)
         seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
+        seen += f", for surfaces met at {settings.grazing:g} degrees or more (auto.grazing)" if name == "steps" else ""
         verb, reason = CHANGING.get(name, ("is", seen))
         notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
     return node, notes

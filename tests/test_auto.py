@@ -51,7 +51,8 @@ def test_both_follow_each_other_and_are_told():
     assert node.steps == steps(VIEW, node, TEN) < 33
     seen = "for 128 pixels from 2.5 away (view)"
     told = {"epsilon": f"{node.epsilon:.4g}", "steps": str(node.steps)}
-    assert notes == [f"renderer.{name}=auto is {number}, {seen}" for name, number in told.items()]
+    angle = {"epsilon": "", "steps": ", for surfaces met at 10 degrees or more (auto.grazing)"}
+    assert notes == [f"renderer.{name}=auto is {number}, {seen}{angle[name]}" for name, number in told.items()]
 
 
 def test_what_has_no_equation_is_told():

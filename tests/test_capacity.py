@@ -68,6 +68,9 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert any("needs rounded_box, 10 numbers" in note for note in record.notes)
     frugal = [note for note in record.notes if note.startswith("frugal: renderer.")]
     assert [note.split()[1] for note in frugal] == ["renderer.epsilon=auto", "renderer.steps=auto"]
+    saved = next(note for note in record.notes if note.startswith("frugal: error"))
+    values = 100 * metrics["frugal.evaluations"] / metrics["rounded_box.evaluations"]
+    assert f", {values:.0f} % of the field values; of {metrics['precision.hits']} hits " in saved
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert {line["rung"] for line in lines} == {"sphere", "rounded_box", "network_1x16"}
@@ -98,7 +101,7 @@ def test_a_renderer_of_the_users_own_without_epsilon_has_a_ladder_too(compose_co
     own = ("renderer=custom", "renderer._target_=tests.user_renderer.Mine", "+renderer.steps=40")
     record = run(tmp_path, compose_config, "task=capacity", "dataset=sphere", "ladder.rungs=[sphere]", *own)
     assert (record.status, record.metrics["recommended_field"]) == ("ok", "sphere")
-    assert not [note for note in record.notes if note.startswith("frugal:")]
+    assert not [note for note in record.notes if note.startswith("frugal: renderer.")]
 
 
 def test_samples_that_follow_the_shape_are_told_for_the_rung_that_is_recommended(compose_config, tmp_path):

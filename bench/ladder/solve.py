@@ -27,7 +27,8 @@ ENDED = {
     "field": "the rung that field=auto ended on, or the one that was asked for",
     "field_parameters": "its free numbers",
     "field_error, field_standard_error": "of what was held out of the observations: as RUNG.error of task=capacity, in "
-    "scene units; of photographs the mean difference of colours from 0 to 1",
+    "scene units; of photographs the mean difference of colours from 0 to 1; through the renderer as it was "
+    "asked for, so that what renderer.epsilon=auto adds to a surface is not in it",
     "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends; 0 for photographs",
     "field_overhead": "seconds of all fits, also of rungs that were tried in vain, over those of the last rung's; "
     "without looks at what is held out",

@@ -109,7 +109,7 @@ class Capacity:
             record.status, record.reason = RunStatus.EMPTY, "the recommended field has no surface in the unit sphere"
         else:
             judged.mesh.save(cell.folder / "mesh.ply")
-        frugality = [f"frugal: {note}" for note in settled]
+        frugality = [f"frugal: {note}" for note in [*settled, *frugal_told(metrics, chosen.rung.name)]]
         record.notes = [*record.notes, told(choice, growth), *ending(chosen.renderer), *frugality]
         title = f"{record.task}, {record.name}, {record.scene}"
         film.save(cell.folder, f"{title}: needs {chosen.rung.name.replace('_', ' ')}", chosen.rung.name)
@@ -171,6 +171,16 @@ def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     if fitted is not None:
         network["seconds"] = fitted.seconds
     return {f"saved_{key}": value / max(getattr(chosen, key), TINY) for key, value in network.items()}
+
+
+def frugal_told(metrics: dict[str, Any], rung: str) -> list[str]:
+    """What the frugal fit came to beside the plain one, and what rendering at its precision changes, in words."""
+    if "frugal.error" not in metrics:
+        return [f"the fit ended as {metrics['frugal.failed']}"]
+    values = metrics["frugal.evaluations"] / max(metrics[f"{rung}.evaluations"], 1)
+    lost, gained, hits = (metrics[f"precision.{name}"] for name in ("lost", "gained", "hits"))
+    error = f"error (x1000) {1000 * metrics['frugal.error']:.3g} instead of {1000 * metrics[f'{rung}.error']:.3g}"
+    return [f"{error}, {100 * values:.0f} % of the field values; of {hits} hits {lost} lost, {gained} gained"]
 
 
 def told(choice: Choice, growth: Growth) -> str:
