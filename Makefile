@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
-PYTHON ?= python3
+PYTHON ?=
 BIN := .venv/bin
 
 .PHONY: demo test test-slow benchmark lint setup clean
@@ -7,24 +7,27 @@ BIN := .venv/bin
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
 
-test: .venv/ready ## set up once, then the tests (under 6 minutes on 2 cores)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: .venv/ready-dev ## set up once, then the tests (about 5 minutes on 2 cores)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --durations=10
 
-test-slow: .venv/ready ## the minutes-long tests
+test-slow: .venv/ready-dev ## the minutes-long tests
 	$(BIN)/python -m pytest -m slow --ignore tests/benchmarks
 
-benchmark: .venv/ready ## speed and memory against the machine's own limits; on a quiet machine
+benchmark: .venv/ready-dev ## speed and memory against the machine's own limits; on a quiet machine
 	$(BIN)/python -m pytest -o addopts="-q -s -p no:dash" tests/benchmarks
 
-lint: .venv/ready ## ruff (lint and format) and pyright
+lint: .venv/ready-dev ## ruff (lint and format) and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-setup: .venv/ready
+setup: .venv/ready-dev
 
-.venv/ready: pyproject.toml .ci/setup
-	PYTHON=$(PYTHON) .ci/setup
+.venv/ready: pyproject.toml .ci/setup  # what the command needs
+	@PYTHON="$(PYTHON)" .ci/setup command
+
+.venv/ready-dev: .venv/ready  # what tests and lint need on top
+	@.ci/setup dev
 
 clean:
 	rm -rf .venv

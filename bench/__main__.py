@@ -4,8 +4,8 @@ import sys
 
 from omegaconf import DictConfig
 
-from bench.command import FAILED, command_line
-from bench.plan import Sweep
+from bench.run.command import FAILED, command_line
+from bench.run.sweep import Sweep
 
 
 def main() -> int:
@@ -13,16 +13,18 @@ def main() -> int:
     statuses: list[str] = []
 
     def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
-        from bench.cell import run_cell  # what it needs waits until the command line is known to be sound
+        from bench.report.write.html import write_index  # what it needs waits until the command line is sound
+        from bench.run.run import run_cell
 
-        statuses.append(run_cell(config))
+        statuses.append(run_cell(config, write_index))
 
     code = command_line(one)
     plan = Sweep.end()
     if plan is not None:  # also after Ctrl-C: what was run stands there
-        from bench.summary import show_sweep
+        from bench.report.write.html import write_index
+        from bench.run.summary import show_sweep
 
-        statuses = show_sweep(plan)
+        statuses = show_sweep(plan, write_index(plan.results_dir))
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)
 
 

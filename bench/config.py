@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
@@ -25,8 +25,65 @@ LEAST = {
     "evaluation.every": 1,
 }
 DOUBLING = "doubling"
-RESERVED = ("_target_", "_package_")  # of a node; its other keys are arguments
+MANY = 20  # names, beyond which an error message leaves variants out
+SELF = "_self_"  # of a list of defaults: the file itself
+RESERVED = ("_target_", "_package_", "_label_", "_rows_")  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
+STRATEGIES = {  # of the group `strategy`, whose files are files of `renderer` now
+    "aggressive": "dist_aggressive",
+    "capped": "dist_capped",
+    "coarse_to_fine": "dist_coarse_to_fine",
+    "coarse_to_fine_100": "dist_coarse_to_fine_100",
+    "dist": "dist",
+    "dvr": "dvr_64",
+    "dvr_128": "dvr",
+    "dvr_official_slope": "dvr_official_slope",
+    "dynamic": "dist_dynamic",
+    "idr": "idr",
+    "naive": "naive_serial",
+    "official_clamp": "dist_official_clamp",
+    "parallel": "naive_practical_parallel",
+    "practical_gradient": "naive_practical",
+    "slope_bound": "dist_slope_bound",
+    "step_back": "dist_step_back",
+    "step_floor": "dist_step_floor",
+    "unrolled_parallel": "naive_parallel",
+}
+SETTINGS = (  # of the group `setting`, likewise; these keep their names
+    *("dist", "dist_alpha_1", "dist_alpha_1_2", "dist_alpha_2", "dist_epsilon_5e3", "dist_epsilon_5e4", "dist_k_3"),
+    *("dist_one_level", "dist_steps_10", "dist_steps_20", "idr", "idr_epsilon_5e3", "idr_steps_20", "naive"),
+    "naive_steps_20",
+)
+K_OR_N = "renderer.n_gradient_samples (K, of dist and naive) or renderer.n_ray_samples (n, of dvr)"
+SIZES = "sizes.smoke, sizes.desk or sizes.paper, which +experiment=NAME has"
+RENAMED = {  # what users typed before, a choice as GROUP/NAME or a key, and what to type now
+    **{f"strategy/{name}": f"renderer={renderer}" for name, renderer in STRATEGIES.items()},
+    "strategy": "renderer=NAME",
+    **{f"setting/{name}": f"renderer={name}" for name in SETTINGS},
+    "setting/dvr": "renderer=dvr_early_stop",
+    **{f"setting/dvr_{n}": f"renderer=dvr_fixed_{n}" for n in (16, 32, 64, 128)},
+    "setting/dist_half": "+method=dist_half",
+    "setting": "renderer=NAME",
+    "trial/completion": "+experiment=speed_completion",
+    "trial/rendering": "+experiment=speed_rendering",
+    "trial": "+experiment=speed_completion or +experiment=speed_rendering",
+    **{f"condition/focal_{name}": f"task.focal={int(name) / 100:g}" for name in ("050", "075", "105")},
+    **{f"condition/start_{name}": f"task.start_scale={int(name) / 100:g}" for name in ("000", "050", "200")},
+    "condition": "task.focal=1 task.start_scale=1",
+    "common": "+experiment=fitted",
+    "experiment/speed_accuracy": "+experiment=speed_completion or +experiment=speed_rendering",
+    "experiment/fig10": "+experiment=fig10_focal or +experiment=fig10_start",
+    "renderer.samples": K_OR_N,
+    "task.samples": "renderer.n_gradient_samples",
+    **{f"task.{name}": f"task.optimiser.{name}" for name in ("iterations", "learning_rate", "schedule")},
+    **{f"task.code_{name}": f"task.code.{name}" for name in ("weight", "average")},
+    "ladder.rungs": "models.candidates",
+    "ladder": "models",
+    **{f"ladder.{name}": f"models.{name}" for name in ("fit", "growth", "views")},
+    "task.stress.among": "task.stress.setting alone",
+    **{f"scale.{name}": SIZES for name in ("table2", "table3", "fig6", "fig10", "speed_accuracy")},
+    **{f"scale.{name}": SIZES for name in ("stability.stresses", "capacity.resolution", "capacity.scenes")},
+}
 
 
 class Device(StrEnum):
@@ -63,8 +120,8 @@ class EvaluationSettings:
     every: int | str | None = MISSING
     film: str | None = MISSING
 
-    def looks(self, iterations: int) -> set[int]:
-        """The iterations, counted from 0, whose Chamfer distance is looked at: with the first also the last."""
+    def checkpoints(self, iterations: int) -> set[int]:
+        """The iterations, counted from 0, before which the current state is evaluated: with the first also the last."""
         if self.every is None:
             return set()
         last = iterations - 1
@@ -86,7 +143,7 @@ class Config:
     tracker: Any = MISSING
     view: Any = MISSING
     auto: Any = MISSING
-    ladder: Any = MISSING
+    models: Any = MISSING
     field: str = MISSING
     evaluation: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
     split: str = MISSING
@@ -94,6 +151,7 @@ class Config:
     seed: int = MISSING
     label: str | None = MISSING
     experiment: str | None = MISSING
+    sizes: Any = MISSING
     device: Device = MISSING
     threads: int | None = MISSING
     results_dir: str = MISSING
@@ -110,6 +168,16 @@ def register() -> None:
     """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
     ConfigStore.instance().store(name="schema", node=Config)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
+    OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
+
+
+def check_names(config: DictConfig) -> None:
+    """Raises ValueError for a key of the top level that there is not, which a plus on the command line would add."""
+    names = [item.name for item in fields(Config)]
+    for key in map(str, config):
+        if key not in names:
+            what = f"{key}/{config[key]}" if isinstance(config[key], str) else key
+            raise ValueError(f"unknown key {key!r}{renamed(what) or nearest(key, names)}")
 
 
 def check_top_level(config: DictConfig) -> None:
@@ -162,7 +230,7 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
     names = [f.name for f in fields(cls)]
     for key in arguments:
         if key not in names:
-            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
+            raise ValueError(f"{name} has no key {key!r}{renamed(f'{name}.{key}') or nearest(str(key), names)}")
     return _typed(cls, arguments, name)
 
 
@@ -177,14 +245,34 @@ def load(group: str, name: str, **arguments: Any) -> Any:
         known = [file.stem for file in (CONF / group).glob("*.yaml")]
         raise ValueError(f"unknown {group} {name!r}{nearest(name, known)}")
     package = {"_package_": arguments.get("_target_", "").split(".")[0]}  # who names a class in Python trusts it
-    return build(OmegaConf.merge(OmegaConf.load(path), arguments, package), group)  # type: ignore[arg-type]
+    return build(OmegaConf.merge(_with_defaults(path), arguments, package), group)  # type: ignore[arg-type]
+
+
+def _with_defaults(path: Path) -> DictConfig:
+    """What a YAML holds, over the files of its own group that its `defaults` name, in their order, as Hydra has it."""
+    node = cast(DictConfig, OmegaConf.load(path))
+    bases = [str(base) for base in node.pop("defaults", [])]
+    order = bases if SELF in bases else [SELF, *bases]
+    parts = [node if base == SELF else _with_defaults(path.with_name(f"{base}.yaml")) for base in order]
+    return cast(DictConfig, OmegaConf.merge(*parts))
+
+
+def renamed(name: str) -> str:
+    """A hint at the end of an error message: the new name of a choice GROUP/NAME or of a key; empty for others."""
+    outer = [name, name.split("/")[0], *(name.rsplit(".", count)[0] for count in range(1, name.count(".") + 1))]
+    new = next((RENAMED[known] for known in outer if known in RENAMED), None)
+    return f": it was renamed, write {new}" if new else ""
 
 
 def nearest(word: str, known: list[str]) -> str:
     """A hint at the end of an error message: the nearest known names, or all of them."""
     last = [name for name in known if "." not in word and name.rsplit(".", 1)[-1] == word]
     close = last or [name for name in get_close_matches(word, known, n=3, cutoff=0.5) if name != word]
-    return f": did you mean {' or '.join(close)}?" if close else f": it has {', '.join(sorted(known))}"
+    if close:
+        return f": did you mean {' or '.join(close)}?"
+    roots = [name for name in known if not any(name.startswith(f"{other}_") for other in known)]
+    shown = roots if len(known) > MANY else known
+    return f": it has {', '.join(sorted(shown))}" + (", and variants of these" if len(shown) < len(known) else "")
 
 
 def _typed(cls: type, arguments: dict, name: str) -> Any:
@@ -205,7 +293,10 @@ def _typed(cls: type, arguments: dict, name: str) -> Any:
     missing = [key for key, value in values.items() if value == MISSING]
     if missing:
         raise ValueError(f"{name}.{missing[0]} must be given: set {name}.{missing[0]}=...")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except ValueError as error:  # a class within another does not know where it stands
+        raise error if "." not in name or name in str(error) else ValueError(f"{name}: {error}") from error
 
 
 def _node_class(wanted: Any) -> type | None:

@@ -1,4 +1,4 @@
-"""Live progress on a terminal: a line for the run and one for the sweep; silent where there is no terminal."""
+"""Shows progress on a terminal: a line for the run and one for the sweep; silent where there is no terminal."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -13,7 +13,10 @@ HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may 
 
 @runtime_checkable
 class Report(Protocol):
-    """Says that `done` of `total` steps of a phase are done, with the loss if there is one."""
+    """Reports that `done` of `total` steps of a phase are done, with the loss if there is one.
+
+    A phase says what is being done, such as "training the prior"; the message of a limit that is reached names it.
+    """
 
     def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None: ...
 
@@ -22,21 +25,21 @@ def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-_tell: Callable[[str], None] = _print
+_receive: Callable[[str], None] = _print
 
 
 def notice(text: str) -> None:
-    """Tells the user something that should be seen also where there is no terminal."""
-    _tell(text)
+    """Prints a message for the user, also where there is no terminal."""
+    _receive(text)
 
 
-def notices_to(tell: Callable[[str], None]) -> None:
-    """Gives notices to `tell` from now on, such as to a parent process."""
-    global _tell
-    _tell = tell
+def notices_to(receive: Callable[[str], None]) -> None:
+    """Sends notices to `receive` from now on, for example to a parent process."""
+    global _receive
+    _receive = receive
 
 
-_shown: Progress | None = None  # the display of this process: a sweep's line, and that of the run within, share it
+_shown: Progress | None = None  # the display of this process, shared by the lines of a sweep and of its run
 
 
 @contextmanager
@@ -72,7 +75,7 @@ def display() -> Iterator[Progress]:
 
 @contextmanager
 def run_progress(name: str) -> Iterator[Report]:
-    """One line for a run: its phase, how far it is, and its loss."""
+    """Shows one line for a run: its phase, its progress, and its loss."""
     with display() as shown:
         line = shown.add_task(name, total=None, said="")
         current = ""

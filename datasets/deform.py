@@ -1,4 +1,4 @@
-"""Seeded smooth deformations: many shapes of one family out of one mesh."""
+"""Seeded smooth deformations that make many shapes of one mesh."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ BEND = 0.25  # largest curvature, 1 / scene unit
 class Deformation:
     """Stretch, then taper, twist and bend, each along an axis of the frame; the identity where all are zero.
 
-    Axes are 0, 1, 2 for x, y, z. Every part preserves orientation within the unit ball.
+    Axes are 0, 1, 2 for x, y, z. Every part preserves orientation within the unit sphere.
     """
 
     stretch: tuple[float, float, float] = (0.0, 0.0, 0.0)  # logs of the scales
@@ -52,7 +52,7 @@ class Deformation:
         )
 
     def apply(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Moves points of the unit ball; the result is not normalised again."""
+        """Moves points of the unit sphere; the result is not normalised again."""
         points = np.asarray(points, dtype=np.float64) * np.exp(self.stretch)
         points = _taper(points, self.taper, self.taper_axis)
         points = _twist(points, self.twist, self.twist_axis)
@@ -60,14 +60,14 @@ class Deformation:
 
 
 def deform(mesh: Mesh, seed: int, strength: float = 1.0) -> Mesh:
-    """Deforms a mesh that lies in the unit ball; its faces and repairs stay. Normalise it again afterwards.
+    """Deforms a mesh that lies in the unit sphere; its faces and repairs stay. Normalise it again afterwards.
 
     Raises:
-        ValueError: the mesh leaves the unit ball, or the strength is not from 0 to 1.
+        ValueError: the mesh leaves the unit sphere, or the strength is not from 0 to 1.
     """
     farthest = np.linalg.norm(mesh.vertices, axis=1).max()
     if farthest > 1 + 1e-6:
-        raise ValueError(f"mesh: must lie in the unit ball, found a vertex at {farthest:.4g}; normalise it first")
+        raise ValueError(f"mesh: must lie in the unit sphere, found a vertex at {farthest:.4g}; normalise it first")
     return replace(mesh, vertices=Deformation.draw(seed, strength).apply(mesh.vertices))
 
 

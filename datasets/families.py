@@ -1,4 +1,4 @@
-"""Procedural shapes: seeded samplers of a few parameters over primitives and unions of them. World axes: y up."""
+"""Procedural shapes: unions of primitives with a few random parameters. World axes: y up."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -17,18 +17,18 @@ from datasets.mesh import Mesh, fit_in_sphere, normalise
 from renderers.checks import check_at_least, check_choice, check_share
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
-VERSION = 1  # to be raised when a builder changes, so that no prior of the old shapes is taken for the new ones
+VERSION = 1  # raise it when a builder changes, so that no prior of the old shapes is used for the new ones
 HALF_GRID = 1.5  # the sampled cube reaches from -1.5 to 1.5, wider than any shape before it is normalised
 SHEAR_BOUND = 0.8  # values of sheared parts are multiplied by this, so that they stay a bound at these slopes
 
 
 @dataclass(frozen=True)
 class Family:
-    """A seeded sampler of shapes, in three parts that share none.
+    """A seeded sampler of shapes, in three disjoint splits.
 
     Args:
         name: which builder, one of `BUILDERS`.
-        resolution: of the marching cubes that turn a shape into a mesh, samples an axis.
+        resolution: samples per axis of the marching cubes that make the mesh.
         radius: of the sphere about the origin that holds a shape.
         ranges: least and largest value of each of the builder's parameters, drawn uniformly.
     """
@@ -45,7 +45,7 @@ class Family:
             if not numbers or not -inf < bounds[0] <= bounds[1] < inf:
                 raise ValueError(f"dataset.ranges.{name} must be two rising numbers, not {bounds}: write [0.1, 0.2]")
         check_at_least("resolution", self.resolution, 16, "128 keeps legs and wings")
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere, 0.97 leaves them room")
+        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
 
     def draw(self, split: Split, index: int) -> dict[str, float]:
         """The parameters of a shape."""
@@ -57,7 +57,7 @@ class Family:
         return normalise(self._raw_mesh(split, index), self.radius)
 
     def formula(self, split: Split, index: int) -> Shape:
-        """The same shape as the formula that the mesh was made from."""
+        """The same shape as a field, the formula that its mesh was made from."""
         centre, factor = fit_in_sphere(self._raw_mesh(split, index), self.radius)
         return self._raw_shape(split, index).translate(tuple(-centre)).scale(factor)
 
@@ -71,7 +71,7 @@ class Family:
         return mesh
 
     def identity(self) -> dict[str, Any]:
-        """What decides the shapes: two families of equal identity hold the same ones."""
+        """Plain data that determines the shapes: families of equal identity hold the same ones."""
         return {"version": VERSION, **asdict(self)}
 
 

@@ -1,4 +1,4 @@
-"""Local mesh files as a dataset: a single mesh becomes a family by deformations, a folder is split into parts."""
+"""Local mesh files as a dataset: deformations of a single mesh, or the meshes of a folder in three splits."""
 
 import hashlib
 from dataclasses import dataclass
@@ -14,22 +14,22 @@ from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from renderers.checks import check_at_least, check_share
 
-VERSION = 1  # to be raised when repair or deformation changes the shapes
-HELD_OUT = 0.2  # share of a folder's meshes that goes to validation, and to test
+VERSION = 1  # raise it when repair or deformation changes the shapes
+HELD_OUT = 0.2  # share of a folder's meshes in the validation split, and in the test split
 
 
 @dataclass(frozen=True)
 class LocalMeshes:
     """Shapes made from local mesh files.
 
-    One file: every shape is a seeded deformation of it, but for the first of the training part, which is the mesh
-    itself. A folder: its meshes are dealt out to the parts, and training goes on with deformations once each of its
-    meshes has been used.
+    One file: every shape is a seeded deformation of it, except the first of the training split, which is the mesh
+    itself. A folder: its meshes are distributed over the splits; once each mesh of a split has been used, its
+    deformations follow.
 
     Args:
         path: a mesh file or a folder of them.
         radius: of the sphere about the origin that holds a shape.
-        strength: of the deformations; 0 leaves a mesh as it is.
+        strength: of the deformations; 0 leaves a mesh unchanged.
     """
 
     path: str
@@ -37,7 +37,7 @@ class LocalMeshes:
     strength: float
 
     def __post_init__(self) -> None:
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere, 0.97 leaves them room")
+        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
         check_at_least("dataset.strength", self.strength, 0, "0 switches deformations off")
         find_meshes(self.path)
 
@@ -47,7 +47,7 @@ class LocalMeshes:
         return Path(self.path).resolve().stem
 
     def mesh(self, split: Split, index: int) -> Mesh:
-        """A shape as a closed mesh; its `repairs` say what was mended in the file."""
+        """A shape as a closed mesh; its `repairs` say what was repaired in the file."""
         files = self.files(split)
         file = files[index % len(files)]
         mesh = _load(file, file.stat().st_mtime_ns, self.radius)
@@ -57,7 +57,7 @@ class LocalMeshes:
         return normalise(deform(mesh, seed_of(split, index), strength=self.strength), self.radius)
 
     def files(self, split: Split) -> list[Path]:
-        """The files that a part is made from; no part shares one with another, unless there are fewer than three."""
+        """The files of a split; splits share none, unless there are fewer than three."""
         files = find_meshes(self.path)
         order = [files[i] for i in np.random.default_rng(0).permutation(len(files))]
         if len(files) == 1:
@@ -68,7 +68,7 @@ class LocalMeshes:
         return {Split.TEST: test, Split.VALIDATION: validation, Split.TRAIN: train}[split]
 
     def identity(self) -> dict[str, Any]:
-        """What decides the shapes: the files' contents, not where they lie."""
+        """Plain data that determines the shapes: the files' contents, not their paths."""
         contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in find_meshes(self.path)]
         return {
             "name": "mesh",

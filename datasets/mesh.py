@@ -1,4 +1,4 @@
-"""The triangle mesh that the rest of the project passes around."""
+"""The triangle mesh."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +12,7 @@ LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float3
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh, wound outward, with the repairs that made it so, each told in a sentence."""
+    """A triangle mesh, wound outward; `repairs` lists what was repaired, and warnings, one sentence each."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -62,7 +62,7 @@ class Mesh:
 
     @property
     def open_faces(self) -> Bool[np.ndarray, " f"]:
-        """True for faces with an edge that is not walked as often one way as the other: a rim, or a wrong winding."""
+        """True for faces with an edge that is not used equally often in both directions: a rim, or a wrong winding."""
         steps = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         keys = steps.min(axis=1) * len(self.vertices) + steps.max(axis=1)
         _, same = np.unique(keys, return_inverse=True)
@@ -101,7 +101,7 @@ class Mesh:
         return len(np.unique(labels[rim]))
 
     def compact(self) -> "Mesh":
-        """Gives the mesh without the vertices that no face uses."""
+        """The mesh without unused vertices."""
         used, faces = np.unique(self.faces, return_inverse=True)
         return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3))
 
@@ -126,7 +126,7 @@ def normalise(mesh: Mesh, radius: float) -> Mesh:
     """Moves the centre of the bounding box to the origin and scales until the farthest vertex is at `radius`.
 
     Args:
-        mesh: any mesh; vertices that no face uses are moved along but not measured.
+        mesh: any mesh; unused vertices are moved along but not measured.
         radius: positive, scene units.
     """
     centre, factor = fit_in_sphere(mesh, radius)
@@ -134,7 +134,7 @@ def normalise(mesh: Mesh, radius: float) -> Mesh:
 
 
 def fit_in_sphere(mesh: Mesh, radius: float) -> tuple[Float[np.ndarray, "3"], float]:
-    """The point that `normalise` moves to the origin, and the factor that it scales by then."""
+    """The point that `normalise` moves to the origin, and the factor by which it then scales."""
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: must be positive, found {radius}; the scenes use a little less than 1")
     used = mesh.vertices[np.unique(mesh.faces)]

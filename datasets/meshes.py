@@ -1,4 +1,4 @@
-"""Meshes from the user's own files: found, read and checked; `repair` makes them closed solids."""
+"""Finds, reads and checks the user's mesh files, and makes them closed solids by `repair`."""
 
 import difflib
 import struct
@@ -9,9 +9,10 @@ import numpy as np
 
 from datasets.mesh import Mesh
 from datasets.repair import repair
+from datasets.truncated import check_whole
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
-FLAT = 1e-12  # of the diagonal squared: a mesh with less area is a line or a point
+FLAT = 1e-12  # of the squared diagonal: a mesh with less area is a line or a point
 READ_ERRORS = (  # what trimesh raises on broken files; it has no exception of its own
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError,
     RuntimeError, TypeError, ValueError, struct.error,
@@ -46,14 +47,14 @@ def find_meshes(path: str | Path) -> list[Path]:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Reads one file and gives a closed solid, wound outward, whose `repairs` say what was changed to get there.
+    """Reads one file as a closed solid, wound outward, whose `repairs` say what was changed.
 
-    Vertices at the same place become one, so that texture seams close. A mesh that is closed already keeps its
-    surface as it is. Otherwise its holes are closed and overlapping parts merged; where that gives no solid, it is
-    wrapped: a closed surface is shrunk around it.
+    Vertices at the same place are merged, so that texture seams close. A mesh that is already closed keeps its
+    surface. Otherwise its holes are closed and overlapping parts merged; where that gives no solid, it is wrapped: a
+    closed surface is shrunk around it.
 
     Raises:
-        ValueError: the file is missing, empty, broken, or holds no surface.
+        ValueError: the file is missing, empty, truncated, broken, or holds no surface or no volume.
     """
     path = Path(path)
     if path.is_dir():
@@ -71,6 +72,7 @@ def _read(path: Path) -> Mesh:
 
     if path.stat().st_size == 0:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
+    doubts = check_whole(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a broken file makes numpy warn; its numbers are checked below
@@ -83,10 +85,11 @@ def _read(path: Path) -> Mesh:
             f"{' '.join(str(error).split())[:120]}); export or copy it again"
         ) from None
     if not parts:
-        raise ValueError("must have faces, found none; export it as a surface of triangles, not points or lines")
+        where = "the file is truncated, or holds points or lines"
+        raise ValueError(f"must have faces, found none: {where}; copy it again, or export it as a surface of triangles")
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
     faces = [part[1] + offset for part, offset in zip(parts, offsets, strict=False)]
-    mesh = Mesh(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces))
+    mesh = Mesh(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces), doubts)
     if mesh.area <= FLAT * mesh.diagonal**2:
         raise ValueError(
             f"must have an area, found {mesh.area:.3g} in a box {mesh.diagonal:.3g} across; "

@@ -1,4 +1,4 @@
-"""What is given of a view: how much of its depth."""
+"""Chooses the pixels of a view whose depth is given."""
 
 import torch
 from jaxtyping import Bool

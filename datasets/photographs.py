@@ -1,4 +1,4 @@
-"""Colour images of a textured mesh from cameras all around it, with what a real camera adds."""
+"""Colour images of a textured mesh from cameras all around it, with noise, blur and exposure of a real camera."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ from datasets.truth import Truth
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 
-SUPERSAMPLING = 2  # rays a side of a pixel, whose mean is its colour
+SUPERSAMPLING = 2  # a pixel's colour is the mean over 2 x 2 rays
 LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT = 0.4  # of the light; the rest comes from one side
 GREY = 0.5
-UNIFORM = 1e-3  # between the quartiles of a surface's colours: below this it tells nothing
+UNIFORM = 1e-3  # least difference between the quartiles of a surface's colours: below it nothing can be matched
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """What a camera saw, with its colours: RGB from 0 to 1."""
+    """A view with its colours, RGB from 0 to 1."""
 
     view: View
     colours: Float[Tensor, "height width 3"]
@@ -36,14 +36,14 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Photography:
-    """How photographs are taken.
+    """Settings of photographs.
 
     Args:
-        views: cameras, evenly spaced on a circle about the vertical axis, of which the first is the scene's own.
+        views: number of cameras, evenly spaced on a circle about the vertical axis; the first is the scene's camera.
         texture: one of `datasets.textures.TEXTURES`.
         texture_size: of its largest parts, in scene units; see `datasets.textures.make_texture`.
-        shading: "unlit": the texture's own colours; "lambertian": under a light that stands still.
-        background: "grey", or "noise" that differs from view to view, as a background far behind does.
+        shading: "unlit": the texture's colours; "lambertian": under a fixed light.
+        background: "grey", or "noise" that differs between views, as a distant background does.
         noise: standard deviation of each colour's noise.
         blur: standard deviation of a Gaussian, in pixels.
         exposure: standard deviation of the logarithm of each view's exposure.
@@ -59,34 +59,34 @@ class Photography:
     exposure: float
 
     def __post_init__(self) -> None:
-        check_at_least("task.images.views", self.views, 2, "a view is compared with its neighbour: 24 work")
-        check_choice("task.images.texture", self.texture, TEXTURES)
-        check_positive("task.images.texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
-        check_choice("task.images.shading", self.shading, ("unlit", "lambertian"))
-        check_choice("task.images.background", self.background, ("grey", "noise"))
+        check_at_least("views", self.views, 2, "views are compared with their neighbours: 24 work")
+        check_choice("texture", self.texture, TEXTURES)
+        check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
+        check_choice("shading", self.shading, ("unlit", "lambertian"))
+        check_choice("background", self.background, ("grey", "noise"))
         if (self.texture, self.shading) == ("plain", "unlit"):
-            raise ValueError("a plain texture in no light has nothing to compare: set task.images.shading=lambertian")
+            raise ValueError("a plain texture without shading has nothing to compare: set shading=lambertian")
         for name in ("noise", "blur", "exposure"):
-            check_at_least(f"task.images.{name}", getattr(self, name), 0, f"task.images.{name}=0 switches it off")
+            check_at_least(f"{name}", getattr(self, name), 0, f"{name}=0 switches it off")
 
     def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Photograph]:
         """The photographs of a mesh.
 
         Raises:
-            ValueError: where a camera sees nothing of it, or its surface has one colour only.
+            ValueError: where a camera sees nothing of it, or all colours of its surface are alike.
         """
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
         cameras = [turned(first, 2 * np.pi * index / self.views) for index in range(self.views)]
-        taken = [self._one(truth, texture, camera, generator) for camera in cameras]
+        taken = [self._take_one(truth, texture, camera, generator) for camera in cameras]
         for index, photograph in enumerate(taken):
             if not bool(photograph.view.mask.any()):
                 raise ValueError(f"camera {index} sees nothing of the shape: widen view.field_of_view or distance")
         if max(_spread(photograph) for photograph in taken) < UNIFORM:
-            raise ValueError("the surface has one colour in all images: choose another task.images.texture or shading")
+            raise ValueError("the surface has one colour in all images: choose another texture or shading")
         return taken
 
-    def _one(self, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator) -> Photograph:
+    def _take_one(self, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator) -> Photograph:
         fine = camera.resized(SUPERSAMPLING * camera.height, SUPERSAMPLING * camera.width)
         rays = fine.rays().flat()
         origins, directions = rays.origins.numpy().astype(float), rays.directions.numpy().astype(float)
@@ -108,13 +108,13 @@ class Photography:
 
 
 def _spread(photograph: Photograph) -> float:
-    """Between the quartiles of the colours on the shape: its outline, mixed with the background, is no texture."""
+    """The interquartile range of the colours on the shape; it ignores outline pixels, which mix with the background."""
     quartiles = photograph.colours[photograph.view.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
     return float((quartiles[1] - quartiles[0]).max())
 
 
 def turned(camera: Camera, angle: float) -> Camera:
-    """The camera after it went around the world's vertical axis, by an angle in radians."""
+    """The camera after a rotation about the world's vertical axis, by an angle in radians."""
     c, s = np.cos(angle), np.sin(angle)
     turn = torch.eye(4, dtype=camera.world_to_camera.dtype)
     turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = c, s, -s, c

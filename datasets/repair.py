@@ -1,4 +1,4 @@
-"""Repair: any triangle mesh becomes a closed solid, and every change is told."""
+"""Repairs triangle meshes: makes them closed solids, and notes every change."""
 
 import contextlib
 from dataclasses import replace
@@ -8,36 +8,44 @@ import numpy as np
 from datasets.mesh import Mesh
 from datasets.truth import Truth, sample_surface
 
-WELD = 1e-6  # of the diagonal: vertices nearer than this, about ten float32 steps, are one
+WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
 THIN = 1e-6  # of the diagonal: a closed part thinner than this on average encloses nothing
-WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: widest gap that a wrap does not enter, coarse to fine
+WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: gaps up to this width are closed by a wrap; coarse to fine
 WRAP_OFFSET = 0.1  # % of the diagonal: how far outside the surface a wrap lies
-HOLLOW_SHARE = 0.15  # of the coarser wrap's volume: a finer one that loses more has entered the inside,
-HOLLOW_SIZE = 0.005  # but for less than this share of the diagonal cubed, as around a sheet
+HOLLOW_SHARE = 0.15  # of the coarser wrap's volume: a finer wrap that loses more has entered the inside,
+HOLLOW_SIZE = 0.005  # unless it loses less than this share of the cubed diagonal, as around a sheet
 OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired solid than this was cut away
+CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
+SHEET = 0.3  # % of the diagonal: a wrap with less mean thickness is that of a sheet, two offsets thick
 OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
 
 
 def repair(mesh: Mesh) -> Mesh:
-    """Makes a mesh a closed solid, wound outward and without overlaps, with as little change as does it."""
+    """Makes a mesh a closed solid, wound outward and without overlaps, with as little change as possible.
+
+    Where that changes its area or volume by more than `CHANGED`, the first entry of `repairs` is a warning.
+
+    Raises:
+        ValueError: where it encloses no volume.
+    """
     mesh = _tidy(mesh)
     closed = _drop_flat_parts(_close(mesh))
     if closed is None:
-        return _wrap(mesh, "it is a sheet that encloses nothing")
+        return _warned(mesh, _wrap_flat(mesh))
     if not closed.watertight:
-        return _wrap(closed, "its parts do not close into a solid")
+        return _warned(mesh, _wrap(closed, "its parts do not close into a solid"))
     solid = _merge(_turn_outward(closed))
     if solid is None:
-        return _wrap(closed, "its overlapping parts could not be merged into a solid")
+        return _warned(mesh, _wrap(closed, "its overlapping parts could not be merged into a solid"))
     if solid.repairs != mesh.repairs and not _covers(solid, mesh):
-        return _wrap(mesh, "closing its holes and merging its parts would cut away some of its surface")
-    return solid
+        return _warned(mesh, _wrap(mesh, "closing its holes and merging its parts would cut away some of its surface"))
+    return _warned(mesh, solid, closed)
 
 
 def _tidy(mesh: Mesh) -> Mesh:
-    """Makes vertices at the same place one, drops faces without three corners and faces that are given twice.
+    """Merges vertices at the same place, drops faces without three corners and duplicate faces.
 
-    Two faces back to back cancel, unless their whole part is double-sided: of such a part one side stays.
+    Two faces back to back cancel, unless their whole part is double-sided: then one side is kept.
     """
     import pymeshlab
 
@@ -55,11 +63,11 @@ def _tidy(mesh: Mesh) -> Mesh:
     kept = np.sort(np.concatenate([keep, double_sided]))
     if len(kept) == len(faces):
         return replace(mesh, faces=faces)
-    return _told(replace(mesh, faces=faces[kept]), f"{_count(len(faces) - len(kept), 'doubled face')} dropped")
+    return _with_note(replace(mesh, faces=faces[kept]), f"{_count(len(faces) - len(kept), 'doubled face')} dropped")
 
 
 def _close(mesh: Mesh) -> Mesh:
-    """Closes the parts that are open, by winding them consistently or else by closing their holes."""
+    """Closes open parts, by winding them consistently or else by closing their holes."""
     parts = mesh.parts
     opened = np.isin(parts, parts[mesh.open_faces])
     if not opened.any():
@@ -68,7 +76,7 @@ def _close(mesh: Mesh) -> Mesh:
     wind = ("meshing_re_orient_faces_coherently", {})
     closed = _apply(shells, wind)
     if closed.watertight:
-        closed = _told(closed, "faces wound consistently")
+        closed = _with_note(closed, "faces wound consistently")
     else:
         cut = ("meshing_repair_non_manifold_edges", {"method": "Remove Faces"})
         split = ("meshing_repair_non_manifold_vertices", {"vertdispratio": 0.0})
@@ -76,7 +84,7 @@ def _close(mesh: Mesh) -> Mesh:
         shells = _apply(shells, cut, split, wind)
         closed = _apply(shells, fill, wind)
         if (count := shells.holes - closed.holes) > 0:
-            closed = _told(closed, f"{_count(count, 'hole')} closed")
+            closed = _with_note(closed, f"{_count(count, 'hole')} closed")
     faces = np.concatenate([mesh.faces[~opened], closed.faces + len(mesh.vertices)])
     return replace(closed, vertices=np.concatenate([mesh.vertices, closed.vertices]), faces=faces).compact()
 
@@ -91,14 +99,14 @@ def _drop_flat_parts(mesh: Mesh) -> Mesh | None:
     if not flat.any():
         return mesh
     kept = replace(mesh, faces=mesh.faces[~flat[parts]])
-    return _told(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
+    return _with_note(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
 
 
 def _turn_outward(mesh: Mesh) -> Mesh:
-    """Turns the parts that are inside out, but for cavities: inverted parts that lie within another."""
+    """Turns parts that are inside out, except cavities: inverted parts that lie within another."""
     parts = mesh.parts
     volumes = mesh.part_volumes
-    sign = 1 if volumes.sum() > 0 else -1  # the whole mesh may be inside out, its cavities with it
+    sign = 1 if volumes.sum() > 0 else -1  # the whole mesh, with its cavities, may be inside out
     outward = sign * volumes > 0
     for part in np.flatnonzero(~outward):
         points = mesh.vertices[mesh.faces[parts == part, 0]][:16]
@@ -108,11 +116,11 @@ def _turn_outward(mesh: Mesh) -> Mesh:
     if not turn.any():
         return mesh
     faces = np.where(turn[parts][:, None], mesh.faces[:, ::-1], mesh.faces)
-    return _told(replace(mesh, faces=faces), f"{_count(int(turn.sum()), 'part')} turned outward")
+    return _with_note(replace(mesh, faces=faces), f"{_count(int(turn.sum()), 'part')} turned outward")
 
 
 def _merge(mesh: Mesh) -> Mesh | None:
-    """Merges what overlaps, so that a ray crosses the surface once between in and out; None if it cannot."""
+    """Merges overlapping parts, so that surfaces inside the solid vanish; None where that fails."""
     import pymeshlab
 
     count = mesh.parts.max() + 1
@@ -132,19 +140,19 @@ def _merge(mesh: Mesh) -> Mesh | None:
         return None
     left = merged.parts.max() + 1
     if left < count:
-        return _told(merged, f"{count} overlapping parts merged into {left}")
-    return _told(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
+        return _with_note(merged, f"{count} overlapping parts merged into {left}")
+    return _with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
 
 
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
-    """True if next to nothing of the mesh's surface lies outside the solid."""
+    """True where at most `OUTSIDE_SHARE` of the mesh's surface lies outside the solid."""
     points, _ = sample_surface(mesh, 5000, seed=0)
     outside = Truth(solid).signed_distance(points) > OUTSIDE_BY * mesh.diagonal
     return bool(outside.mean() <= OUTSIDE_SHARE)
 
 
 def _wrap(mesh: Mesh, reason: str) -> Mesh:
-    """Shrinks a closed surface around the mesh, as finely as goes without entering its inside."""
+    """Shrinks a closed surface around the mesh, as fine as possible without entering its inside."""
     import pymeshlab
 
     wrapped = None
@@ -159,7 +167,59 @@ def _wrap(mesh: Mesh, reason: str) -> Mesh:
                 break
         wrapped, used = finer, alpha
     how = f"a closed surface shrunk around it, {WRAP_OFFSET:g} % of the diagonal outside, over gaps up to {used:g} %"
-    return _told(wrapped, f"wrapped: {how}, since {reason}")
+    return _with_note(wrapped, f"wrapped: {how}, since {reason}")
+
+
+def _wrap_flat(mesh: Mesh) -> Mesh:
+    """Wraps a mesh whose parts are all flat: walls around a room enclose a volume, sheets do not.
+
+    Raises:
+        ValueError: where they have none.
+    """
+    wrapped = _wrap(mesh, "all its parts are flat")
+    if 2 * wrapped.volume / wrapped.area > SHEET / 100 * mesh.diagonal:
+        return wrapped
+    found = "a single triangle" if len(mesh.faces) == 1 else f"{_count(len(mesh.faces), 'face')} in flat sheets"
+    done = f" (after {'; '.join(mesh.repairs)})" if mesh.repairs else ""
+    raise ValueError(
+        f"must enclose a volume, found {found}{done}; copy the file again if it is truncated, else export a closed "
+        "surface or give the sheet a thickness"
+    )
+
+
+def _warned(before: Mesh, after: Mesh, closed: Mesh | None = None) -> Mesh:
+    """The repaired mesh, with a warning where its area or volume changed much.
+
+    Args:
+        before: the mesh as read.
+        after: the repaired mesh.
+        closed: the mesh before overlapping parts were merged, which counts overlaps twice: the smaller change counts.
+    """
+    if after.repairs == before.repairs:
+        return after
+    wound = _apply(before, ("meshing_re_orient_faces_coherently", {}))
+    changes = []
+    for name, was, *now in (
+        ("area", before.area, after.area, *([closed.area] if closed else [])),
+        ("volume", _enclosed(wound), after.volume, *([_enclosed(closed)] if closed else [])),
+    ):
+        if was > 0 and min(abs(value - was) for value in now) > CHANGED * was:
+            changes.append(f"{name} from {was:.4g} to {now[0]:.4g} ({now[0] / was - 1:+.0%})")
+    if not changes:
+        return after
+    what = " and ".join(changes)
+    warning = f"warning: repair changed the {what}, in the file's units: check the pictures, or repair the file"
+    return replace(after, repairs=(warning, *after.repairs))
+
+
+def _enclosed(mesh: Mesh) -> float:
+    """The volume of all parts; of an open part, that between its faces and their centroid."""
+    parts = mesh.parts
+    faces = np.bincount(parts)
+    corners = mesh.vertices[mesh.faces]
+    middles = np.stack([np.bincount(parts, weights=axis) / faces for axis in corners.mean(axis=1).T], axis=1)
+    heights = ((corners[:, 0] - middles[parts]) * mesh.crosses).sum(axis=1)
+    return float(np.abs(np.bincount(parts, weights=heights / 6)).sum())
 
 
 def _winding(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -185,7 +245,7 @@ def _current(meshes, before: Mesh) -> Mesh:
 
 
 def _apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
-    """Runs filters of pymeshlab; one that refuses leaves the mesh as it is, and the caller's checks decide."""
+    """Runs filters of pymeshlab; one that fails leaves the mesh unchanged, which the caller checks."""
     import pymeshlab
 
     meshes = _mesh_set(mesh)
@@ -195,7 +255,7 @@ def _apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
     return _current(meshes, mesh)
 
 
-def _told(mesh: Mesh, repair: str) -> Mesh:
+def _with_note(mesh: Mesh, repair: str) -> Mesh:
     return replace(mesh, repairs=(*mesh.repairs, repair))
 
 

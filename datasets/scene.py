@@ -1,4 +1,4 @@
-"""A scene: one shape, one camera, and what the camera saw of it."""
+"""A scene: one shape, one camera, and the camera's view of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from renderers.field import Field
 
 @dataclass(frozen=True)
 class View:
-    """A camera and the true images that it sees.
+    """A camera and its true images.
 
     Args:
         camera: its resolution is that of the images.
@@ -38,7 +38,7 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """A true shape and one view of it; `formula` makes the shape's field, where the shape has one."""
+    """A true shape and one view of it; `formula` gives the shape as a field, where it has a formula."""
 
     name: str
     mesh: Mesh
@@ -46,7 +46,7 @@ class Scene:
     formula: Callable[[], Field] | None = None
 
     def seed(self, seed: int) -> int:
-        """A run's seed, made another one for each scene: what is drawn for one says nothing of the next."""
+        """A run's seed combined with the scene's name, so that draws for different scenes are independent."""
         return crc32(self.name.encode()) ^ seed
 
 
@@ -55,22 +55,24 @@ class Formulas(Protocol):
     """A dataset whose shapes are formulas."""
 
     def formula(self, split: Split, index: int) -> Field:
-        """The shape of the same number as a field."""
+        """Shape number `index` of a split as a field."""
         ...
 
 
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
-    """Shape number `index` of a part of a dataset, seen by a camera that belongs to the shape."""
+    """The scene of shape number `index` of a split, with the camera of that number."""
     mesh = dataset.mesh(split, index)
     view = see(Truth(mesh), views.draw(seed_of(split, index)))
     if not bool(view.mask.any()):
-        raise ValueError(f"the camera sees nothing of {dataset.name} {index}: widen view.field_of_view or distance")
+        repaired = f" (repaired: {'; '.join(mesh.repairs)})" if mesh.repairs else ""
+        what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
+        raise ValueError(f"{what}: widen view.field_of_view or distance")
     formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
     return Scene(scene_name(dataset, split, index), mesh, view, formula)
 
 
 def scene_name(dataset: Dataset, split: Split, index: int) -> str:
-    """What a shape of a dataset is called."""
+    """The name of a dataset's shape."""
     return f"{dataset.name} {split} {index}"
 
 

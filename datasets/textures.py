@@ -1,4 +1,4 @@
-"""Colour of surfaces: solid noise, and photographs projected along the axes. RGB from 0 to 1."""
+"""Textures of surfaces: solid noise, and photographs projected along the axes. RGB from 0 to 1."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -9,9 +9,9 @@ from scipy.ndimage import map_coordinates
 
 PHOTOGRAPHS = ("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "rocket")  # that scikit-image ships
 TEXTURES = ("noise", "plain", *PHOTOGRAPHS)
-LATTICE = 64  # random colours an axis, after which solid noise repeats
+LATTICE = 64  # random colours per axis, after which solid noise repeats
 OCTAVES = 3  # each halves the cells and the weight
-CONTRAST = 2.0  # averages of random numbers lie near a half: they are spread by this
+CONTRAST = 2.0  # factor that spreads averages of random numbers, which lie near a half
 SHARPNESS = 4.0  # power of the normal's components in the blend of the three projections
 PLAIN = 0.75  # brightness of a surface without texture
 

@@ -1,4 +1,4 @@
-"""Ground truth of a mesh: exact ray hits, signed distances and samples of its surface."""
+"""Ground truth of a mesh: exact ray hits, signed distances, and samples of its surface."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Hits:
 
 
 class Truth:
-    """Answers questions about a closed mesh on the CPU, in float32: what a ray meets, how far the surface is."""
+    """Ray casting and signed distances of a closed mesh, on the CPU, in float32."""
 
     def __init__(self, mesh: Mesh):
         """Builds the search tree.
@@ -59,7 +59,7 @@ class Truth:
         return Hits(distance=distance, normals=normals, hit=np.isfinite(distance))
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Gives the distance to the surface, negative inside, with the sign by majority over five rays a point."""
+        """Gives the distance to the surface, negative inside, with the sign by majority over five rays per point."""
         points = np.asarray(points, dtype=np.float32)
         flat = self._tensor(np.ascontiguousarray(points.reshape(-1, 3)))
         return self._scene.compute_signed_distance(flat, nsamples=5).numpy().reshape(points.shape[:-1])

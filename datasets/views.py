@@ -1,4 +1,4 @@
-"""Where cameras stand."""
+"""Positions of cameras."""
 
 from dataclasses import dataclass
 from math import inf, radians, tan
@@ -45,7 +45,7 @@ class ViewSampler:
         return self.resolution / 2 / tan(radians(self.field_of_view) / 2)
 
     def draw(self, seed: int) -> Camera:
-        """Camera number `seed`; its draws are not those of the shape of the same number."""
+        """Camera number `seed`; its random draws are independent of the shape of the same number."""
         generator = np.random.default_rng([seed, 1])
         return self.camera(generator.uniform(*self.azimuth), generator.uniform(*self.elevation))
 
@@ -61,10 +61,10 @@ class ViewSampler:
 
 
 def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The world_to_camera of a camera at `eye` that sees `target` in its middle, with world y up in the image.
+    """The world_to_camera of a camera at `eye` with `target` in the middle of its image and world y up.
 
     Raises:
-        ValueError: where the camera looks straight up or down, or stands on its target.
+        ValueError: where the camera looks straight up or down, or is at its target.
     """
     up = torch.tensor([0.0, 1.0, 0.0])
     forward = torch.nn.functional.normalize(target - eye, dim=0)

@@ -1,4 +1,4 @@
-"""Roots between two samples of a field on a ray: the first change from free to occupied, and how to close in on it.
+"""Roots between two samples of a field on a ray: the first change from free to occupied, and its refinement.
 
 Everything here runs without a graph; `gradients.implicit` attaches the gradient afterwards.
 """
@@ -46,13 +46,13 @@ def first_crossing(
 
 
 def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: int) -> Bracket:
-    """Brackets closer about the root, by one value of the field a step and ray.
+    """Narrows brackets about the root, with one field value per step and ray.
 
     Args:
         field: where it has no finite value it counts as occupied.
         rays: n rays, as many as the bracket has.
         method: "secant", where the line through both ends meets zero, or "bisection", the middle.
-        steps: how often.
+        steps: number of repetitions.
     """
     near, far, near_value, far_value = bracket.near, bracket.far, bracket.near_value, bracket.far_value
     for _ in range(steps):

@@ -54,7 +54,7 @@ class Rays:
     def coarser(self, factor: int) -> "Rays":
         """One ray for each block of factor x factor pixels, through its middle; image rays only.
 
-        The last row and column of blocks are filled up by repeating the image's edge.
+        The last row and column of blocks are padded by repeating the image's edge.
         """
         return Rays(
             _block_mean(self.origins, factor),
@@ -98,11 +98,11 @@ class Camera:
 
     @property
     def center(self) -> Float[Tensor, "3"]:
-        """Where the camera is, in world coordinates."""
+        """The position of the camera, in world coordinates."""
         return self.camera_to_world[:3, 3]
 
     def resized(self, height: int, width: int) -> "Camera":
-        """The same view in other pixels."""
+        """The same view at another resolution."""
         intrinsics = self.intrinsics.clone()
         intrinsics[0] *= width / self.width
         intrinsics[1] *= height / self.height
@@ -125,6 +125,16 @@ class Camera:
         motion = rigid(twist)
         return Camera(self.intrinsics, motion @ self.world_to_camera, self.height, self.width)
 
+    def with_object_moved(self, twist: Float[Tensor, "6"]) -> "Camera":
+        """The camera that sees an unmoved object as this one sees it after a rigid motion; gradients flow to the twist.
+
+        The motion is about the object's origin, so that a turn does not carry the object out of the image.
+
+        Args:
+            twist: see `rigid`.
+        """
+        return Camera(self.intrinsics, self.world_to_camera @ rigid(twist), self.height, self.width)
+
     def to(self, device: torch.device) -> "Camera":
         """The same camera on a device."""
         return Camera(self.intrinsics.to(device), self.world_to_camera.to(device), self.height, self.width)
@@ -142,6 +152,19 @@ class Camera:
     def depth(self, distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """Camera z of the points at `distance` along each pixel's ray (DIST, Eq. 2)."""
         return distance / torch.linalg.vector_norm(self._bearings(), dim=-1)
+
+    def project(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+        """Where the camera sees points of the world.
+
+        Returns:
+            pixels: column and row; the first pixel's centre is (0.5, 0.5). Without meaning behind the camera.
+            depth: camera z, in scene units; 0 or less behind the camera.
+        """
+        motion = self.world_to_camera
+        seen = points @ motion[:3, :3].T + motion[:3, 3]
+        depth = seen[..., 2]
+        plane = seen / torch.where(depth > 0, depth, 1.0)[..., None]
+        return (plane @ self.intrinsics.T)[..., :2], depth
 
     def _bearings(self) -> Float[Tensor, "height width 3"]:
         """Camera coordinates of the pixel centres on the plane z = 1."""
@@ -170,7 +193,7 @@ def sphere_span(
     Returns:
         entry, exit: distances along the ray, entry 0 where the ray starts inside; both are the distance of the closest
             approach where it misses. Gradients flow to the rays.
-        meets: false where the ray misses the sphere, or has it behind.
+        meets: false where the ray misses the sphere, or the sphere lies behind its origin.
     """
     approach = -(rays.origins * rays.directions).sum(-1)
     beyond = rays.origins + approach[..., None] * rays.directions

@@ -1,4 +1,4 @@
-"""Checks of arguments at the edges; each names the argument, the rule, the value found and the remedy."""
+"""Checks of arguments; each message names the argument, the rule, the value found and the remedy."""
 
 from math import isfinite
 

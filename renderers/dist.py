@@ -1,4 +1,4 @@
-"""DIST: sphere tracing of a network, made cheap (Liu et al., CVPR 2020)."""
+"""DIST: fast differentiable sphere tracing of a network (Liu et al., CVPR 2020)."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -22,23 +22,23 @@ class DIST:
 
     Source: DIST, Secs. 3.1 to 3.4, A.1 to A.3, B.2.
     Differentiable in: field parameters and rays, by the approximate rule of Eq. 4. The gradient of `distance` has the
-        right direction at each pixel and a wrong scale, alpha * samples * cos(angle of incidence); see
+        right direction at each pixel and a wrong scale, alpha * K * cos(angle of incidence); see
         `gradients.approximate`. That of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
     Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step` and `slope_samples` are ours.
         `step_clamp`, `silhouette_signed` and the average over violating pixels are as in the official code; Eq. 11
-        states neither sign nor average. Each is named, and off in the setting that takes the paper at its word. A ray
-        that begins at negative values stops at once and says so. Coarse to fine applies to rays that say that they are
-        an image; others march at full resolution.
+        states neither sign nor average. Each has a setting, which is off in the preset that follows the paper's text. A
+        ray that begins at negative values stops at once with STARTED_INSIDE. Coarse to fine applies to rays of an
+        image (`Rays.image`); others march at full resolution.
 
     Args:
-        steps: most marching steps a ray.
+        steps: most marching steps per ray.
         epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step: see
             `march.Stepping`.
-        slope_samples: points at which the steepest gradient is looked for before the march, by which values are then
-            divided (`field.steepest`); 0 trusts the field.
-        coarse_to_fine: begin with a ray for each 4 x 4 pixels.
-        samples: K, how many samples of least magnitude carry the gradient of a hit.
+        slope_samples: points at which the steepest gradient is estimated before the march (`field.steepest`); values
+            are then divided by it; 0 trusts the field.
+        coarse_to_fine: begin with one ray per 4 x 4 pixels.
+        n_gradient_samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
         silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
     """
@@ -54,7 +54,7 @@ class DIST:
     step_back: bool
     least_step: float
     slope_samples: int
-    samples: int
+    n_gradient_samples: int
     sphere_radius: float
     silhouette_signed: bool
     silhouette_average: str
@@ -67,17 +67,17 @@ class DIST:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
         check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
         check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, the paper uses 1.5")
-        check_at_least("samples", self.samples, 1, "the paper uses 1 to 3")
+        check_at_least("n_gradient_samples", self.n_gradient_samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
         check_at_least("least_step", self.least_step, 0, "0 switches it off")
-        check_at_least("slope_samples", self.slope_samples, 0, "0 switches it off, 4096 cost a pixel's worth a pixel")
+        check_at_least("slope_samples", self.slope_samples, 0, "0 switches it off; 4096 cost as much as 64 x 64 pixels")
         for name in ("extra_step_cap", "step_clamp"):
             if getattr(self, name) is not None:
                 check_positive(name, getattr(self, name), f"{name}=null switches it off")
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """Marches without a graph, then asks again for the samples that carry the gradient."""
+        """Marches without a graph, then evaluates again the samples that carry the gradient."""
         flat = rays.flat()
         with torch.no_grad():
             front = self._trace(field, rays)
@@ -117,9 +117,9 @@ class DIST:
         )
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
-                field, rays, stepping, steps=self.steps, radius=self.sphere_radius, samples=self.samples
+                field, rays, stepping, steps=self.steps, radius=self.sphere_radius, samples=self.n_gradient_samples
             )
         flat = rays.flat()
-        front = Front.on_sphere(flat, radius=self.sphere_radius, samples=self.samples)
+        front = Front.on_sphere(flat, radius=self.sphere_radius, samples=self.n_gradient_samples)
         march(field, flat, front, stepping, self.steps)
         return front

@@ -15,7 +15,7 @@ from renderers.field import Field, Kind, occupancy_logits
 from renderers.gradients import fixed_samples, implicit
 from renderers.rendering import Capabilities, Rendering, Status, assemble
 
-BLOCK = 2**20  # samples at a time: bounds memory, and changes nothing
+BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,17 @@ class DVR:
         refinement leaves. What comes into view or leaves it has no part in the gradient of `distance`.
     Needs: any level set: only signs are searched. What is thinner along the ray than the spacing may be missed.
     Deviates from the paper: the first sample lies where the ray enters the volume (Eq. 9 from j = 0, as in the official
-        code), which is the unit sphere; a ray that begins occupied says so. Rays have a gradient, which the official
-        code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as the official clamp has
-        it. `early_stop` is ours.
+        code), which is the unit sphere; a ray that begins occupied has STARTED_INSIDE. Rays have a gradient, which the
+        official code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as in the official
+        clamp. `early_stop` is ours.
 
     Args:
-        samples: n, equally spaced between where a ray enters and leaves the sphere, its ends among them.
+        n_ray_samples: n, equally spaced between where a ray enters and leaves the sphere, its ends among them.
         doublings: iterations of an optimisation at which n doubles; before the last of them n is smaller.
         refinement: "secant" as in the paper, or "bisection".
-        refinement_steps: field values that a hit costs after the search.
-        early_stop: ask the samples of a ray from front to back until it is found; else all of them, as in the paper.
+        refinement_steps: field values per hit after the search.
+        early_stop: evaluate the samples of a ray from front to back up to the first that is occupied; else all of them,
+            as in the paper.
         least_slope, keep_slope_sign: see `gradients.implicit`.
         occupancy_width: length in scene units over which a distance turns from occupied to free in the mask losses;
             see `field.occupancy_logits`. Occupancy networks do not use it.
@@ -44,7 +45,7 @@ class DVR:
         sphere_radius: of the volume of interest, a sphere about the origin.
     """
 
-    samples: int
+    n_ray_samples: int
     doublings: tuple[int, ...]
     refinement: str
     refinement_steps: int
@@ -58,44 +59,44 @@ class DVR:
     capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
 
     def __post_init__(self) -> None:
-        check_at_least("samples", self.samples, 2, "the paper uses 16 to 128")
+        check_at_least("n_ray_samples", self.n_ray_samples, 2, "the paper uses 16 to 128")
         check_choice("refinement", self.refinement, REFINEMENTS)
         check_at_least("refinement_steps", self.refinement_steps, 0, "the official code uses 8")
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("occupancy_width", self.occupancy_width, "0.02 suits distances in the unit sphere")
-        check_at_least("mask_weight", self.mask_weight, 0, "1 leaves them as they are")
+        check_at_least("mask_weight", self.mask_weight, 0, "1 keeps the paper's equations")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         if list(self.doublings) != sorted(set(self.doublings)) or min(self.doublings, default=0) < 0:
             raise ValueError(f"doublings must be rising iterations from 0, not {list(self.doublings)}: [10, 30, 50]")
 
     def at_iteration(self, iteration: int) -> "DVR":
-        """With the sampling accuracy of an iteration: n halved for each doubling that is still to come (Sec. 3.5)."""
+        """The renderer of an iteration: n is halved for each doubling that is still to come (Sec. 3.5)."""
         to_come = sum(iteration < doubling for doubling in self.doublings)
-        return replace(self, samples=max(self.samples // 2**to_come, 2))
+        return replace(self, n_ray_samples=max(self.n_ray_samples // 2**to_come, 2))
 
     def with_samples(self, samples: int) -> "DVR":
-        """With another n, at every iteration: without doublings."""
-        return replace(self, samples=samples, doublings=())
+        """The renderer with another n at every iteration, without doublings."""
+        return replace(self, n_ray_samples=samples, doublings=())
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Searches without a graph, then attaches the implicit gradient to the hits."""
         flat = rays.flat()
         entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
-        asked = meets.nonzero().squeeze(-1)
-        size = max(BLOCK // self.samples, 1)
+        queried = meets.nonzero().squeeze(-1)
+        size = max(BLOCK // self.n_ray_samples, 1)
         with torch.no_grad():
-            parts = [self._search(field, flat[some], entry[some], leave[some]) for some in asked.split(size)]
+            parts = [self._search(field, flat[some], entry[some], leave[some]) for some in queried.split(size)]
         status, ended, least_distance, least = (torch.cat(part) for part in zip(*parts, strict=True))
-        hit = asked[status == Status.HIT]
-        distance = entry.index_put((asked,), ended)
+        hit = queried[status == Status.HIT]
+        distance = entry.index_put((queried,), ended)
         found = implicit(field, flat[hit], distance[hit], least_slope=self.least_slope, keep_sign=self.keep_slope_sign)
         return assemble(
             rays,
             self.sphere_radius,
             distance=distance.index_put((hit,), found),
-            status=torch.full_like(meets, Status.MISS, dtype=torch.int8).index_put((asked,), status),
-            residual=torch.zeros_like(entry).index_put((asked,), least),
-            closest=(asked, fixed_samples(field, flat[asked], least_distance, least)),
+            status=torch.full_like(meets, Status.MISS, dtype=torch.int8).index_put((queried,), status),
+            residual=torch.zeros_like(entry).index_put((queried,), least),
+            closest=(queried, fixed_samples(field, flat[queried], least_distance, least)),
         )
 
     def silhouette_loss(
@@ -118,7 +119,7 @@ class DVR:
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""
-        shares = torch.linspace(0, 1, self.samples, dtype=entry.dtype, device=entry.device)
+        shares = torch.linspace(0, 1, self.n_ray_samples, dtype=entry.dtype, device=entry.device)
         distance = entry[:, None] + shares * (leave - entry)[:, None]
         value = self._in_order(field, rays, distance) if self.early_stop else field(_along(rays, distance))
         inside = value[:, 0] < 0
@@ -131,7 +132,7 @@ class DVR:
         status[inside], status[hit] = Status.STARTED_INSIDE, Status.HIT
         ended = torch.where(inside, entry, leave)
         magnitude = torch.where(value.isfinite(), value.abs(), torch.inf)
-        magnitude[inside, 1:] = torch.inf  # such a ray has ended at its first sample
+        magnitude[inside, 1:] = torch.inf  # such a ray ended at its first sample
         index = magnitude.argmin(dim=1, keepdim=True)
         least_distance, least = distance.gather(1, index).squeeze(1), value.gather(1, index).squeeze(1)
         least = torch.where(least.isfinite(), least, 1.0)  # a ray that met no finite value passes by
@@ -142,7 +143,7 @@ class DVR:
         """The values of the samples up to the first that is occupied; NaN behind it."""
         value = torch.full_like(distance, torch.nan)
         searching = torch.arange(len(distance), device=distance.device)
-        for sample in range(self.samples):
+        for sample in range(self.n_ray_samples):
             found = field(rays[searching].at(distance[searching, sample]))
             value[searching, sample] = found
             searching = searching[~(found < 0 if sample == 0 else found <= 0)]

@@ -1,4 +1,4 @@
-"""Fields: callables from points to values, negative inside; what they state of themselves; normals; the Meter."""
+"""Fields: callables from points to values, negative inside; their properties; normals; the Meter."""
 
 from dataclasses import dataclass, field
 from enum import Enum
@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-STEEPEST_MARGIN = 1.2  # over the steepest gradient that was found: steeper ones lie between the points
+STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
 
 
 class Kind(Enum):
-    """What the values of a field mean, from most to least.
+    """What the values of a field mean, the strongest meaning first.
 
     DISTANCE: the signed distance to the surface. BOUND: its magnitude never exceeds the distance, so that a step of
     that length passes no surface. LEVEL: only the sign and the zero set mean anything.
@@ -25,7 +25,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Flops:
-    """Floating-point operations that one point costs: its value, and going back through it in backward."""
+    """Floating-point operations per point: of its value, and of its backward pass."""
 
     value: int
     gradient: int
@@ -35,7 +35,7 @@ class Flops:
 class Field(Protocol):
     """Points [*batch, 3] to values [*batch], negative inside.
 
-    `lipschitz` bounds the length of the gradient, and `flops` says what a point costs, where that is known.
+    `lipschitz` bounds the length of the gradient, and `flops` gives the operations per point, where that is known.
     """
 
     kind: Kind
@@ -53,7 +53,7 @@ class Counts:
     gradient: int = 0
 
     def flops(self, field: Field) -> int | None:
-        """What the field spent on them, in floating-point operations."""
+        """The floating-point operations of these evaluations; None where the field does not state them."""
         if field.flops is None:
             return None
         return field.flops.value * self.value + field.flops.gradient * self.gradient
@@ -64,7 +64,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class Meter:
-    """A Field that counts what is asked of the field that it wraps, so that no renderer can under-report.
+    """A Field that counts the evaluations of the field that it wraps, so that no renderer can under-report.
 
     A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
     gradient other than zero was propagated back, counted when the backward pass arrives there.
@@ -118,7 +118,7 @@ def steepest(
         radius: of the sphere about the origin.
         samples: how many points, the same ones each time.
         margin: see `STEEPEST_MARGIN`.
-        like: a tensor of the dtype and on the device in which the field is asked; None for float64 on the CPU.
+        like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
     draws = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
     direction = torch.nn.functional.normalize(torch.randn(samples, 3, **draws), dim=-1)
@@ -130,7 +130,7 @@ def steepest(
 def central_difference_normals(
     field: Field, points: Float[Tensor, "*batch 3"], *, delta: float
 ) -> Float[Tensor, "*batch 3"]:
-    """Unit gradients of the field by central differences (DIST, Eq. 3), at six values a point.
+    """Unit gradients of the field by central differences (DIST, Eq. 3), with six values per point.
 
     Args:
         points: where, in scene units.
@@ -169,7 +169,7 @@ def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None 
     Args:
         logits: logit(p) at points.
         threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
-        flops: what a point costs, where that is known.
+        flops: operations per point, where that is known.
     """
     if not 0 < threshold < 1:
         raise ValueError(f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5")
@@ -178,7 +178,7 @@ def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None 
 
 
 def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:
-    """Logits of occupancy from a field's values; 0 on the surface, so a threshold other than 0.5 is taken off.
+    """Logits of occupancy from a field's values; 0 on the surface, also where the threshold is not 0.5.
 
     Args:
         values: of the field.

@@ -1,4 +1,4 @@
-"""The gradient rules, each once. A rule attaches a gradient to distances that were found without a graph."""
+"""The gradient rules. A rule attaches a gradient to distances that were found without a graph."""
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ def approximate(
     sample_distance: Float[Tensor, "n samples"],
     sample_value: Float[Tensor, "n samples"],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """DIST's approximate gradient: the field at the K samples of least magnitude, asked again with a graph.
+    """DIST's approximate gradient: the field at the K samples of least magnitude, evaluated again with a graph.
 
     Source: DIST, Eq. 4 (first term only) and B.2. The derivative of the distance is alpha times the sum of the
     field's derivatives at these fixed samples, so memory does not grow with the number of steps.
@@ -36,7 +36,7 @@ def approximate(
 
     Returns:
         the distances with their gradient, and the field's value at each ray's first sample; without a graph that is
-        the value of the march, which coarse to fine may have asked on a neighbour's ray.
+        the value of the march, which coarse to fine may have evaluated on a neighbour's ray.
     """
     if not torch.is_grad_enabled():
         return distance, sample_value[:, 0]
@@ -54,28 +54,28 @@ def approximate_front(
     """The approximate gradient for all n rays of a front, whose samples carry it.
 
     Returns:
-        the distances, with a gradient where the ray has hit, and the rays on which the field was asked, each with its
-        value of least magnitude.
+        the distances, with a gradient where the ray has hit, and the rays on which the field was evaluated, each with
+        its value of least magnitude.
     """
     hit = front.status == Status.HIT
-    asked = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
-    wanted = front.sample_value[asked].clone()
-    wanted[~hit[asked], 1:] = torch.inf  # a ray that hit nothing needs its closest sample only
+    queried = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
+    wanted = front.sample_value[queried].clone()
+    wanted[~hit[queried], 1:] = torch.inf  # a ray without a hit needs only its closest sample
     carried, least = approximate(
         field,
-        rays[asked],
-        front.distance[asked],
+        rays[queried],
+        front.distance[queried],
         alpha=alpha,
-        sample_distance=front.sample_distance[asked],
+        sample_distance=front.sample_distance[queried],
         sample_value=wanted,
     )
-    return torch.where(hit, front.distance.index_put((asked,), carried), front.distance), (asked, least)
+    return torch.where(hit, front.distance.index_put((queried,), carried), front.distance), (queried, least)
 
 
 def fixed_samples(
     field: Field, rays: Rays, distance: Float[Tensor, "n"], value: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
-    """The field's values at fixed distances along rays, known as `value`; asked again where a gradient is wanted."""
+    """The field's values at fixed distances along rays, `value`, evaluated again where a gradient is wanted."""
     return field(rays.at(distance.detach())) if torch.is_grad_enabled() else value
 
 
@@ -87,12 +87,12 @@ def implicit(
     Source: DVR, Eqs. 8 and 11. On the ray o + d w, the level set stays under the ray's end if
     d distance = -(d field + grad field . d(o + d w)) / (grad field . w): towards the field's parameters by its first
     term, towards the ray by its second one. Exact at a root; where the distance is off, it is the gradient of a
-    level set beside it. The surface must be crossed: what comes into view or leaves it has no part in this gradient.
+    neighbouring level set. The surface must be crossed: what comes into view or leaves it has no part in this gradient.
 
     Args:
         rays: n rays whose distance is to get a gradient.
         distance: where they cross the surface.
-        least_slope: least magnitude of the field's slope along the ray, grad field . w, in field units a scene unit.
+        least_slope: least magnitude of the field's slope along the ray, grad field . w, in field units per scene unit.
             A flatter crossing is divided by this, with the slope's own sign; rays enter, so zero counts as negative.
         keep_sign: False takes flat crossings as if rays left there, as DVR's official code does.
     """
@@ -100,7 +100,7 @@ def implicit(
         return distance
     reached = rays.at(distance.detach())
     at = reached.detach().requires_grad_(True)
-    towards_field = field(at.detach()[:0]).requires_grad  # asked of no point, so at no cost
+    towards_field = field(at.detach()[:0]).requires_grad  # no points, so no cost
     if not (towards_field or reached.requires_grad):
         return distance
     value = field(at)

@@ -22,13 +22,13 @@ class IDR:
 
     Source: IDR (Yariv et al. 2020, arXiv 2003.09852), Sec. 3.1 (intersection) and 3.3 (masked rendering).
     Differentiable in: field parameters and rays, by the implicit rule of DVR, Eq. 8, and exactly, up to `epsilon`.
-        What comes into view or leaves it has no part in the gradient of `distance`; the mask loss sees that.
+        What comes into view or leaves it has no part in the gradient of `distance`, only in that of the mask loss.
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: marches from the camera's side only, and does not sample rays that have not converged; the
         least field value on a ray is that of the marched samples. A ray that begins at negative values stops at once.
 
     Args:
-        steps: most marching steps a ray.
+        steps: most marching steps per ray.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
         least_slope: see `gradients.implicit`.
         mask_sharpness: of the mask loss, for a length of one scene unit; the paper begins at 50 and doubles it.
@@ -63,22 +63,22 @@ class IDR:
             stepping = Stepping(self.epsilon, 1.0, None, None, active_only=True, careful_split=False)
             march(field, flat, front, stepping, self.steps)
         hit = (front.status == Status.HIT).nonzero().squeeze(-1)
-        asked = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
+        queried = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
         found = implicit(field, flat[hit], front.distance[hit], least_slope=self.least_slope)
-        least = fixed_samples(field, flat[asked], front.sample_distance[asked, 0], front.sample_value[asked, 0])
+        least = fixed_samples(field, flat[queried], front.sample_distance[queried, 0], front.sample_value[queried, 0])
         return assemble(
             rays,
             self.sphere_radius,
             distance=front.distance.index_put((hit,), found),
             status=front.status,
             residual=front.value,
-            closest=(asked, least),
+            closest=(queried, least),
         )
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value, over the rays not rightly hit (Sec. 3.3), weighted."""
+        """Cross entropy of a sigmoid of the least field value, over all rays but correct hits (Sec. 3.3), weighted."""
         logits = -self.mask_sharpness * rendering.closest
         entropy = softplus(torch.where(mask, -logits, logits))
         total = (entropy * ~(mask & rendering.hit)).sum()

@@ -14,9 +14,9 @@ from renderers.camera import Rays, sphere_span
 from renderers.field import Field
 from renderers.rendering import Status
 
-PYRAMID = (4, 2)  # pixels a side of a coarse ray's block, at the first levels (DIST, Sec. 3.2)
+PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
 PYRAMID_STEPS = 3  # steps at each of these levels
-TOUCHING = 1.0001  # times the radii of two empty balls: a wall that is met head-on makes them touch
+TOUCHING = 1.0001  # times the radii of two empty spheres: at normal incidence they just touch
 CAREFUL = 2.0  # careful_split: the closest sample is not the closest point, so "closer" allows for twice the distance
 
 
@@ -29,14 +29,14 @@ class Stepping:
         alpha: the step is alpha times the value; 1 is sphere tracing, more is aggressive marching.
         extra_step_cap: bound on (alpha - 1) times the value, the part of a step that may pass a surface; None for none.
         step_clamp: bound on the magnitude of the value, before alpha, as in the official code; None for none.
-        active_only: ask the field only for rays that have not finished; else for every ray that meets the sphere.
-        careful_split: a ray goes on not from where its coarse ray is, but from where that came closest to the surface,
-            if it came about as close as the two rays lie apart there. Else rays beside an edge begin behind it.
-        step_back: a step beyond the value is taken back where the empty balls about its two ends do not meet, and the
-            value itself is gone instead (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1); so is it where the
-            step would leave the sphere. Later steps go beyond the value again.
-        least_step: forward steps are at least this long, in scene units, but for one that turns back from behind the
-            surface, else a ray would never come to rest there; 0 for none.
+        active_only: evaluate the field only for rays that have not finished; else for every ray that meets the sphere.
+        careful_split: a ray continues not from the end of its coarse ray, but from the coarse ray's closest sample, if
+            the surface is about as close there as the two rays are apart. Else rays next to an edge begin behind it.
+        step_back: a step longer than the value is shortened to the value where the empty spheres about its two ends do
+            not meet (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1), and where it would leave the bounding
+            sphere. Later steps may be longer than the value again.
+        least_step: forward steps are at least this long, in scene units, but for one that follows a step back from
+            behind the surface, else a ray would never converge there; 0 for none.
         slope: bound on the length of the field's gradient, by which values are divided before a step is made of them.
     """
 
@@ -51,7 +51,7 @@ class Stepping:
     slope: float = 1.0
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-        """The signed step along the ray after the field gave `value`."""
+        """The signed step along the ray for a field value."""
         value = value / self.slope
         if self.step_clamp is not None:
             value = value.clamp(-self.step_clamp, self.step_clamp)
@@ -63,19 +63,19 @@ class Stepping:
 
 @dataclass
 class Front:
-    """Where the front ends of n rays are, and the `samples` least field values that each has met."""
+    """The current ends of n marching rays, and the `samples` least field values found on each."""
 
     distance: Float[Tensor, "n"]
-    entry: Float[Tensor, "n"]  # where it entered the bounding sphere; a ray that is led behind it began inside
+    entry: Float[Tensor, "n"]  # of the bounding sphere; a ray that moves back beyond it began inside
     leave: Float[Tensor, "n"]
     meets: Bool[Tensor, "n"]  # the ray meets the bounding sphere
     active: Bool[Tensor, "n"]
-    fresh: Bool[Tensor, "n"]  # the field was not asked yet, on this ray or on the coarse one that it comes from
+    fresh: Bool[Tensor, "n"]  # not evaluated yet, on this ray or on its coarse ray
     status: Int8[Tensor, "n"]
     value: Float[Tensor, "n"]
     sample_distance: Float[Tensor, "n samples"]
     sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
-    safe: Float[Tensor, "n"]  # how far the last value allowed the ray to go, and how far it went
+    safe: Float[Tensor, "n"]  # the step that the last value allowed, and the step taken
     gone: Float[Tensor, "n"]
 
     @staticmethod
@@ -101,10 +101,11 @@ class Front:
     def split(
         self, parent: Int[Tensor, "children"], coarse: Rays, rays: Rays, *, radius: float, careful: bool
     ) -> "Front":
-        """The front of finer rays, each going on from where its coarse `parent` is; for `careful`, see Stepping.
+        """The front of finer rays, each continuing from its coarse `parent`; for `careful`, see Stepping.
 
-        A ray whose coarse ray met no sphere, or started inside the shape, begins anew. One whose coarse ray has left
-        the sphere has left it too. The samples of a coarse ray that hit nothing are kept: its nearest may lie behind.
+        A ray whose coarse ray missed the sphere, or started inside the shape, begins anew. One whose coarse ray has
+        left the sphere has left it too. The samples of a coarse ray without a hit are kept: its closest one may lie
+        behind the finer ray's start.
         """
         child = Front.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
         inherits = self.meets[parent] & (self.status[parent] != Status.STARTED_INSIDE)
@@ -128,24 +129,24 @@ class Front:
 def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int) -> None:
     """Moves the front of flat rays [n, 3] by at most `steps` steps, in place."""
     for _ in range(steps):
-        asked = (front.active if stepping.active_only else front.meets).nonzero().squeeze(-1)
-        if asked.numel() == 0:
+        queried = (front.active if stepping.active_only else front.meets).nonzero().squeeze(-1)
+        if queried.numel() == 0:
             return
-        value = field(rays.origins[asked] + front.distance[asked, None] * rays.directions[asked])
+        value = field(rays.origins[queried] + front.distance[queried, None] * rays.directions[queried])
         if not stepping.active_only:
-            moving = front.active[asked]
-            asked, value = asked[moving], value[moving]
-        _advance(front, asked, value, stepping)
+            moving = front.active[queried]
+            queried, value = queried[moving], value[moving]
+        _advance(front, queried, value, stepping)
 
 
 def march_coarse_to_fine(
     field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
 ) -> Front:
-    """Three steps with a ray for 4 x 4 pixels, three with one for 2 x 2, the rest with one a pixel (DIST, Sec. 3.2).
+    """Three steps with one ray per 4 x 4 pixels, three with one per 2 x 2, the rest with one per pixel (DIST, 3.2).
 
     Args:
         rays: an image of rays [*batch, height, width, 3].
-        steps: most steps of a pixel, those of its coarse rays included.
+        steps: most steps per pixel, those of its coarse rays included.
         radius, samples: see `Front.on_sphere`.
 
     Returns:
@@ -171,59 +172,61 @@ def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[
     return doubled[..., : fine[-2], : fine[-1]].reshape(-1)
 
 
-def _advance(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], stepping: Stepping) -> None:
-    """Takes in the values of the active rays `asked` and moves them, in place."""
+def _advance(front: Front, queried: Int[Tensor, "m"], value: Float[Tensor, "m"], stepping: Stepping) -> None:
+    """Moves the active rays `queried` by their field values, in place."""
     finite = value.isfinite()
     value = torch.where(finite, value, 0.0)
     converged = finite & (value.abs() < stepping.epsilon)
-    inside = finite & front.fresh[asked] & (value < 0) & ~converged
-    distance = front.distance[asked]
-    _keep_least(front, asked, torch.where(finite, value, torch.inf), distance)
+    inside = finite & front.fresh[queried] & (value < 0) & ~converged
+    distance = front.distance[queried]
+    _keep_least(front, queried, torch.where(finite, value, torch.inf), distance)
 
     # The last query moves the ray by the value itself, without alpha (DIST, Eq. 1).
     length = stepping.length(value)
-    onward = (value > 0) & (front.value[asked] >= 0)
+    onward = (value > 0) & (front.value[queried] >= 0)
     length = torch.where(onward, length.clamp_min(stepping.least_step), length)
     step = torch.where(converged, value, torch.where(inside, 0.0, length))
     if stepping.step_back:
         reach = value / stepping.slope
-        over = (distance + step > front.leave[asked]) & (distance + reach <= front.leave[asked])
-        step, apart = _taken_back(front, asked, reach, torch.where(over, reach, step))
+        over = (distance + step > front.leave[queried]) & (distance + reach <= front.leave[queried])
+        step, apart = _taken_back(front, queried, reach, torch.where(over, reach, step))
         converged &= ~apart
     moved = distance + step
-    left = ~converged & (moved > front.leave[asked])
-    behind = moved < front.entry[asked] - stepping.epsilon
+    left = ~converged & (moved > front.leave[queried])
+    behind = moved < front.entry[queried] - stepping.epsilon
     inside |= behind
     converged &= ~behind
-    moved = torch.where(behind, front.entry[asked], moved)
+    moved = torch.where(behind, front.entry[queried], moved)
 
-    status = torch.full_like(front.status[asked], Status.OUT_OF_STEPS)
+    status = torch.full_like(front.status[queried], Status.OUT_OF_STEPS)
     status[left] = Status.MISS
     status[converged] = Status.HIT
     status[inside] = Status.STARTED_INSIDE
-    front.status[asked] = status
-    front.value[asked] = value
-    front.distance[asked] = torch.where(left, front.leave[asked], moved)
-    front.fresh[asked] = False
-    front.active[asked] = finite & ~converged & ~inside & ~left
+    front.status[queried] = status
+    front.value[queried] = value
+    front.distance[queried] = torch.where(left, front.leave[queried], moved)
+    front.fresh[queried] = False
+    front.active[queried] = finite & ~converged & ~inside & ~left
 
 
 def _taken_back(
-    front: Front, asked: Int[Tensor, "m"], reach: Float[Tensor, "m"], step: Float[Tensor, "m"]
+    front: Front, queried: Int[Tensor, "m"], reach: Float[Tensor, "m"], step: Float[Tensor, "m"]
 ) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"]]:
-    """The step, or that back to where the last value reached, where the last two empty balls lie apart; and where."""
-    safe, gone = front.safe[asked], front.gone[asked]
+    """The steps, with a step back where the last two empty spheres do not meet; and on which rays that is."""
+    safe, gone = front.safe[queried], front.gone[queried]
     apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
     back = torch.where(apart, safe - gone, step)
-    front.safe[asked] = torch.where(apart, torch.inf, reach.clamp_min(0))  # what was gone back to is sure
-    front.gone[asked] = back
+    front.safe[queried] = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
+    front.gone[queried] = back
     return back, apart
 
 
-def _keep_least(front: Front, asked: Int[Tensor, "m"], value: Float[Tensor, "m"], distance: Float[Tensor, "m"]) -> None:
-    """Keeps of each ray the samples of least magnitude, in rising order."""
-    values = torch.cat([front.sample_value[asked], value[:, None]], dim=1)
-    distances = torch.cat([front.sample_distance[asked], distance[:, None]], dim=1)
+def _keep_least(
+    front: Front, queried: Int[Tensor, "m"], value: Float[Tensor, "m"], distance: Float[Tensor, "m"]
+) -> None:
+    """Keeps the samples of least magnitude of each ray, in rising order."""
+    values = torch.cat([front.sample_value[queried], value[:, None]], dim=1)
+    distances = torch.cat([front.sample_distance[queried], distance[:, None]], dim=1)
     order = values.abs().argsort(dim=1, stable=True)[:, :-1]
-    front.sample_value[asked] = values.gather(1, order)
-    front.sample_distance[asked] = distances.gather(1, order)
+    front.sample_value[queried] = values.gather(1, order)
+    front.sample_distance[queried] = distances.gather(1, order)

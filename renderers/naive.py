@@ -1,4 +1,4 @@
-"""Sphere tracing as first written: the baseline that the others are measured against."""
+"""Plain sphere tracing: the baseline of all comparisons."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -18,23 +18,23 @@ from renderers.silhouette import hinge_silhouette_loss
 
 @dataclass(frozen=True)
 class Naive:
-    """Sphere tracing that asks every ray that meets the sphere at every step. Honest and slow: not for real use.
+    """Sphere tracing that evaluates every ray that meets the sphere at every step. A slow baseline, not for real use.
 
     With the unrolled gradient all steps stay in the graph, so that time and memory grow with rays times steps. Its
-    other settings are the first rows of DIST's Table 1: rays one by one or all at once, and the practical gradient.
+    other settings are the first rows of DIST's Table 1: rays one by one or all at once, and the approximate gradient.
 
-    Source: DIST, Algorithm 1, begun on the bounding sphere (Sec. 3.2), since a network means nothing outside it.
-    Differentiable in: field parameters and rays. Unrolled, exact in the limit of many steps; short of it by a
-        factor 1 - (1 - cos(angle of incidence))^steps, which shows near grazing. Its `closest` has next to no
-        gradient at a hit, since the sample follows the surface. Practical, as DIST at alpha = 1.
+    Source: DIST, Algorithm 1, begun on the bounding sphere (Sec. 3.2), since a network is undefined outside it.
+    Differentiable in: field parameters and rays. Unrolled, exact in the limit of many steps; too short by
+        a factor 1 - (1 - cos(angle of incidence))^steps, which matters near grazing. Its `closest` has next to no
+        gradient at a hit, since the sample follows the surface. Approximate ("practical"): as DIST at alpha = 1.
     Needs: a distance or a bound inside the sphere.
-    Deviates from the paper: a ray that begins at negative values stops at once and says so.
+    Deviates from the paper: a ray that begins at negative values stops at once with STARTED_INSIDE.
 
     Args:
         steps: marching steps, all of them taken.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
-        gradient: "unrolled" through all steps, or "practical", DIST's rule (Eq. 4) at the closest samples.
-        samples: K of the practical gradient.
+        gradient: "unrolled" through all steps, or "practical", DIST's approximate rule (Eq. 4) at the closest samples.
+        n_gradient_samples: K of the approximate gradient; None with the unrolled one, which has no such number.
         serial: march the rays one after the other.
         sphere_radius: of the sphere about the origin that holds the shape.
         silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
@@ -43,7 +43,7 @@ class Naive:
     steps: int
     epsilon: float
     gradient: str
-    samples: int
+    n_gradient_samples: int | None
     serial: bool
     sphere_radius: float
     silhouette_signed: bool
@@ -57,18 +57,21 @@ class Naive:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
         check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
         check_choice("gradient", self.gradient, ("unrolled", "practical"))
-        check_at_least("samples", self.samples, 1, "the paper uses 1 to 3")
+        if self.gradient == "practical" and self.n_gradient_samples is None:
+            raise ValueError("n_gradient_samples must be given for gradient=practical: n_gradient_samples=1")
+        if self.n_gradient_samples is not None:
+            check_at_least("n_gradient_samples", self.n_gradient_samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches all rays through all steps."""
         flat = rays.flat()
-        render = self._unrolled if self.gradient == "unrolled" else self._practical
+        render = self._unrolled if self.gradient == "unrolled" else self._approximate
         if not self.serial or flat.shape.numel() == 0:
             parts = [render(field, flat)]
         else:
-            parts = [render(field, flat[one]) for one in torch.arange(flat.shape.numel()).split(1)]
+            parts = [render(field, flat[index]) for index in torch.arange(flat.shape.numel()).split(1)]
         distance = torch.cat([part.distance for part in parts]).view(rays.shape)
         return Rendering(
             distance=distance,
@@ -90,9 +93,10 @@ class Naive:
             average=self.silhouette_average,
         )
 
-    def _practical(self, field: Field, rays: Rays) -> Rendering:
+    def _approximate(self, field: Field, rays: Rays) -> Rendering:
         with torch.no_grad():
-            front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.samples)
+            assert self.n_gradient_samples is not None  # checked above
+            front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
             stepping = Stepping(self.epsilon, 1.0, None, None, active_only=False, careful_split=False)
             march(field, rays, front, stepping, self.steps)
         distance, closest = approximate_front(field, rays, front, alpha=1.0)

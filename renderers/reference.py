@@ -1,4 +1,4 @@
-"""The slow judge: hits of a field in float64, sure up to a stated bound. For ground truth only; it has no gradient."""
+"""The reference tracer: hits of a field in float64, exact up to a stated bound. Slow, for ground truth; no gradient."""
 
 import torch
 
@@ -8,12 +8,12 @@ from renderers.checks import check_positive
 from renderers.field import Field
 from renderers.rendering import Rendering, Status, assemble
 
-BISECTIONS, SECANTS = 12, 8  # how a bracket is narrowed: the middle is safe, the secant is exact on straight pieces
+BISECTIONS, SECANTS = 12, 8  # steps that narrow a bracket: bisection is safe, the secant exact for a linear field
 
 
 @torch.no_grad()
 def trace(field: Field, rays: Rays, *, lipschitz: float, least_step: float, radius: float) -> Rendering:
-    """The first hit of every ray in the sphere, by steps that pass no surface, and a bracketed root.
+    """The first hit of every ray in the sphere, by steps that cross no surface, and a bracketed root.
 
     A step is |field| / lipschitz, which is safe where that bounds the gradient (Hart 1996), but at least
     `least_step`: what is thinner along the ray than that, and nearer than lipschitz * least_step, may be missed.
@@ -58,12 +58,12 @@ def trace(field: Field, rays: Rays, *, lipschitz: float, least_step: float, radi
     bracket = narrow(field, flat[hit], bracket, method="bisection", steps=BISECTIONS)
     distance, remaining = refine(field, flat[hit], bracket, method="secant", steps=SECANTS)
     residual = torch.where(least.isfinite(), least, 0.0).index_put((hit,), remaining)
-    asked = meets.nonzero().squeeze(-1)
+    queried = meets.nonzero().squeeze(-1)
     return assemble(
         rays,
         radius,
         distance=torch.where(status == Status.MISS, leave, at).index_put((hit,), distance),
         status=status,
         residual=residual,
-        closest=(asked, residual[asked]),
+        closest=(queried, residual[queried]),
     )

@@ -1,4 +1,4 @@
-"""What a renderer gives, and what it states of itself."""
+"""The contract of renderers: the Rendering that they return, and their capabilities."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -22,13 +22,13 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Rendering:
-    """One answer a ray, all of the rays' leading shape, all finite.
+    """One answer per ray, all of the rays' leading shape, all finite.
 
     Args:
         distance: along the ray to where it ended; a surface only where `hit`. Differentiable as the renderer states.
         status: of each ray, a Status as int8.
         points: the points at `distance`.
-        residual: the field's value where it was last asked, for the error that is left. Not differentiable.
+        residual: the last field value on the ray, a measure of the remaining error. Not differentiable.
         closest: the field's value, with its sign, at the sample of least magnitude on the ray. Its magnitude less a
             threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable.
     """
@@ -47,11 +47,12 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a renderer can do.
+    """A renderer's capabilities.
 
     Args:
         needs: the kinds of field that it is meant for.
-        field_gradient, ray_gradient: whether `distance` has a gradient towards the field's parameters and the rays.
+        field_gradient, ray_gradient: whether `distance` and the silhouette loss have a gradient towards the field's
+            parameters and the rays; checked in `boundary`.
     """
 
     needs: tuple[Kind, ...]
@@ -95,7 +96,7 @@ class Spaced(Renderer, Protocol):
     sphere_radius: float
 
     def with_samples(self, samples: int) -> "Spaced":
-        """The renderer with that many samples a ray, at every iteration."""
+        """The renderer with that many samples per ray, at every iteration."""
         ...
 
 
@@ -113,16 +114,16 @@ def assemble(
     residual: Float[Tensor, "n"],
     closest: tuple[Int[Tensor, "m"], Float[Tensor, "m"]],
 ) -> Rendering:
-    """The rendering of rays of any leading shape, from one answer a ray in one row.
+    """The rendering of rays of any leading shape, from one answer per ray in one row.
 
     Args:
         rays: all n of them.
         radius: of the sphere about the origin that holds the shape.
         distance, status, residual: as in Rendering.
-        closest: the rays on which the field was asked, and its value of least magnitude on these. For the others,
-            `closest` is how far they pass by the sphere (DIST, A.3).
+        closest: the rays on which the field was evaluated, and its value of least magnitude on these. For the others,
+            `closest` is their distance from the sphere (DIST, A.3).
     """
-    asked, least = closest
+    queried, least = closest
     passing_by = distance_to_origin(rays.flat()) - radius
     shaped = distance.view(rays.shape)
     return Rendering(
@@ -130,5 +131,5 @@ def assemble(
         status=status.view(rays.shape),
         points=rays.at(shaped),
         residual=residual.detach().view(rays.shape),
-        closest=passing_by.index_put((asked,), least).view(rays.shape),
+        closest=passing_by.index_put((queried,), least).view(rays.shape),
     )

@@ -20,9 +20,9 @@ def hinge_silhouette_loss(
         mask: true on the foreground.
         epsilon: the threshold between them, in scene units.
         signed: False takes the magnitude of `closest`, as the paper does. A background ray that stops just inside the
-            shape is then pushed deeper. True keeps the sign, which mends that.
+            shape is then pushed deeper. True keeps the sign, which avoids that.
         average: over "all" rays, or over those that are "violating". With all, a missed pixel weighs next to nothing,
-            and an optimiser can lower the loss of depth by losing hits.
+            and an optimiser can lower the depth loss by losing hits.
     """
     soft = (closest if signed else closest.abs()) - epsilon
     violation = torch.where(mask, soft, -soft).clamp_min(0)

@@ -13,11 +13,19 @@ from renderers.rendering import Rendering
 
 
 class Failing:
-    """IDR, until it is asked for its third rendering with a gradient; then it fails as `how` says."""
+    """IDR, until it is asked for its third rendering with a gradient; then it fails as `how` says.
+
+    What is wrong with its silhouette loss is so from the first one on.
+
+    Args:
+        how: it fails, one of FAILURES.
+        pause: seconds before each rendering.
+        limits: not its own: seconds for each way to fail, for the `time_limit` of a sweep over `how` to refer to.
+    """
 
     capabilities = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
 
-    def __init__(self, how: str = "not", pause: float = 0.0):
+    def __init__(self, how: str = "not", pause: float = 0.0, limits: dict | None = None):
         self.how, self.pause, self.renderings = how, pause, 0
         self.tracer = IDR(
             steps=10, epsilon=1e-3, least_slope=1e-3, mask_sharpness=50.0, mask_weight=100.0, sphere_radius=1.0
@@ -30,7 +38,8 @@ class Failing:
         return FAILURES[self.how](rendering) if self.renderings == 3 else rendering
 
     def silhouette_loss(self, field, rays, rendering, mask):
-        return self.tracer.silhouette_loss(field, rays, rendering, mask)
+        loss = self.tracer.silhouette_loss(field, rays, rendering, mask)
+        return LOSSES.get(self.how, lambda loss: loss)(loss)
 
 
 def _raise(rendering: Rendering) -> Rendering:
@@ -41,9 +50,25 @@ def _not_a_number(rendering: Rendering) -> Rendering:
     return Rendering(**{**vars(rendering), "distance": rendering.distance * float("nan")})
 
 
+def _nothing(rendering: Rendering) -> None:
+    return None
+
+
+def _short(rendering: Rendering) -> Rendering:
+    return Rendering(**{name: part[:-1] for name, part in vars(rendering).items()})
+
+
+def _double(rendering: Rendering) -> Rendering:
+    return Rendering(**{**vars(rendering), "distance": rendering.distance.double()})
+
+
+def _detached(rendering: Rendering) -> Rendering:
+    return Rendering(**{**vars(rendering), "distance": rendering.distance.detach()})
+
+
 def _loop(rendering: Rendering) -> Rendering:
     while True:
-        pass
+        time.sleep(0.1)
 
 
 def _native_loop(rendering: Rendering) -> Rendering:
@@ -81,6 +106,10 @@ FAILURES = {
     "not": lambda rendering: rendering,
     "raise": _raise,
     "not_a_number": _not_a_number,
+    "nothing": _nothing,
+    "short": _short,
+    "double": _double,
+    "detached": _detached,
     "loop": _loop,
     "native_loop": _native_loop,
     "leave": _leave,
@@ -88,4 +117,12 @@ FAILURES = {
     "terminate": _terminate,
     "segfault": _segfault,
     "hog": _hog,
+    "no_loss": lambda rendering: rendering,
+    "loss_per_ray": lambda rendering: rendering,
+    "detached_loss": lambda rendering: rendering,
+}
+LOSSES = {
+    "no_loss": lambda loss: None,
+    "loss_per_ray": lambda loss: loss.expand(144),
+    "detached_loss": lambda loss: loss.detach() + 1,
 }

@@ -1,4 +1,4 @@
-"""Who may import whom: renderers <- datasets <- bench, and a report that needs no torch."""
+"""Who may import whom: renderers <- datasets <- bench, in bench room by room, and a report that needs no torch."""
 
 import ast
 import sys
@@ -14,7 +14,14 @@ FORBIDDEN = {  # what the modules of a package may not import
     "bench": ("tests",),
     "conf": OURS,
 }
+# The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
+ROOMS = (
+    *("config", "progress", "records", "machine", "trackers", "shape_prior", "setup", "evaluate", "pictures"),
+    *("solve", "models", "stress", "tasks", "run", "report"),
+)
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
+WITHOUT_TORCH = ("bench.records", "bench.report", "bench.pictures.style", "bench.pictures.size_chart")
+REPORT_MAY = ("bench.report", "bench.records", "bench.pictures.style", "bench.pictures.size_chart")
 
 
 def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
@@ -33,8 +40,26 @@ def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
     return names
 
 
-def within(name: str, package: str) -> bool:
-    return name == package or name.startswith(package + ".")
+def within(name: str, *packages: str) -> bool:
+    return any(name == package or name.startswith(package + ".") for package in packages)
+
+
+def room(name: str) -> str:
+    """The room of bench that a dotted name is in; empty for other packages."""
+    parts = name.split(".")
+    return parts[1] if parts[0] == "bench" and len(parts) > 1 else ""
+
+
+def backward(module: str, names: set[str]) -> list[str]:
+    """The imports of a module from rooms behind its own, and from rooms that have no place in the order."""
+    if module.endswith(".__main__"):  # commands: nothing imports them
+        return []
+    here, found = room(module), []
+    for name in (name for name in names if room(name) in ROOMS and here in ROOMS):
+        there = room(name)
+        if there != here and ROOMS.index(there) > ROOMS.index(here):
+            found.append(f"imports {name} from a room behind {here}")
+    return found
 
 
 def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
@@ -42,12 +67,15 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     tree = ast.parse(source)
     names = imported(tree, module, is_package)
     top = module.split(".")[0]
-    found = [f"imports {name}" for name in names if any(within(name, other) for other in FORBIDDEN.get(top, ()))]
+    found = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
+    found += [f"imports a command: {name}" for name in names if top == "bench" and ".__main__" in name]
+    found += backward(module, names)
     if top == "renderers":
         found += [f"imports {name}" for name in names if name.split(".")[0] not in RENDERERS_MAY]
+    if within(module, *WITHOUT_TORCH):
+        found += [f"imports {name}" for name in names if within(name, "torch", "renderers", "datasets")]
     if within(module, "bench.report"):
-        outside = [n for n in names if n.split(".")[0] in (*OURS, "torch") and not within(n, "bench.report")]
-        found += [f"imports {name}" for name in outside]
+        found += [f"imports {name}" for name in names if name.split(".")[0] in OURS and not within(name, *REPORT_MAY)]
     if module == "bench":  # runs before every import of bench.report, and before torch may be imported
         found += [f"imports {name}" for name in names if name.split(".")[0] not in sys.stdlib_module_names]
     for node in ast.walk(tree):
@@ -75,12 +103,30 @@ def test_imports_go_one_way(path):
 
 def test_every_package_is_looked_at():
     seen = {named(path)[0] for path in modules()}
-    assert seen >= {"renderers.fields.mlp", "datasets.scene", "bench", "bench.report.html", "conf", "tests.test_layers"}
+    named_here = {
+        "renderers.fields.mlp",
+        "datasets.scene",
+        "bench",
+        "bench.report.__main__",
+        "conf",
+        "tests.test_layers",
+    }
+    assert seen >= named_here
+
+
+def test_every_room_has_its_place():
+    there = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
+    there |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
+    commands = {path for path in there if {p.name for p in (ROOT / "bench" / path).rglob("*.py")} == COMMAND_ALONE}
+    assert there - commands == set(ROOMS)
+
+
+COMMAND_ALONE = {"__init__.py", "__main__.py"}  # of a folder that holds a command and nothing to import
 
 
 def test_conf_holds_yaml_only():
     held = {path for path in (ROOT / "conf").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
-    assert {path for path in held if path.suffix != ".yaml"} == {ROOT / "conf" / "__init__.py"}
+    assert {path.name for path in held if path.suffix != ".yaml"} <= {"__init__.py", "README.md"}
 
 
 @pytest.mark.parametrize(
@@ -95,18 +141,23 @@ def test_conf_holds_yaml_only():
         ("datasets.scene", "import bench.records"),
         ("datasets.scene", "from bench import records"),
         ("datasets.scene", "if True:\n    import conf"),
-        ("bench.runner", "from tests.analytic_cases import CASES"),
-        ("bench.report.html", "import torch.nn"),
-        ("bench.report.html", "from torch import Tensor"),
-        ("bench.report.html", "from bench.records import Record"),
-        ("bench.report.html", "from bench import records"),
-        ("bench.report.html", "from .. import records"),
-        ("bench.report.html", "from ..records import Record"),
-        ("bench.report.html", "from datasets.mesh import Mesh"),
+        ("bench.run.run", "from tests.renderers.analytic_cases import CASES"),
+        ("bench.run.run", "from bench.report.write.html import write_index"),
+        ("bench.solve.optimise", "from bench.tasks.task import Task"),
+        ("bench.records.record", "def f():\n    import bench.report"),
+        ("bench.records.record", "import torch"),
+        ("bench.config", "from bench.records.record import Record"),
+        ("bench.run.run", "from bench.merge.__main__ import merge"),
+        ("bench.report.write.html", "import torch.nn"),
+        ("bench.report.write.html", "from torch import Tensor"),
+        ("bench.report.write.html", "from bench.solve.solve import COSTS"),
+        ("bench.report.write.html", "from bench import solve"),
+        ("bench.report.write.html", "from ...solve.solve import COSTS"),
+        ("bench.report.write.html", "from datasets.mesh import Mesh"),
         ("bench.report", "import renderers"),
         ("bench", "import torch"),
         ("conf", "from bench import config"),
-        ("bench.runner", "from os import *"),
+        ("bench.run.run", "from os import *"),
         ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
         ("tests.test_layers", "import sys\nsys.path += ['.']"),
         ("tests.test_layers", "from sys import path"),
@@ -122,8 +173,9 @@ def test_the_checker_finds_what_is_wrong(module, source):
         ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
         ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
         ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
-        ("bench.runner", "import torch, renderers, datasets\nfrom bench.report.html import write_index"),
-        ("bench.report.html", "import jinja2, os.path\nfrom bench.report import format\nfrom . import records"),
+        ("bench.run.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
+        ("bench.__main__", "from bench.report.write.html import write_index"),
+        ("bench.report.write.html", "import jinja2, os.path\nfrom bench.records import format\nfrom . import caption"),
         ("bench", "import os"),
         ("benchmark.report", "import datasets_of_others"),
     ],

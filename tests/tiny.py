@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.autodecoder import Prior
 from bench.config import EvaluationSettings
-from bench.records import Record
-from bench.stage import Cell, Stage
+from bench.models.field import FieldChoice
+from bench.records.record import Record
+from bench.setup.inputs import RunContext, RunInputs
+from bench.shape_prior.autodecoder import Prior
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from datasets.views import ViewSampler
@@ -20,7 +21,7 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
-PEAK = 1e10  # operations a second that the machine of a cell is said to do
+PEAK = 1e10  # operations a second that the machine of a run is said to do
 
 
 class Blind:
@@ -33,6 +34,14 @@ class Blind:
 
     def silhouette_loss(self, field, rays, rendering, mask):
         raise AssertionError
+
+
+def altered(settings: Any, changed: dict[str, Any]) -> Any:
+    """Settings with other values; "optimiser.iterations" is a value of the settings within."""
+    for name, value in changed.items():
+        part, _, rest = name.partition(".")
+        settings = replace(settings, **{part: altered(getattr(settings, part), {rest: value}) if rest else value})
+    return settings
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:
@@ -73,13 +82,13 @@ def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, 
     return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
 
 
-def cell_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed: Any) -> Cell:
+def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed: Any) -> RunContext:
     """A run under way in a folder; its scene has no image of its own, since tasks that measure need none."""
     blank = torch.zeros(camera.height, camera.width)
     view = View(camera, blank, blank[..., None].expand(-1, -1, 3), blank.bool())
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     scene = Scene("a scene", Mesh(corners, np.array([[0, 2, 1]])), view)
-    stage = Stage(
+    inputs = RunInputs(
         renderer=renderer,
         scene_name=scene.name,
         make_scene=lambda: scene,
@@ -89,8 +98,9 @@ def cell_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed
         seed=0,
         device=CPU,
         cache=folder / "cache",
+        field=FieldChoice("prior", None),
         trained=0,
     )
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}
-    return Cell(replace(stage, **changed), folder, record, silent)
+    return RunContext(replace(inputs, **changed), folder, record, silent)

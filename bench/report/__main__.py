@@ -1,18 +1,19 @@
-"""`python -m bench.report [results_dir=PATH]`: writes all tables, figures and the page; prints the page last."""
+"""`python -m bench.report [results_dir=PATH]`: writes all tables, figures and `index.html`, and prints their paths."""
 
 import sys
 from pathlib import Path
 
-from bench.report.frame import write_frame
-from bench.report.html import write_index
-from bench.report.paper import write_paper
-from bench.report.records import read_records
+from bench.records.read import read_records
+from bench.report.data.frame import write_frame
+from bench.report.write.html import write_index
+from bench.report.write.paper import write_paper
+from bench.report.write.readme import write_readme
 
 USAGE = "usage: python -m bench.report [results_dir=PATH]   (results_dir is `results` unless given)"
 
 
 def main(arguments: list[str]) -> None:
-    """Writes `runs.csv`, the experiments' files and `index.html`; exits with a message where an input is wrong."""
+    """Writes `runs.csv`, all pages, `README.md` and `index.html`; exits with a message where an argument is wrong."""
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
         return
@@ -27,6 +28,7 @@ def main(arguments: list[str]) -> None:
         print(write_frame(records, results_dir))
         for path in write_paper(records, results_dir):
             print(path)
+        write_readme(results_dir)
         print(write_index(results_dir))
     except ValueError as error:
         sys.exit(str(error))

@@ -1,1 +1,1 @@
-"""Trials that a renderer passes or fails at a severity, and what theory says of where it fails."""
+"""Stress tests: trials of growing severity, and formulas that predict where a renderer fails."""

@@ -1,24 +1,24 @@
-"""Does a renderer find what is there? One rendering against the closed-form truth."""
+"""Stress tests of a rendering, compared with the closed-form truth."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.stress.conditions import Conditions, Criteria
-from bench.stress.outcome import Failure, Outcome
+from bench.stress.trial import Conditions, Criteria, Failure, Outcome
 from datasets.stress import Exam, FirstHit
 from datasets.stress.solids import incidence_cosines
+from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.rendering import Renderer
 
 DEFINITIONS = {
-    "lost": "true hits that were not found",
-    "false": "rays that were said to hit and have no true hit, or begin inside",
-    "wrong": "true hits that were found further off than the pixel's footprint: its width at the true distance, over "
+    "lost": "true hits that were missed",
+    "false": "spurious hits: on rays that have no true hit, or begin inside",
+    "wrong": "true hits found with an error larger than the pixel's footprint: its width at the true distance, over "
     "the cosine of the angle of incidence",
     "hits": "true hits",
-    "evaluations_per_ray": "field values computed, over rays",
+    "evaluations_per_ray": "field values computed, divided by rays",
 }
 
 
@@ -27,25 +27,25 @@ def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> O
     """Renders an exam, and compares each ray with the truth in float64.
 
     Raises:
-        LimitReached: where it takes more than it may.
+        LimitReached: where the rendering exceeds its time or memory.
     """
     camera = exam.camera
     true, footprint = truth(exam)
     meter = Meter(conditions.limits.watch(exam.field, conditions.device))
-    rendering = renderer.render(meter, camera.rays().to(conditions.device))
+    rendering = rendered(renderer, meter, camera.rays().to(conditions.device))
     hit = rendering.hit.flatten().cpu()
     distance = rendering.distance.flatten().cpu().double()
     finite = distance.isfinite()
     both = hit & true.hit & finite
     error = (distance - true.distance).abs()
-    lost, false = true.hit & ~hit, hit & ~true.hit
+    missed, spurious = true.hit & ~hit, hit & ~true.hit
     wrong = both & (error > footprint)
     nan = hit & ~finite
-    counts = {"lost": lost, "false": false, "wrong": wrong, "nan": nan, "hits": true.hit}
+    counts = {"lost": missed, "false": spurious, "wrong": wrong, "nan": nan, "hits": true.hit}
     numbers = {name: float(which.sum()) for name, which in counts.items()}
     numbers["evaluations_per_ray"] = meter.counts.value / max(hit.numel(), 1)
-    kinds = torch.zeros(hit.shape, dtype=torch.uint8)  # 1 rightly hit, 2 lost, 3 false, 4 wrong
-    for kind, which in enumerate((both, lost, false, wrong | nan), start=1):
+    kinds = torch.zeros(hit.shape, dtype=torch.uint8)  # 1 correct hit, 2 missed, 3 spurious, 4 wrong
+    for kind, which in enumerate((both, missed, spurious, wrong | nan), start=1):
         kinds[which] = kind
     shape = camera.height, camera.width
     images = {
@@ -66,7 +66,7 @@ def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, "n"]]:
 
 
 def _failure(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failure:
-    """The most frequent kind of failure, where there are too many."""
+    """The most frequent kind of failure, where failures exceed the criteria."""
     bad = {Failure.LOST: numbers["lost"], Failure.WRONG: numbers["wrong"], Failure.NAN: numbers["nan"]}
     kinds = {}
     if sum(bad.values()) > (1 - criteria.hits) * numbers["hits"]:

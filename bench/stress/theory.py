@@ -1,6 +1,6 @@
-"""Where theory has a renderer fail, in the severities of conf/stress: a few lines each, from its own settings.
+"""Formulas that predict the severity at which a renderer fails, in the units of conf/stress, from its settings.
 
-A renderer that lacks the settings that a formula is made of has no prediction.
+A renderer without the settings that a formula needs has no prediction.
 """
 
 from collections.abc import Callable
@@ -9,20 +9,19 @@ from functools import wraps
 from math import asin, degrees, log, sqrt
 from typing import Any
 
-from bench.auto import half_pixel
-from bench.stress.conditions import Criteria
+from bench.setup.auto import half_pixel
+from bench.stress.trial import Criteria
 from datasets.stress import scenes
 from datasets.views import ViewSampler
 from renderers.field import STEEPEST_MARGIN
 
-FRONT = 1.0  # distance from the unit sphere to its middle, along a ray through that
-# Cosine of incidence on the cube's sides below which 1 % of the hits are.
-FLATTEST = 0.29
+FRONT = 1.0  # distance from the unit sphere to its centre
+FLATTEST = 0.29  # cosine of incidence below which 1 % of the hits on the cube's sides are
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A severity from which on a renderer should fail, and the formula that says so."""
+    """A severity from which on a renderer should fail, and its formula in words."""
 
     severity: float
     formula: str
@@ -33,9 +32,9 @@ THEORIES: dict[str, Theory] = {}
 
 
 def needs(*settings: str) -> Callable[[Theory], Theory]:
-    """Makes a function a theory of renderers that have these settings; of others it predicts nothing.
+    """Registers a function as a theory of renderers that have these settings; for others it predicts nothing.
 
-    Nor does it where its formula has no answer, such as a sine above 1, or where a setting is not a number.
+    It predicts nothing either where its formula has no solution, such as a sine above 1, or a setting is not a number.
     """
 
     def known(theory: Theory) -> Theory:
@@ -56,9 +55,9 @@ def needs(*settings: str) -> Callable[[Theory], Theory]:
 
 @needs()
 def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """What the first long step overshoots; or DVR's spacing (Eq. 9) on the longest ray."""
-    if hasattr(renderer, "refinement"):
-        return [Prediction(2 * FRONT / (renderer.samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
+    """The overshoot of the first long step; or DVR's sample spacing (Eq. 9) on the longest ray."""
+    if hasattr(renderer, "n_ray_samples"):
+        return [Prediction(2 * FRONT / (renderer.n_ray_samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
     bounded = getattr(renderer, "slope_samples", 0)
     extra = getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0) - 1
     reach = min(FRONT, getattr(renderer, "step_clamp", None) or FRONT)
@@ -70,34 +69,34 @@ def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Predi
 
 @needs("steps", "epsilon")
 def grazing_plane(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The angle at which the steps of Eq. 8 are all that there are, at the far edge of the picture."""
-    edge = 1 - scenes.GRAZING_SHARE  # of the middle's sine; rays there go as much further
+    """The angle at which Eq. 8 needs all steps at the far edge of the picture."""
+    edge = 1 - scenes.GRAZING_SHARE  # of the sine at the middle; rays at the edge are longer by that factor
     way = FRONT + scenes.DISTANCE * (1 / edge - 1)
     sine = _least(lambda sine: _queries(renderer, edge * sine, way) <= renderer.steps)
     published = (1 - (renderer.epsilon / FRONT) ** (1 / renderer.steps)) / _alpha(renderer)
     return [
-        Prediction(degrees(asin(sine)), "as many queries as Eq. 8 asks for at the far edge, of a field d sin(theta)"),
-        Prediction(degrees(asin(published)), "as many steps as DIST, Eq. 8, asks for"),
+        Prediction(degrees(asin(sine)), "the queries of Eq. 8 at the far edge, of a field d sin(theta)"),
+        Prediction(degrees(asin(published)), "the steps of DIST, Eq. 8"),
     ]
 
 
 @needs()
 def grazing_gradient(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Where DIST's scale alpha K sin(theta) leaves its tolerance, the slope falls below its least, or Eq. 8 ends."""
-    lost = grazing_plane(renderer, resolution, criteria)[:1]
+    found = grazing_plane(renderer, resolution, criteria)[:1]
     if hasattr(renderer, "alpha"):
-        longest = renderer.alpha * getattr(renderer, "samples", 1)
+        longest = renderer.alpha * getattr(renderer, "n_gradient_samples", 1)
         sine = 1.0 if longest > 1 + criteria.scale else min((1 - criteria.scale) / longest, 1.0)
-        lost.append(Prediction(degrees(asin(sine)), "scale alpha K sin(theta) of DIST's Eq. 4, too long or too short"))
+        found.append(Prediction(degrees(asin(sine)), "scale alpha K sin(theta) of DIST's Eq. 4, too long or too short"))
     elif hasattr(renderer, "least_slope"):
         share = 1 - criteria.scale if getattr(renderer, "keep_slope_sign", True) else 1.0
-        lost.append(Prediction(degrees(asin(share * renderer.least_slope)), "slope sin(theta) below least_slope"))
-    return sorted(lost, key=lambda prediction: -prediction.severity)
+        found.append(Prediction(degrees(asin(share * renderer.least_slope)), "slope sin(theta) below least_slope"))
+    return sorted(found, key=lambda prediction: -prediction.severity)
 
 
 @needs("epsilon")
 def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The ring by which epsilon widens a cube's outline, a regular hexagon; and Eq. 10."""
+    """The ring by which epsilon dilates a cube's outline, a regular hexagon; and Eq. 10."""
     around = scenes.CUBE * 2 * sqrt(2 / 3)  # radius through the hexagon's corners
     view = ViewSampler(scenes.DISTANCE, scenes.CUBE_VIEW, **scenes.CORNER, resolution=resolution)
     nearest = scenes.DISTANCE - scenes.CUBE * sqrt(3)
@@ -109,21 +108,21 @@ def epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Predicti
 
 @needs("epsilon")
 def within_epsilon(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """What comes nearer than epsilon counts as a surface."""
+    """Rays that pass closer than epsilon count as hits."""
     return [Prediction(renderer.epsilon, "epsilon")]
 
 
 @needs("epsilon", "steps")
 def sheet(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """What comes nearer than epsilon counts as a surface, unless a step jumps over it."""
+    """Rays that pass closer than epsilon count as hits, unless a step jumps over the sheet."""
     return [Prediction(renderer.epsilon, "epsilon")] if _alpha(renderer) == 1 else []
 
 
 @needs("steps", "epsilon")
 def truncated(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The way to the cube in steps of the truncated value, and the queries of Eq. 8 from there on."""
+    """The distance to the cube in steps of the truncated value, and the queries of Eq. 8 from there on."""
     cut = _least(lambda value: FRONT / _alpha(renderer) / value + _queries(renderer, FLATTEST, value) <= renderer.steps)
-    return [Prediction(cut, "way over alpha k, and the queries of DIST, Eq. 8, from there on")]
+    return [Prediction(cut, "distance / (alpha k), and the queries of DIST, Eq. 8, from there on")]
 
 
 @needs("steps", "epsilon")
@@ -136,27 +135,27 @@ def few_steps(renderer: Any, resolution: int, criteria: Criteria) -> list[Predic
 def weak_distance(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
     """Eq. 8 at the cube's flattest side, with values and steps shortened by the factor."""
     factor = _least(lambda factor: _queries(renderer, factor * FLATTEST) <= renderer.steps)
-    return [Prediction(factor, "as many queries as DIST, Eq. 8, asks for at the cube's flattest side")]
+    return [Prediction(factor, "the queries of DIST, Eq. 8, at the cube's flattest side")]
 
 
 @needs("epsilon")
 def float_spacing(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Where neighbouring float32 numbers of the camera's distance lie one to two epsilon apart."""
+    """The camera distance at which neighbouring float32 numbers are one to two epsilon apart."""
     return [Prediction(renderer.epsilon * 2**24, "float32's numbers there lie one to two epsilon apart")]
 
 
 @needs("steps")
 def gap(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """Rays as near to a side of the slit as its depth over the steps are lost: two of them a slit."""
-    lost = 2 * scenes.SLIT_DEPTH / renderer.steps / _alpha(renderer)
-    return [Prediction(lost / scenes.SLIT_SHARE / (1 - criteria.hits), "rays within depth / k of a side are lost")]
+    """Rays closer to a side of the slit than its depth over the steps are missed: two such strips per slit."""
+    missed = 2 * scenes.SLIT_DEPTH / renderer.steps / _alpha(renderer)
+    return [Prediction(missed / scenes.SLIT_SHARE / (1 - criteria.hits), "rays within depth / k of a side are missed")]
 
 
 def _alpha(renderer: Any) -> float:
-    """The factor of a step.
+    """The over-relaxation factor of a step.
 
     Raises:
-        ValueError: where a guard makes steps that no formula here knows.
+        ValueError: where a safeguard changes steps, which these formulas do not cover.
     """
     if getattr(renderer, "slope_samples", 0) or getattr(renderer, "least_step", 0) or getattr(renderer, "step_back", 0):
         raise ValueError("a guarded march has other steps")
@@ -170,7 +169,7 @@ def _queries(renderer: Any, slope: float, distance: float = FRONT) -> float:
 
 
 def _least(enough: Callable[[float], bool]) -> float:
-    """The least number from which on all are enough, up to 0.6: beyond, an alpha of 1.5 bounces and needs more."""
+    """The least number, up to 0.6, from which on `enough` holds: beyond, an alpha of 1.5 oscillates and needs more."""
     low, high = 1e-6, 0.6
     for _ in range(60):
         middle = (low + high) / 2

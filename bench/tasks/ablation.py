@@ -1,4 +1,4 @@
-"""What a renderer costs on one view of a fitted network, and how far it is from the reference (DIST, Table 1)."""
+"""The rendering benchmark: a renderer's cost and error on one view of a fitted network (DIST, Table 1)."""
 
 import time
 from collections.abc import Callable
@@ -9,42 +9,43 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from bench.environment import gemm_peak, synchronise
-from bench.images import save_images
-from bench.limits import LimitReached, Limits
-from bench.pictures import draw_against
-from bench.records import RunStatus
-from bench.reference_store import Reference, reference_for
-from bench.stage import Cell, Stage
-from bench.tasks.problem import check_field_gradient, check_kind
+from bench.evaluate.reference import Reference, reference_for
+from bench.machine.environment import gemm_peak, synchronise
+from bench.machine.limits import LimitReached, Limits
+from bench.pictures.run_figures import draw_against
+from bench.pictures.views import save_images
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.problem import check_field_gradient, check_kind
 from datasets.scene import View
+from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.rendering import Rendering
 
-SMALLER = 8  # times: the side of an image that takes too much, over that of the next one tried
-WARM_UP = 8  # pixels a side of the image that is rendered before the clock
+SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
+WARM_UP = 8  # pixels per side of the image that is rendered before the timing
 
 DEFINITIONS = {
-    "size": "pixels a side of the image that the other numbers are of",
-    "queries": "points whose field value was computed while rendering forward, without gradient; counted at the field",
-    "step_queries, step_gradients": "points whose value was computed, and through whose value a gradient other than "
-    "zero was propagated back, in a step",
-    "forward_seconds": "rendering without gradient; median of the repeats, least (_low) and largest (_high) beside it",
+    "size": "pixels per side of the image for which the other numbers were measured",
+    "queries": "points whose field value was computed in one rendering without gradient; counted at the field",
+    "step_queries, step_gradients": "points whose value was computed in a step, and points through whose value a "
+    "non-zero gradient was propagated back",
+    "forward_seconds": "rendering without gradient: median of the repeats; _low and _high: least and largest",
     "step_seconds": "a step of an optimisation: rendering with gradient, losses, backward",
     "backward_seconds": "the backward pass of a step",
     "repeats": "how often a step was timed",
     "evaluations.value, evaluations.gradient": "as step_queries and step_gradients",
     "evaluations.per_ray": "queries divided by rays",
-    "seconds.total": "the whole run, with shape, network and reference made or loaded",
-    "forward_gemm, step_gemm": "floating-point operations over the median time, divided by the machine's best rate of "
-    "a float32 matrix product",
-    "peak_memory_bytes": "highest rise of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
-    "lost, false": "pixels that the float64 reference hits and the renderer does not, and the other way round",
-    "rays, hits": "pixels of that image; those that the reference hits",
-    "wrong": "pixels that both hit at depths further apart than task.wrong",
-    "error_p95": "difference of depth that 95 % of the pixels that either hits do not exceed, where a pixel that only "
+    "seconds.total": "the whole run, with making or loading shape, network and reference",
+    "forward_gemm, step_gemm": "floating-point operations per second at the median time, divided by the machine's peak "
+    "rate of a float32 matrix product",
+    "peak_memory_bytes": "largest growth of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
+    "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
+    "rays, hits": "pixels of the image; pixels that the reference hits",
+    "wrong": "pixels that both hit, at depths that differ by more than task.wrong",
+    "error_p95": "95th percentile of the difference of depth over the pixels that either hits, where a pixel that only "
     "one of them hits counts as infinite; in scene units",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
@@ -52,16 +53,16 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Ablation:
-    """Renders a shape that the prior was trained on, forward and back, and compares it with the reference.
+    """Renders a training shape of the prior, forward and backward, and compares it with the reference.
 
-    Where a limit is reached at the asked resolution, the run's status says so, and the numbers are those of an image of
-    an eighth of the side, and so on.
+    Where a limit is reached at the requested resolution, the run's status says so, and an eighth of the side is tried
+    next, until the measurement finishes or the side is below `smallest`.
 
     Args:
-        repeats: of the clock; fewer where they come to a quarter of the limit together, one at a smaller size.
+        repeats: timed repeats; fewer where they take more than a quarter of the limit together, one at smaller sizes.
         limits: on each rendering and each step.
-        smallest: pixels a side below which no more is tried.
-        wrong: difference of depth, in scene units, from which on a pixel is wrong.
+        smallest: fewest pixels per side that are tried.
+        wrong: difference of depth, in scene units, above which a pixel is wrong.
     """
 
     repeats: int
@@ -74,18 +75,18 @@ class Ablation:
         check_at_least("task.smallest", self.smallest, 1, "8 always finishes")
         check_positive("task.wrong", self.wrong, "0.02 is 1 % of the unit sphere")
 
-    def execute(self, cell: Cell) -> None:
-        """Measures, and fills the record, images.npz and a picture."""
-        stage, record = cell.stage, cell.record
+    def execute(self, run: RunContext) -> None:
+        """Measures costs and errors, and writes them to the record, images.npz and a picture."""
+        inputs, record = run.inputs, run.record
         record.definitions = DEFINITIONS
-        asked = stage.scene.view.camera
-        camera, measured = asked, None
+        requested = inputs.scene.view.camera
+        camera, measured = requested, None
         failure: tuple[RunStatus, str] | None = None
         while measured is None:
             try:
-                measured = self._measure(stage, camera, repeats=1 if failure else self.repeats)
+                measured = self._measure(inputs, camera, repeats=1 if failure else self.repeats)
             except LimitReached as limit:
-                failure = failure or (limit.status, str(limit))  # not itself: it holds on to all that was computed
+                failure = failure or (limit.status, str(limit))  # not the exception, which keeps all tensors alive
                 smaller = camera.height // SMALLER, camera.width // SMALLER
                 if min(smaller) < self.smallest:
                     break
@@ -94,23 +95,23 @@ class Ablation:
         if failure is not None:
             end = "at no smaller size" if measured is None else f"at {camera.height} x {camera.width}"
             record.status = failure[0]
-            record.reason = f"{failure[1]} at {asked.height} x {asked.width}; it finishes {end}"
+            record.reason = f"{failure[1]} at {requested.height} x {requested.width}; it finishes {end}"
         if measured is not None:
-            self._note(cell, measured)
+            self._note(run, measured)
 
-    def _measure(self, stage: Stage, camera: Camera, *, repeats: int) -> "Measured":
-        """All numbers of one resolution.
+    def _measure(self, inputs: RunInputs, camera: Camera, *, repeats: int) -> "Measured":
+        """Measures everything at one resolution.
 
         Raises:
-            LimitReached: where a rendering or a step takes more than it may.
+            LimitReached: where a rendering or a step exceeds a limit.
         """
-        bench = Workbench(stage, camera, reference_for(stage.fitted(), camera, stage.cache), self.limits)
-        step = bench.steps(repeats)  # first, since it takes more, and where it takes too much the rest is in vain
+        bench = Workbench(inputs, camera, reference_for(inputs.fitted(), camera, inputs.cache), self.limits)
+        step = bench.steps(repeats)  # first: it costs more, and where it exceeds a limit the rest would be wasted
         return Measured(bench, bench.forward(repeats), step)
 
-    def _note(self, cell: Cell, measured: "Measured") -> None:
-        record, bench = cell.record, measured.bench
-        peak = max(record.environment["gemm_peak_flops"], gemm_peak(bench.device))  # beside what is compared with it
+    def _note(self, run: RunContext, measured: "Measured") -> None:
+        record, bench = run.record, measured.bench
+        peak = max(record.environment["gemm_peak_flops"], gemm_peak(bench.device))  # measured close to the times
         record.environment["gemm_peak_flops"] = peak
         record.metrics = {"size": bench.camera.height, **measured.costs(peak), **bench.errors(self.wrong)}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
@@ -118,13 +119,13 @@ class Ablation:
         record.evaluations["per_ray"] = measured.forward.counts.value / bench.rays.shape.numel()
         record.peak_memory_bytes = measured.step.memory
         found, true = bench.views()
-        save_images(cell.folder, found, true)
-        draw_against(cell.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
+        save_images(run.folder, found, true)
+        draw_against(run.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
 
 
 @dataclass(frozen=True)
 class Clocked:
-    """What some repeats of the same work took; `second` is a part of it that was timed apart."""
+    """The costs of repeats of the same work; `second` has the times of its second part, the backward pass."""
 
     seconds: list[float]
     second: list[float]
@@ -135,14 +136,14 @@ class Clocked:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured at one resolution."""
+    """The measurements at one resolution."""
 
     bench: "Workbench"
     forward: Clocked
     step: Clocked
 
     def costs(self, peak: float) -> dict[str, float]:
-        """The numbers that say what it costs, by their names in DEFINITIONS; `peak` is the machine's best rate."""
+        """The costs by their names in DEFINITIONS; `peak` is the machine's peak rate in operations per second."""
         times = {"forward": self.forward.seconds, "step": self.step.seconds, "backward": self.step.second}
         costs: dict[str, float] = {
             "queries": self.forward.counts.value,
@@ -162,13 +163,13 @@ class Measured:
 
 
 class Workbench:
-    """A renderer before one view of a network, with the limits and the clock about it."""
+    """Renders one view of a network with a renderer, under limits, and times it."""
 
-    def __init__(self, stage: Stage, camera: Camera, reference: Reference, limits: Limits) -> None:
-        prior, self.device = stage.fitted(), stage.device
+    def __init__(self, inputs: RunInputs, camera: Camera, reference: Reference, limits: Limits) -> None:
+        prior, self.device = inputs.fitted(), inputs.device
         self.decoder = prior.decoder.to(self.device).requires_grad_(False)
         self.code = prior.codes[0].detach().clone().to(self.device).requires_grad_(True)
-        self.renderer, self.camera, self.reference, self.limits = stage.renderer, camera, reference, limits
+        self.renderer, self.camera, self.reference, self.limits = inputs.renderer, camera, reference, limits
         self.rays = camera.rays().to(self.device)
         self.mask = reference.hit.to(self.device)
         self.rendering: Rendering | None = None
@@ -178,21 +179,21 @@ class Workbench:
         self._step(self.decoder.at(self.code), small.rays().to(self.device), torch.ones(WARM_UP, WARM_UP).bool())
 
     def forward(self, repeats: int) -> Clocked:
-        """Renderings without gradient."""
+        """Times renderings without gradient."""
 
         def work(field: Field) -> float:
             with torch.no_grad():
-                self.rendering = self.renderer.render(field, self.rays)
+                self.rendering = rendered(self.renderer, field, self.rays)
             return 0.0
 
-        return self._clock(work, repeats)
+        return self._clock("a rendering", work, repeats)
 
     def steps(self, repeats: int) -> Clocked:
-        """Steps of an optimisation of the code."""
-        return self._clock(lambda field: self._step(field, self.rays, self.mask), repeats)
+        """Times steps of an optimisation of the code."""
+        return self._clock("a step", lambda field: self._step(field, self.rays, self.mask), repeats)
 
     def errors(self, wrong: float) -> dict[str, float]:
-        """The rendering against the reference, by the names in DEFINITIONS."""
+        """The errors of the rendering against the reference, by their names in DEFINITIONS."""
         found, true = self.views()
         error = (found.depth - true.depth).abs()[found.mask & true.mask].double()
         numbers = {
@@ -211,7 +212,7 @@ class Workbench:
         return numbers
 
     def views(self) -> tuple[View, View]:
-        """What was rendered, and the reference, on the CPU; depths in float64, normals in world axes."""
+        """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes."""
         assert self.rendering is not None
         hit, cosine = self.rendering.hit, self.camera.double().depth(torch.ones_like(self.reference.distance))
         normals = torch.zeros_like(self.rendering.points)
@@ -223,9 +224,9 @@ class Workbench:
         )
 
     def _step(self, field: Field, rays: Rays, mask: Tensor) -> float:
-        """One step; the seconds of its backward pass."""
-        rendering = self.renderer.render(field, rays)
-        silhouette = self.renderer.silhouette_loss(field, rays, rendering, mask.to(self.device))
+        """Takes one step and gives the seconds of its backward pass."""
+        rendering = rendered(self.renderer, field, rays)
+        silhouette = silhouette_loss(self.renderer, field, rays, rendering, mask.to(self.device))
         loss = rendering.distance[rendering.hit].sum() + silhouette
         synchronise(self.device)
         start = time.perf_counter()
@@ -233,14 +234,14 @@ class Workbench:
         synchronise(self.device)
         return time.perf_counter() - start
 
-    def _clock(self, work: Callable[[Field], float], repeats: int) -> Clocked:
-        """Does the same work until it was done often enough, or a quarter of the limit of one is spent on all."""
+    def _clock(self, name: str, work: Callable[[Field], float], repeats: int) -> Clocked:
+        """Times the same work `repeats` times, or until all took a quarter of the time limit of one."""
         seconds: list[float] = []
         second: list[float] = []
         counts, memory = Counts(), None
         while len(seconds) < repeats and (not seconds or sum(seconds) < self.limits.seconds / 4):
             counts = Counts()
-            field = self.limits.watch(self.decoder.at(self.code), self.device)
+            field = self.limits.watch(self.decoder.at(self.code), self.device, name)
             synchronise(self.device)
             start = time.perf_counter()
             second.append(work(Meter(field, counts)))

@@ -1,4 +1,4 @@
-"""How true a renderer's gradients are: against central differences in float64, by angle of incidence."""
+"""Compares a renderer's gradients with central differences in float64, by angle of incidence."""
 
 from dataclasses import dataclass
 from math import cos, radians
@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.jacobians import Differences, differences, image_differences
-from bench.records import RunStatus
-from bench.reference_store import RADIUS, Reference, in_float64, reference_for
-from bench.stage import Cell
-from bench.tasks.problem import check_field_gradient, check_kind
+from bench.evaluate.finite_differences import Differences, differences, image_differences
+from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.solve.problem import check_field_gradient, check_kind
+from renderers.boundary import check_gradients, rendered
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Meter, steepest
@@ -19,36 +20,38 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Renderer
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
-ASTRAY = 0.01  # scene units: a renderer whose hit lies further off is at another surface, and is not judged there
+OTHER_SURFACE = 0.01  # scene units: a hit further from the true one is on another surface, and is not evaluated
 
 DEFINITIONS = {
     "BAND": "angle between ray and inward normal: frontal to 30 degrees, oblique to 70, grazing beyond; silhouette: "
-    "pixels beside the outline",
-    "pixels, excluded": "pixels judged; pixels drawn but not judged, since visibility changes there, the root is not "
-    "found again, or the renderer does not hit that surface",
-    "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and its truth, median over pixels; "
+    "pixels next to the outline",
+    "pixels, excluded": "pixels evaluated; pixels drawn but not evaluated, since visibility changes there, the root is "
+    "not found again, or the renderer does not hit that surface",
+    "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and the true one, median over pixels; "
     "code: along task.directions orthogonal directions, camera: six rigid motions (scene units, radians)",
-    "code_pooled_cosine, camera_pooled_cosine": "cosine between the gradients of all pixels of the band, one after the "
-    "other, and the truth: a scale that differs between pixels lowers it",
-    "code_scale, camera_scale": "length of the gradient along the truth over that of the truth, median over pixels",
-    "code_median_error, code_p99_error, camera_median_error, camera_p99_error": "length of the difference over that of "
-    "the truth: median and 99th percentile over pixels",
-    "image_cosine, image_scale": "pooled cosine and scale of the image of distances, with the sphere's far side as "
-    "background, towards the code, against differences of a supersampled image, in which visibility changes",
+    "code_pooled_cosine, camera_pooled_cosine": "cosine between the concatenated gradients of all pixels of the band "
+    "and the true ones: a scale that differs between pixels lowers it",
+    "code_scale, camera_scale": "component of the gradient along the true one over the length of the true one, median "
+    "over pixels",
+    "code_median_error, code_p99_error, camera_median_error, camera_p99_error": "length of the difference over the "
+    "length of the true gradient: median and 99th percentile over pixels",
+    "image_cosine, image_scale": "pooled cosine and scale of the gradient of the image of distances, with the far side "
+    "of the unit sphere as background, for the code, against differences of a supersampled image, in which visibility "
+    "changes",
 }
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """Compares gradients of distance with central differences, at a shape that the prior was trained on, in float64.
+    """Compares gradients of distance with central differences, at a training shape of the prior, in float64.
 
     Args:
-        pixels: drawn in each band of angles.
-        directions: of the code, orthogonal and drawn at random.
-        outline: pixels drawn beside the outline.
-        outline_directions: of the code, there.
-        outline_step: length of the step of the code there.
-        supersampling: rays a side of a pixel there.
+        pixels: number drawn in each band of angles.
+        directions: number of random orthogonal directions of the code.
+        outline: number of pixels drawn next to the outline.
+        outline_directions: number of directions of the code for these.
+        outline_step: length of the step of the code for these.
+        supersampling: rays per side of a pixel for these.
     """
 
     pixels: int
@@ -63,62 +66,62 @@ class Gradients:
             check_at_least(f"task.{name}", getattr(self, name), 1, "conf/task/gradients.yaml holds values that work")
         check_positive("task.outline_step", self.outline_step, "conf/task/gradients.yaml holds one that works")
 
-    def execute(self, cell: Cell) -> None:
-        """Judges, and fills the record."""
-        stage, record = cell.stage, cell.record
+    def execute(self, run: RunContext) -> None:
+        """Compares the gradients, and fills the record."""
+        inputs, record = run.inputs, run.record
         record.definitions = DEFINITIONS
-        twin = in_float64(stage.fitted())
-        reference = reference_for(stage.fitted(), stage.scene.view.camera, stage.cache)
+        twin = in_float64(inputs.fitted())
+        reference = reference_for(inputs.fitted(), inputs.scene.view.camera, inputs.cache)
         subject = Subject(
-            stage.renderer,
+            inputs.renderer,
             twin.decoder.requires_grad_(False),
             twin.codes[0],
-            stage.scene.view.camera.double(),
+            inputs.scene.view.camera.double(),
             Counts(),
         )
         subject.check()
-        generator = torch.Generator().manual_seed(stage.seed)
+        generator = torch.Generator().manual_seed(inputs.seed)
         axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
         directions = torch.linalg.qr(axes).Q
         metrics: dict[str, float] = {}
         for number, (band, pixels) in enumerate(_bands(reference, subject.camera).items()):
-            cell.progress("bands", number, len(BANDS) + 1)
+            run.progress("comparing gradients", number, len(BANDS) + 1)
             drawn = _draw(pixels, self.pixels, generator)
-            numbers = self._judge(subject, drawn, reference.distance.flatten()[drawn], directions)
+            numbers = self._evaluate(subject, drawn, reference.distance.flatten()[drawn], directions)
             metrics |= {f"{band}.{name}": value for name, value in numbers.items()}
         outline = _draw(_outline(reference.hit), self.outline, generator)
-        numbers = self._judge_outline(subject, outline, directions[:, : self.outline_directions])
+        numbers = self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         metrics |= {f"silhouette.{name}": value for name, value in numbers.items()}
         record.metrics = metrics
         record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}
         record.status, record.reason = RunStatus.OK, ""
 
-    def _judge(
+    def _evaluate(
         self,
         subject: "Subject",
         pixels: Int[Tensor, "m"],
         distance: Float[Tensor, "m"],
         directions: Float[Tensor, "code_length directions"],
     ) -> dict[str, float]:
-        """The numbers of one band."""
+        """The metrics of one band."""
         if not pixels.numel():
             return {"pixels": 0, "excluded": 0}
         truth: Differences = differences(
             subject.decoder, subject.code, directions, camera=subject.camera, pixels=pixels, distance=distance
         )
         by_code, by_camera, found, hit = subject.gradients(pixels)
-        judged = truth.valid & hit & ((found - distance).abs() < ASTRAY)
-        numbers: dict[str, float] = {"pixels": int(judged.sum()), "excluded": int((~judged).sum())}
-        if judged.any():
-            numbers |= _compare((by_code @ directions)[judged], truth.code[judged], "code")
+        valid = truth.valid & hit & ((found - distance).abs() < OTHER_SURFACE)
+        numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
+        if valid.any():
+            numbers |= _compare((by_code @ directions)[valid], truth.code[valid], "code")
             if subject.renderer.capabilities.ray_gradient:
-                numbers |= _compare(by_camera[judged], truth.camera[judged], "camera")
+                numbers |= _compare(by_camera[valid], truth.camera[valid], "camera")
         return numbers
 
-    def _judge_outline(
+    def _evaluate_outline(
         self, subject: "Subject", pixels: Int[Tensor, "m"], directions: Float[Tensor, "code_length directions"]
     ) -> dict[str, float]:
-        """The numbers across the silhouette."""
+        """The metrics across the silhouette."""
         if not pixels.numel():
             return {"pixels": 0}
         lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
@@ -141,7 +144,7 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Subject:
-    """A renderer before a network, all in float64."""
+    """The renderer, network, code and camera whose gradients are compared, all in float64."""
 
     renderer: Renderer
     decoder: Decoder
@@ -157,15 +160,16 @@ class Subject:
     def gradients(
         self, pixels: Int[Tensor, "m"]
     ) -> tuple[Float[Tensor, "m code_length"], Float[Tensor, "m 6"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
-        """Of each pixel: the gradient of its distance towards code and camera, the distance, and whether it hits."""
+        """For each pixel the gradients of its distance for code and camera, the distance, and whether it hits."""
         code = self.code.clone().requires_grad_(True)
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         rays = self.camera.moved(twist).rays().flat()
-        rendering = self.renderer.render(Meter(self.decoder.at(code), self.counts), rays[pixels])
+        rendering = rendered(self.renderer, Meter(self.decoder.at(code), self.counts), rays[pixels])
         by_code = torch.zeros(len(pixels), len(code), dtype=torch.float64)
         by_camera = torch.zeros(len(pixels), 6, dtype=torch.float64)
         for row in rendering.hit.nonzero().squeeze(-1).tolist():
             found = torch.autograd.grad(rendering.distance[row], (code, twist), retain_graph=True, allow_unused=True)
+            check_gradients(self.renderer, *found)
             for table, gradient in zip((by_code, by_camera), found, strict=True):
                 if gradient is not None:
                     table[row] = gradient
@@ -186,8 +190,8 @@ def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str)
 
 
 def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"]]:
-    """The hit pixels of each band of angles, as indices into the image in one row."""
-    cosine = -(reference.normals * camera.rays().directions).sum(-1).clamp(min=-1)  # rounding leads beyond
+    """The hit pixels of each band of angles, as indices into the flattened image."""
+    cosine = -(reference.normals * camera.rays().directions).sum(-1).clamp(min=-1)  # rounding can exceed 1
     bands = {}
     for band, (low, high) in BANDS.items():
         within = (cosine <= cos(radians(low))) & (cosine > cos(radians(high)))
@@ -196,7 +200,7 @@ def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"
 
 
 def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, "some"]:
-    """Pixels that have both hits and misses among themselves and their neighbours."""
+    """Pixels whose 3 x 3 neighbourhood has both hits and misses, as indices into the flattened image."""
     around = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
     return (around.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
 

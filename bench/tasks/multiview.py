@@ -1,4 +1,4 @@
-"""Shape from many views: find the code whose depths carry each view's colours onto the next (DIST, Sec. 4.2.2)."""
+"""Shape from many views: optimise the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
 from dataclasses import dataclass
 from math import radians
@@ -9,23 +9,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.autodecoder import Prior
-from bench.ladder.observations import Observations
-from bench.ladder.solve import solve_shape
-from bench.pictures import Given
-from bench.stage import Cell
-from bench.starts import StartSettings
-from bench.tasks.code import CodePenalty, CodeProblem, code_problem
+from bench.models.observations import Observations
+from bench.pictures.run_figures import Given
+from bench.setup.inputs import RunContext
+from bench.shape_prior.autodecoder import Prior
+from bench.solve.latent_code import CodePenalty, CodeProblem, code_problem
+from bench.solve.problem import OptimiserSettings, check_field_gradient
+from bench.solve.starts import StartSettings
 from bench.tasks.photographs import GivenPhotographs, PhotographObservations
-from bench.tasks.problem import OptimiserSettings, check_field_gradient
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.truth import Truth
 from renderers.checks import check_at_least, check_positive
 from renderers.rendering import Renderer
 
-LEAST_SCALE, MOST_SHIFT = 0.8, 0.2
-FAR_APART = 60.0  # degrees between two photographs that a note is made of
+MIN_SCALE, MAX_SHIFT = 0.8, 0.2
+FAR_APART = 60.0  # degrees between compared photographs, above which the record has a note
 
 
 @dataclass(frozen=True)
@@ -33,21 +32,21 @@ class Multiview:
     """Shape from photographs whose cameras are known; no mask is used.
 
     Args:
-        images: how the photographs are taken.
-        focal: of the photographs' cameras, times that of the scene's camera (DIST, Fig. 10 a).
-        views_per_step: views that an iteration compares, evenly spaced; they move on from one iteration to the next.
-        neighbour: how many views further on the one is that a view is compared with.
+        images: settings of the photographs.
+        focal: focal length of the photographs' cameras over that of the scene's camera (DIST, Fig. 10 a).
+        views_per_step: views that an iteration compares, evenly spaced; they shift by one with each iteration.
+        neighbour: a view is compared with the one that is this many views further.
         visible: squared difference of depths below which both views see a point, in squared scene units (DIST, B.3).
         photometric_weight: of the mean absolute difference of colours (Eq. 6).
-        code_weight, code_average: see `bench.tasks.code.CodePenalty`.
-        start_scale: of the random code at the start, in standard deviations of the prior's training codes; 0 is the
+        code: penalty on the code.
+        start_scale: standard deviation of the random initial code over that of the prior's training codes; 0 is the
             mean shape.
-        starts, trial: see `bench.starts.StartSettings`.
-        coarse_blur: standard deviation of the Gaussian that the images begin with, as a share of their height; it falls
+        starts, trial: see `bench.solve.starts.StartSettings`.
+        coarse_blur: standard deviation of the initial Gaussian blur of the images, as a share of their height; it falls
             to 0 over the first half of a start's iterations.
-        scale, degrees, shift: by how much the shape is too large, turned and shifted at the start; where one is not
-            neutral the similarity is optimised, too (DIST, Fig. 12). Degrees, scene units.
-        iterations, learning_rate, schedule: see `bench.tasks.problem.OptimiserSettings`.
+        scale, degrees, shift: scale, rotation and shift of the initial shape against the true one; where one is not
+            neutral, a similarity transform is optimised as well (DIST, Fig. 12). Ratio, degrees, scene units.
+        optimiser: iterations and learning rates.
     """
 
     images: Photography
@@ -56,8 +55,7 @@ class Multiview:
     neighbour: int
     visible: float
     photometric_weight: float
-    code_weight: float
-    code_average: str
+    code: CodePenalty
     start_scale: float
     starts: int
     trial: int
@@ -65,9 +63,7 @@ class Multiview:
     scale: float
     degrees: float
     shift: float
-    iterations: int
-    learning_rate: float
-    schedule: str
+    optimiser: OptimiserSettings
 
     takes_field: ClassVar[bool] = True
 
@@ -82,50 +78,39 @@ class Multiview:
         check_positive("task.scale", self.scale, "1 is the true size")
         check_positive("task.photometric_weight", self.photometric_weight, "the paper uses 5")
         for name in ("start_scale", "coarse_blur", "degrees", "shift"):
-            check_at_least(f"task.{name}", getattr(self, name), 0, f"task.{name}=0 is the least")
-        if not (LEAST_SCALE <= self.scale <= 1 / LEAST_SCALE and self.shift <= MOST_SHIFT):
+            check_at_least(f"task.{name}", getattr(self, name), 0, f"task.{name}=0 is the smallest value")
+        if not (MIN_SCALE <= self.scale <= 1 / MIN_SCALE and self.shift <= MAX_SHIFT):
             raise ValueError(
-                f"task.scale must lie between {LEAST_SCALE} and {1 / LEAST_SCALE}, and task.shift be {MOST_SHIFT} at "
-                f"most, not {self.scale} and {self.shift}: further off, a shape leaves the space priors are trained in"
+                f"task.scale must lie between {MIN_SCALE} and {1 / MIN_SCALE}, and task.shift be {MAX_SHIFT} at "
+                f"most, not {self.scale} and {self.shift}: priors are not trained outside of this range"
             )
-        self.turns.check(self.iterations)
-        _ = self.optimiser, self.penalty
+        self.turns.check(self.optimiser.iterations)
 
     @property
     def turns(self) -> StartSettings:
-        """How the random codes share the iterations."""
+        """The number of starts, and the iterations of each one's trial."""
         return StartSettings(self.starts, self.trial)
 
-    @property
-    def optimiser(self) -> OptimiserSettings:
-        """For how long and how fast."""
-        return OptimiserSettings(self.iterations, self.learning_rate, self.schedule)
-
-    @property
-    def penalty(self) -> CodePenalty:
-        """What the code costs."""
-        return CodePenalty(self.code_weight, self.code_average)
-
-    def execute(self, cell: Cell) -> None:
-        """Optimises the code, and judges the shape before and after."""
+    def execute(self, run: RunContext) -> None:
+        """Optimises the code, or the requested field, and evaluates the shape before and after."""
         apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
         if apart > FAR_APART:
-            told = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
-            cell.record.notes = [*cell.record.notes, told]
-        solve_shape(self, cell)
+            note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
+            run.record.notes = [*run.record.notes, note]
+        run.inputs.field.solve(self, run)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[Observations, Given]:
-        """What a field without a prior is fitted to; some photographs are held out.
+        """The observations for a field without a prior; some photographs are held out.
 
         Raises:
-            ValueError: for settings of a prior's code, and for too few photographs.
+            ValueError: for settings that need a prior, and for too few photographs.
         """
         if self.scale != 1 or self.degrees or self.shift or self.starts > 1:
-            raise ValueError("task.scale, degrees, shift and starts are those of a prior's shape: set field=prior")
-        own = scene.seed(seed)
-        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=own)
+            raise ValueError("task.scale, degrees, shift and starts need a prior: set field=prior")
+        scene_seed = scene.seed(seed)
+        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
         nothing = np.zeros(scene.view.mask.shape, dtype=bool)
         return PhotographObservations.of(given), Given(scene.view, nothing, given.colours.cpu().numpy())
@@ -133,19 +118,19 @@ class Multiview:
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
-        """The problem of a scene's mesh."""
+        """The problem of a scene: the code, and where it is misplaced at the start a similarity transform."""
         check_field_gradient(renderer)
-        own = scene.seed(seed)  # another texture and other codes for each shape
-        generator = torch.Generator().manual_seed(own)
-        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=own)
+        scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
+        generator = torch.Generator().manual_seed(scene_seed)
+        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
         if len(prior.codes) < 2:
-            raise ValueError("a prior of one shape has no spread to draw a code from: set scale.shapes=96")
+            raise ValueError("a prior of one shape has no spread from which to draw codes: set scale.shapes=96")
         spread = self.start_scale * prior.codes.std(0)
         codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
         problem = code_problem(
             prior,
-            self.penalty,
+            self.code,
             given.compare,
             observed=torch.zeros_like(scene.view.mask),
             rays=2 * given.per_step * scene.view.mask.numel(),
@@ -155,11 +140,11 @@ class Multiview:
             trial=self.trial,
         )
         problem.photographs = given.colours.cpu().numpy()
-        problem.judged_at = self.iterations  # the images are not blurred any more
+        problem.judged_at = self.optimiser.iterations  # where images are no longer blurred
         return problem
 
     def _misplaced(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
-        """A similarity of the given size in random directions, the same for all starts: it is what is known."""
+        """A similarity transform of the given size in random directions, the same for all starts."""
         axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
         similarity = torch.cat([self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()])
         return similarity.expand(self.starts, -1)

@@ -1,49 +1,115 @@
-"""Camera pose: find the camera that saw a known shape, from its depth image and silhouette (DIST, Sec. 4.1, Fig. 6)."""
+"""Camera pose: optimise the camera of a depth image and silhouette of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
-import time
 from dataclasses import dataclass, field
-from typing import ClassVar
+from math import atan2, degrees, radians, sqrt
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.film import Film
-from bench.judge import look
-from bench.ladder.known import grown_shape
-from bench.ladder.settings import PRIOR
-from bench.pictures import draw_curve
-from bench.poses import JUDGED, PoseStart, of_moved_object
-from bench.solve import COSTS, descend, verdict
-from bench.stage import Cell, Stage
-from bench.starts import Starts, StartSettings
-from bench.tasks.problem import OptimiserSettings, Unsupported, check_kind
+from bench.evaluate.evaluate import Evaluation, render_view
+from bench.evaluate.metrics import DEFINITIONS as IMAGE_DEFINITIONS
+from bench.evaluate.metrics import image_metrics
+from bench.pictures.run_figures import draw_curve
+from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.solve.solve import solve
+from bench.solve.starts import Starts, StartSettings
 from datasets.scene import View
 from datasets.truth import Truth
+from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera
-from renderers.checks import check_at_least, check_choice
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
 from renderers.rendering import Renderer, at_iteration
 
-REACH = 1.05  # half the side of the cube that holds the samples of a known shape: the unit sphere and a little more
+REACH = 1.05  # half the side of the cube of a known shape's samples: the unit sphere with a margin
+DEFINITIONS = {
+    "rotation_error_deg": "angle of the rotation between the found and the true camera, in degrees",
+    "translation_error": "distance between the object's origin in the coordinates of the found and of the true camera,"
+    " in scene units",
+    "success": "1 where both errors are at most task.success_degrees and task.success_distance, else 0",
+}
+TRACKED = tuple(DEFINITIONS)
+EVALUATED = DEFINITIONS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae", "mask_iou")}
+
+
+@dataclass(frozen=True)
+class PoseStart:
+    """The initial cameras, and the criteria of success.
+
+    Args:
+        degrees: error in rotation of the initial camera, about a random axis through the object's origin.
+        shift: its error in translation, in a random direction, in scene units.
+        starts: number of starts: the initial camera, and others that are rotated from it at random.
+        spread: largest angle of these rotations, in degrees.
+        success_degrees, success_distance: largest errors that count as success, in degrees and scene units.
+    """
+
+    degrees: float
+    shift: float
+    starts: int
+    spread: float
+    success_degrees: float
+    success_distance: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.starts", self.starts, 1, "1 is the initial camera alone, 8 avoid most failures")
+        for name in ("degrees", "spread"):
+            if not 0 <= getattr(self, name) <= 180:
+                raise ValueError(f"task.{name} must lie between 0 and 180 degrees, not {getattr(self, name)}")
+        check_at_least("task.shift", self.shift, 0, "0.1 is a tenth of the object's radius")
+        check_positive("task.success_degrees", self.success_degrees, "5 is usual")
+        check_positive("task.success_distance", self.success_distance, "0.05 is usual")
+
+    def cameras(self, true: Camera, seed: int) -> list[Camera]:
+        """The initial cameras; the first one's errors are exactly `degrees` and `shift`."""
+        generator = torch.Generator().manual_seed(seed)
+        axis, direction = _directions(2, generator)
+        turned = true.with_object_moved(torch.cat([torch.zeros(3), radians(self.degrees) * axis]))
+        given = turned.with_object_moved(torch.cat([self.shift * direction, torch.zeros(3)]))
+        angles = radians(self.spread) * torch.rand(self.starts - 1, 1, generator=generator)
+        turns = angles * _directions(self.starts - 1, generator)
+        return [given, *(given.with_object_moved(torch.cat([torch.zeros(3), turn])) for turn in turns)]
+
+    def metrics(self, found: Camera, true: Camera) -> dict[str, float]:
+        """The metrics of `DEFINITIONS`."""
+        rotation, translation = pose_error(found, true)
+        success = rotation <= self.success_degrees and translation <= self.success_distance
+        return {"rotation_error_deg": rotation, "translation_error": translation, "success": float(success)}
+
+    def evaluate(self, seen: View, true: View) -> Evaluation:
+        """The metrics of `EVALUATED`; a note where the pose was not found, which changes no status.
+
+        Args:
+            seen: view of the found camera.
+            true: given view.
+        """
+        images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())
+        metrics = self.metrics(seen.camera, true.camera)
+        rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
+        note = f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"
+        return Evaluation(metrics | images, notes=() if metrics["success"] else (note,))
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The camera of a depth image and a silhouette, from a perturbed start; the shape is known.
+    """Finds the camera of a depth image and a silhouette from a perturbed start; the shape is known.
 
     Args:
-        degrees, shift, starts, spread, success_degrees, success_distance: see `bench.poses.PoseStart`.
-        trial: iterations of each start, where there are several; see `bench.starts.StartSettings`.
-        shape: how the shape is known: "grid", distances of the mesh on a grid; "prior", the network at the scene's own
-            code, of which it must be a training shape; "formula", that of a procedural family.
-        grid: its samples an axis.
+        degrees, shift, starts, spread, success_degrees, success_distance: see `PoseStart`.
+        trial: iterations of each start, where there are several; see `bench.solve.starts.StartSettings`.
+        shape: field of the known shape: "grid", distances of the mesh on a grid; "prior", the network at the scene's
+            code, which must be a training shape; "formula", that of a procedural family.
+        grid: samples per axis of the grid.
         depth_weight: of the mean absolute depth error over pixels that both hit.
         silhouette_weight: of the renderer's own silhouette loss.
-        normal_weight: of the mean of one minus the cosine between normals there, in camera axes; its gradient turns the
-            normals and leaves the points where they are.
-        iterations, learning_rate, schedule: see `bench.tasks.problem.OptimiserSettings`.
+        normal_weight: of the mean of one minus the cosine between normals there, in camera axes; its gradient rotates
+            the normals and does not move the points.
+        optimiser: iterations and learning rates.
     """
 
     degrees: float
@@ -58,9 +124,7 @@ class Pose:
     depth_weight: float
     silhouette_weight: float
     normal_weight: float
-    iterations: int
-    learning_rate: float
-    schedule: str
+    optimiser: OptimiserSettings
 
     takes_field: ClassVar[bool] = True
 
@@ -69,83 +133,62 @@ class Pose:
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
         for name in ("depth_weight", "silhouette_weight", "normal_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
-        StartSettings(self.starts, self.trial).check(self.iterations)
-        _ = self.optimiser, self.start
+        StartSettings(self.starts, self.trial).check(self.optimiser.iterations)
+        _ = self.start
 
     @property
     def start(self) -> PoseStart:
-        """Where it starts, and what counts as found."""
+        """The initial cameras, and the criteria of success."""
         return PoseStart(
             self.degrees, self.shift, self.starts, self.spread, self.success_degrees, self.success_distance
         )
 
-    @property
-    def optimiser(self) -> OptimiserSettings:
-        """For how long and how fast."""
-        return OptimiserSettings(self.iterations, self.learning_rate, self.schedule)
-
-    def execute(self, cell: Cell) -> None:
-        """Optimises the pose, and judges it before and after.
+    def execute(self, run: RunContext) -> None:
+        """Optimises the pose, and evaluates it before and after.
 
         Raises:
-            Unsupported: where the renderer has no gradient towards rays, or is not meant for the shape's field.
+            Unsupported: where the renderer has no gradient towards rays, or does not support the shape's field.
         """
-        stage, record, view = cell.stage, cell.record, cell.stage.scene.view
-        if not stage.renderer.capabilities.ray_gradient:
-            raise Unsupported(f"{type(stage.renderer).__name__} has no gradient towards rays, so none towards a camera")
-        known = known_shape(self, stage) if stage.field == PRIOR else grown_shape(cell, self)
-        check_kind(stage.renderer, known)
-        record.definitions = JUDGED | COSTS
-        cameras = self.start.cameras(view.camera, stage.scene.seed(stage.seed))
-        problem = PoseProblem(self, stage.renderer, known, view, cameras, stage.device)
-        film = Film(stage)
-
-        def errors_at(iteration: int) -> dict[str, float]:
-            film.shoot(iteration, known, problem.camera())
-            return self.start.metrics(problem.camera(), view.camera)
-
-        record.metrics_start = self.start.judge(look(known, problem.camera(), stage), view)
-        course = descend(problem, self.optimiser, cell, errors_at)
-        clock = time.perf_counter()
-        record.metrics = self.start.judge(look(known, problem.camera(), stage), view)
-        record.status, record.reason = verdict(course)
-        record.notes = [*record.notes, *self.start.remarks(record.metrics)]
-        film.shoot(len(course.curve), known, problem.camera())
-        if stage.evaluation.picture is not None:
-            draw_curve(cell.folder / "curve.png", course.curve)
-        film.save(cell.folder, f"{record.task}, {record.name}, {record.scene}: {record.status}")
-        record.seconds["evaluation"] += time.perf_counter() - clock
+        inputs, view = run.inputs, run.inputs.scene.view
+        name = type(inputs.renderer).__name__
+        if not inputs.renderer.capabilities.ray_gradient:
+            raise Unsupported(f"{name} has no gradient towards rays, so none towards a camera")
+        known = inputs.field.known_shape(run, self, lambda: known_shape(self, inputs))
+        cameras = self.start.cameras(view.camera, inputs.scene.seed(inputs.seed))
+        solve(PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device), self.optimiser, run)
 
 
-def known_shape(settings: Pose, stage: Stage) -> Field:
-    """The field of the scene's shape, in the way that is asked for.
+def known_shape(settings: Pose, inputs: RunInputs) -> Field:
+    """The field of the scene's shape, of the kind that `settings.shape` names.
 
     Raises:
-        ValueError: where there is none.
+        ValueError: where the scene has no such field.
     """
     if settings.shape == "prior":
-        fitted = stage.fitted()
-        return fitted.decoder.to(stage.device).requires_grad_(False).at(fitted.codes[0].to(stage.device))
+        fitted = inputs.fitted()
+        return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
     if settings.shape == "formula":
-        if stage.scene.formula is None:
-            raise ValueError(f"{stage.scene.name} has no formula: set task.shape=grid")
-        return stage.scene.formula()
-    values = Truth(stage.scene.mesh).distance_grid(settings.grid, REACH)
-    return Grid(torch.from_numpy(values).to(stage.device), REACH)
+        if inputs.scene.formula is None:
+            raise ValueError(f"{inputs.scene.name} has no formula: set task.shape=grid")
+        return inputs.scene.formula()
+    values = Truth(inputs.scene.mesh).distance_grid(settings.grid, REACH)
+    return Grid(torch.from_numpy(values).to(inputs.device), REACH)
 
 
 @dataclass
 class PoseProblem:
-    """A camera to be found, as a rigid motion of the object from each start."""
+    """The problem of a camera: its parameters are a rigid motion of the object from each start."""
 
     settings: Pose
     renderer: Renderer
     known: Field
     view: View
-    cameras: list[Camera]  # one a start
+    cameras: list[Camera]  # one per start
     device: torch.device
-    photographs: None = None
     counts: Counts = field(default_factory=Counts)
+
+    definitions: ClassVar[dict[str, str]] = EVALUATED
+    tracked: ClassVar[tuple[str, ...]] = TRACKED
 
     def __post_init__(self) -> None:
         self.cameras = [camera.to(self.device) for camera in self.cameras]
@@ -156,12 +199,12 @@ class PoseProblem:
 
     @property
     def observed(self) -> Bool[Tensor, "height width"]:
-        """Depth is given wherever there is any."""
+        """Pixels whose depth is given: all that hit."""
         return self.mask
 
     @property
     def rays_per_iteration(self) -> int:
-        """A ray a pixel."""
+        """One ray per pixel."""
         return self.mask.numel()
 
     def field(self) -> Field:
@@ -169,25 +212,41 @@ class PoseProblem:
         return self.known
 
     def objective(self) -> None:
-        """The loss of any two iterations is comparable."""
+        """None: the losses of all iterations are comparable."""
+
+    def frame(self) -> tuple[Field, Camera]:
+        """The known shape and the current camera."""
+        return self.known, self.camera()
+
+    def evaluate(self, inputs: RunInputs) -> Evaluation:
+        """The errors of the current camera, and of its view against the given one."""
+        return self.settings.start.evaluate(render_view(self.known, self.camera(), inputs), self.view)
+
+    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+        """The errors of the current camera."""
+        return self.settings.start.metrics(self.camera(), self.view.camera)
+
+    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+        """Writes the curve of the loss."""
+        draw_curve(folder / "curve.png", curve)
 
     def camera(self) -> Camera:
-        """The camera as it stands, on the CPU; where its numbers are none any more, the one that it started from."""
+        """The current camera, on the CPU; its initial one where the parameters are not finite."""
         best = self.starts.best()
         twist = self.parameters[best].detach()
-        found = of_moved_object(self.cameras[best], twist) if bool(twist.isfinite().all()) else self.cameras[best]
+        found = self.cameras[best].with_object_moved(twist) if bool(twist.isfinite().all()) else self.cameras[best]
         return found.to(torch.device("cpu"))
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
-        start, own = self.starts.turn(iteration)
-        camera = of_moved_object(self.cameras[start], self.parameters[start])
-        renderer, rays, metered = at_iteration(self.renderer, own), camera.rays(), Meter(self.known, self.counts)
-        rendering = renderer.render(metered, rays)
+        start, step = self.starts.turn(iteration)
+        camera = self.cameras[start].with_object_moved(self.parameters[start])
+        renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.known, self.counts)
+        rendering = rendered(renderer, metered, rays)
         compared = self.mask & rendering.hit
         count = compared.sum().clamp_min(1)
         error = (camera.depth(rendering.distance) - self.depth).abs()
-        silhouette = renderer.silhouette_loss(metered, rays, rendering, self.mask)
+        silhouette = silhouette_loss(renderer, metered, rays, rendering, self.mask)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,
@@ -197,10 +256,22 @@ class PoseProblem:
             difference = 1 - (found * self.normals[compared]).sum(-1)
             terms["normals"] = self.settings.normal_weight * difference.sum() / count
         total = torch.stack(list(terms.values())).sum()
-        self.starts.note(start, own, total)
+        self.starts.note(start, step, total)
         return {"total": total, **terms}
 
 
 def in_camera_axes(normals: Float[Tensor, "*batch 3"], camera: Camera) -> Float[Tensor, "*batch 3"]:
-    """Directions of the world as a camera has them; gradients flow to the camera."""
+    """Directions in world axes converted to a camera's axes; gradients flow to the camera."""
     return normals @ camera.world_to_camera[:3, :3].T
+
+
+def pose_error(found: Camera, true: Camera) -> tuple[float, float]:
+    """The errors in rotation (degrees) and translation (scene units) between two cameras; see `DEFINITIONS`."""
+    mine, theirs = found.world_to_camera.detach().double().cpu(), true.world_to_camera.double().cpu()
+    between = mine[:3, :3] @ theirs[:3, :3].T
+    sine, cosine = (between - between.T).norm() / sqrt(8), (between.diagonal().sum() - 1) / 2
+    return degrees(atan2(sine.item(), cosine.item())), (mine[:3, 3] - theirs[:3, 3]).norm().item()
+
+
+def _directions(count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)

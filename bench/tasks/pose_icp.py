@@ -1,4 +1,4 @@
-"""Camera pose without a renderer: iterative closest points, as Open3D has it, on the same depth image."""
+"""Camera pose without a renderer: Open3D's iterative closest points on the same depth image."""
 
 import time
 from dataclasses import dataclass
@@ -9,34 +9,34 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bench.poses import JUDGED, PoseStart
-from bench.records import RunStatus
-from bench.stage import Cell
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.tasks.pose import EVALUATED, PoseStart
 from datasets.scene import View, see
 from datasets.truth import Truth, sample_surface
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 
 COSTS = {
-    "evaluations.value": "none: no field is asked",
-    "evaluations.starts": "starts that were tried; the one with the least distance at its end is kept",
+    "evaluations.value": "0: no field is evaluated",
+    "evaluations.starts": "starts that were tried; the one with the least final distance is kept",
     "seconds.forward": "all registrations",
-    "seconds.evaluation": "metrics, off the clock",
-    "seconds.total": "the whole run, with shapes made or loaded",
+    "seconds.evaluation": "metrics, not part of the loop",
+    "seconds.total": "the whole run, with making or loading shapes",
 }
 
 
 @dataclass(frozen=True)
 class PoseICP:
-    """The camera of a depth image of a known mesh, by Open3D's iterative closest points.
+    """Finds the camera of a depth image of a known mesh by Open3D's iterative closest points.
 
     Args:
-        degrees, shift, starts, spread, success_degrees, success_distance: see `bench.poses.PoseStart`. Each start is
-            tried to its end.
+        degrees, shift, starts, spread, success_degrees, success_distance: see `bench.tasks.pose.PoseStart`. Every start
+            runs to its end.
         method: "point_to_point" (Besl and McKay 1992) or "point_to_plane" (Chen and Medioni 1992).
-        points: sampled on the known mesh.
-        reach: how far apart corresponding points may be, in scene units, in each of the passes.
-        iterations: at most, in each of the passes.
+        points: number of points sampled on the known mesh.
+        reach: largest distance of corresponding points in each pass, in scene units.
+        iterations: most iterations in each pass.
     """
 
     degrees: float
@@ -62,38 +62,36 @@ class PoseICP:
 
     @property
     def start(self) -> PoseStart:
-        """Where it starts, and what counts as found."""
+        """The initial cameras, and the criteria of success."""
         return PoseStart(
             self.degrees, self.shift, self.starts, self.spread, self.success_degrees, self.success_distance
         )
 
-    def execute(self, cell: Cell) -> None:
-        """Registers the points that the camera saw to the mesh, and judges the camera before and after."""
-        stage, record, view = cell.stage, cell.record, cell.stage.scene.view
-        record.definitions = JUDGED | COSTS
-        cameras = self.start.cameras(view.camera, stage.scene.seed(stage.seed))
-        record.metrics_start = self.start.judge(see(Truth(stage.scene.mesh), cameras[0]), view)
-        points, normals = sample_surface(stage.scene.mesh, self.points, stage.seed)
+    def execute(self, run: RunContext) -> None:
+        """Registers the points of the depth image to the mesh, and evaluates the camera before and after."""
+        inputs, record, view = run.inputs, run.record, run.inputs.scene.view
+        record.definitions = EVALUATED | COSTS
+        cameras = self.start.cameras(view.camera, inputs.scene.seed(inputs.seed))
+        record.metrics_start = self.start.evaluate(see(Truth(inputs.scene.mesh), cameras[0]), view).metrics
+        points, normals = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
         clock = time.perf_counter()
         tried = [self._register(camera, view, points, normals) for camera in cameras]
         found, distance = min(tried, key=lambda result: result[1])
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         clock = time.perf_counter()
-        record.metrics = self.start.judge(see(Truth(stage.scene.mesh), found), view)
+        after = self.start.evaluate(see(Truth(inputs.scene.mesh), found), view)
         record.seconds["evaluation"] = time.perf_counter() - clock
+        record.metrics, record.notes = after.metrics, [*record.notes, *after.notes]
         record.status, record.reason = RunStatus.OK, ""
-        record.notes = [*record.notes, *self.start.remarks(record.metrics)]
         if not np.isfinite(distance):
-            record.status, record.reason = (
-                RunStatus.NOT_REACHED,
-                "no point that the camera saw came within task.reach of the mesh",
-            )
+            reason = "no point of the depth image came within task.reach of the mesh"
+            record.status, record.reason = RunStatus.NOT_REACHED, reason
 
     def _register(
         self, camera: Camera, view: View, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
     ) -> tuple[Camera, float]:
-        """The camera from one start, and the mean distance of the points that it saw from the known ones."""
+        """The camera found from one start, and the mean distance of its points from the known ones."""
         import open3d
 
         registration = open3d.pipelines.registration
@@ -118,13 +116,13 @@ class PoseICP:
 
 
 def world_points(view: View, camera: Camera) -> Float[Tensor, "n 3"]:
-    """Where the points of a depth image would be if `camera` had taken it."""
+    """The points of a depth image in world axes, if `camera` had taken it."""
     along = camera.depth(torch.ones(view.depth.shape))  # camera z of a point at distance 1
     return camera.rays().at(view.depth / along)[view.mask]
 
 
 def _rigid_part(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The nearest rigid motion: many products in float32 leave a rotation slightly off."""
+    """The nearest rigid motion: products in float32 make a rotation slightly inexact."""
     exact = motion.clone()
     exact[:3, :3] = torch.from_numpy(Rotation.from_matrix(motion[:3, :3].double().numpy()).as_matrix())
     return exact

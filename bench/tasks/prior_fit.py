@@ -1,4 +1,4 @@
-"""How well a prior can show a shape: a code fitted to the true distances, the best that a method can hope for."""
+"""The oracle: a prior's code fitted to the true distances of a shape, a bound for all methods that use the prior."""
 
 from dataclasses import dataclass
 
@@ -6,75 +6,65 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.autodecoder import Prior, near_surface_first, sample_distances
-from bench.images import save_images
-from bench.judge import look, true_surface
-from bench.metrics import surface_metrics
-from bench.solve import solve
-from bench.stage import Cell
-from bench.tasks.code import CodePenalty, CodeProblem, Terms, code_problem
-from bench.tasks.problem import OptimiserSettings
+from bench.evaluate.evaluate import render_view, true_surface
+from bench.evaluate.metrics import surface_metrics
+from bench.pictures.views import save_images
+from bench.setup.inputs import RunContext
+from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_distances
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, code_problem
+from bench.solve.problem import OptimiserSettings
+from bench.solve.solve import solve_task
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, autograd_gradients
 from renderers.rendering import Renderer
 
-NEAR = 0.02  # scene units: the field is judged as a distance within this of the true surface
+NEAR = 0.02  # scene units: the field is evaluated as a distance within this of the true surface
 DEFINITIONS = {
-    "floor_chamfer_l2": "chamfer_l2 between two independent samplings of the truth, which no prediction can beat;"
-    " in squared scene units.",
-    "distance_error": f"Mean error of the field within {NEAR} of the true surface, in scene units.",
+    "floor_chamfer_l2": "chamfer_l2 between two independent samplings of the true surface, the least that can be "
+    "measured; in squared scene units.",
+    "distance_error": f"Mean absolute error of the field within {NEAR} of the true surface, in scene units.",
     "slope_median": f"Median length of the field's gradient within {NEAR} of the true surface; 1 for a distance.",
-    "slope_p99": "The length of the gradient that 99 % of these points stay below.",
+    "slope_p99": "99th percentile of the length of the gradient there.",
 }
 
 
 @dataclass(frozen=True)
 class PriorFit:
-    """A code fitted to signed distances of the whole true mesh, which no observation gives: the oracle.
+    """Fits a code to signed distances of the true mesh: the oracle.
 
-    The renderer has no part in it: it only draws the pictures, and the images that are judged.
+    The renderer takes no part in the fit: it renders only the pictures and the evaluated images.
 
     Args:
-        distances: signed distances of the shape.
-        batch: how many of them an iteration draws.
-        surface_width: see `bench.autodecoder.PriorSettings`.
-        code_weight, code_average: see `bench.tasks.code.CodePenalty`.
-        iterations, learning_rate, schedule: see `bench.tasks.problem.OptimiserSettings`.
+        distances: number of signed distances of the shape.
+        batch: number of them that an iteration draws.
+        surface_width: see `bench.shape_prior.autodecoder.PriorSettings`.
+        code: penalty on the code.
+        optimiser: iterations and learning rates.
     """
 
     distances: int
     batch: int
     surface_width: float
-    code_weight: float
-    code_average: str
-    iterations: int
-    learning_rate: float
-    schedule: str
+    code: CodePenalty
+    optimiser: OptimiserSettings
 
     def __post_init__(self) -> None:
         check_at_least("task.distances", self.distances, 100, "24000 works")
         check_at_least("task.batch", self.batch, 1, "4000 works")
         check_positive("task.surface_width", self.surface_width, "0.05 works")
-        CodePenalty(self.code_weight, self.code_average)
-        OptimiserSettings(self.iterations, self.learning_rate, self.schedule)
 
-    @property
-    def optimiser(self) -> OptimiserSettings:
-        """For how long and how fast."""
-        return OptimiserSettings(self.iterations, self.learning_rate, self.schedule)
-
-    def execute(self, cell: Cell) -> None:
-        """Fits the code, and judges the field as a surface and as a distance."""
-        stage, record = cell.stage, cell.record
-        field = solve(self, cell)
+    def execute(self, run: RunContext) -> None:
+        """Fits the code, and evaluates the field as a surface and as a distance."""
+        inputs, record = run.inputs, run.record
+        field = solve_task(self, run).field()
         record.definitions |= DEFINITIONS
-        samples = true_surface(stage, stage.seed + 1), true_surface(stage, stage.seed)
-        floor = surface_metrics(*samples, threshold=stage.evaluation.fscore_threshold)
-        points, distances = sample_distances(stage.scene.mesh, self.distances, stage.seed + 1)
+        samples = true_surface(inputs, inputs.seed + 1), true_surface(inputs, inputs.seed)
+        floor = surface_metrics(*samples, threshold=inputs.evaluation.fscore_threshold)
+        points, distances = sample_distances(inputs.scene.mesh, self.distances, inputs.seed + 1)
         close = distances.abs() < NEAR
-        points, distances = points[close].to(stage.device), distances[close].to(stage.device)
+        points, distances = points[close].to(inputs.device), distances[close].to(inputs.device)
         lengths = autograd_gradients(field, points).norm(dim=-1)
         middle, high = lengths.double().quantile(torch.tensor([0.5, 0.99], dtype=torch.float64).to(lengths.device))
         with torch.no_grad():
@@ -85,26 +75,25 @@ class PriorFit:
             "slope_median": middle.item(),
             "slope_p99": high.item(),
         }
-        size = stage.evaluation.picture or stage.scene.view.camera.height
-        camera = stage.scene.view.camera.resized(size, size)
-        found, true = look(field, camera, stage), see(Truth(stage.scene.mesh), camera)
-        save_images(cell.folder, found, true, gradient_length=lengths.cpu().numpy())
+        size = inputs.evaluation.picture or inputs.scene.view.camera.height
+        camera = inputs.scene.view.camera.resized(size, size)
+        found, true = render_view(field, camera, inputs), see(Truth(inputs.scene.mesh), camera)
+        save_images(run.folder, found, true, gradient_length=lengths.cpu().numpy())
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
-        """The problem of a scene, from the mean shape, code zero."""
+        """The problem of a scene; it starts from code zero, the mean shape."""
         points, distances = sample_distances(scene.mesh, self.distances, seed)
         generator = torch.Generator(device=device).manual_seed(seed)
         given = TrueDistances(self, points.to(device), distances.to(device), generator)
         nothing = torch.zeros_like(scene.view.mask)
-        penalty = CodePenalty(self.code_weight, self.code_average)
-        return code_problem(prior, penalty, given.compare, observed=nothing, rays=self.batch, device=device)
+        return code_problem(prior, self.code, given.compare, observed=nothing, rays=self.batch, device=device)
 
 
 @dataclass(frozen=True)
 class TrueDistances:
-    """Signed distances of the truth; `compare` asks a field at some of them."""
+    """True signed distances; `compare` evaluates a field at a random batch of the points."""
 
     settings: PriorFit
     points: Float[Tensor, "n 3"]
@@ -112,7 +101,7 @@ class TrueDistances:
     generator: torch.Generator
 
     def compare(self, field: Field, iteration: int) -> Terms:
-        """The mean error, weighted towards the surface as in the prior's training."""
+        """The mean absolute error, weighted towards the surface as in the prior's training."""
         count = min(self.settings.batch, len(self.points))
         picked = torch.randint(len(self.points), (count,), generator=self.generator, device=self.points.device)
         distances = self.distances[picked]

@@ -1,36 +1,35 @@
-"""Where a renderer breaks: trials of growing severity, and the one at which half of them fail."""
+"""Stress tests: the severity at which half of a renderer's trials fail."""
 
-import json
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bench.breakdown import Search, SearchSettings
-from bench.limits import Limits
-from bench.records import RunStatus, plain
-from bench.stage import Cell
+from bench.machine.limits import Limits
+from bench.pictures.run_figures import draw_failure
+from bench.records.files import curve_file
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.solve.problem import Unsupported
 from bench.stress import fit, gradient, rendering
-from bench.stress.conditions import Conditions, Criteria, FitSettings
-from bench.stress.outcome import Failure, Trial
-from bench.stress.picture import draw_failure
-from bench.stress.stress import Stress
-from bench.tasks.problem import Unsupported
+from bench.stress.axes import Stress
+from bench.stress.search import Search, SearchSettings
+from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from renderers.checks import check_at_least
 from renderers.rendering import Renderer
 
 DEFINITIONS = {
-    "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of what "
-    "the trials leave possible, for a logistic curve with a lapse of 2 %; none where it is not in the sweep",
-    "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is not in the sweep",
+    "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of the "
+    "posterior, for a logistic curve with a lapse of 2 %; none where it is outside the sweep",
+    "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is outside the sweep",
     "level, level_low, level_high": "the same from 0, the mild end of the sweep, to 1, the severe one, and beyond",
     "width": "of the logistic curve, in levels; the most probable of five",
-    "trials": "renderings, gradients or fits that were judged",
-    "grid_trials": "what a full grid of task.search.levels and repeats would take",
+    "trials": "renderings, gradients or fits that were made",
+    "grid_trials": "trials of a full grid of task.search.levels and repeats",
     "mild_successes, mild_trials, severe_successes, severe_trials": "at the two ends of the sweep",
-    "failed_...": "trials that failed in that way; each counts once, as its most frequent kind",
-    "evaluations_per_ray": "field values a ray; median of the trials at the mild end",
-    "predicted": "severity at which theory has the renderer fail, by the first of its formulas",
+    "failed_...": "trials that failed in this way; each counts once, as its most frequent kind of failure",
+    "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
+    "predicted": "severity at which theory predicts failure, by the first of its formulas",
 }
 MEASURED = {
     "rendering": rendering.DEFINITIONS,
@@ -44,13 +43,13 @@ class Stability:
     """Finds the breakdown of a renderer under one stress, by an adaptive search.
 
     Args:
-        stress: what is made worse.
-        search: how finely, and for how long.
-        fit_search: the same for measure=fit, whose trials take more.
-        criteria: what counts as success.
+        stress: the axis of the test.
+        search: its resolution and length.
+        fit_search: the same for measure=fit, whose trials take longer.
+        criteria: of success.
         fit: the fit of measure=fit.
-        resolution: pixels a side of a rendering.
-        limits: on each trial; for a fit on all its steps together.
+        resolution: height and width of a rendering, in pixels.
+        limits: of each trial; for a fit, of all its steps together.
     """
 
     stress: Stress | None
@@ -64,24 +63,24 @@ class Stability:
     def __post_init__(self) -> None:
         if self.stress is None:
             raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stress")
-        check_at_least("task.resolution", self.resolution, 8, "64 shows thin parts")
+        check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
 
-    def execute(self, cell: Cell) -> None:
-        """Searches, and fills the record, curve.jsonl with a line a trial, and the picture of the mildest failure."""
-        record, renderer = cell.record, cell.stage.renderer
-        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, cell.stage.device)
+    def execute(self, run: RunContext) -> None:
+        """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
+        record, renderer = run.record, run.inputs.renderer
+        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device)
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
         self._check(renderer)
         search, trials = Search(self._settings), _Trials()
-        with (cell.folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
+        with curve_file(run.folder) as write_line:
             while (index := search.next()) is not None:
                 level = float(search.levels[index])
                 outcome = self.stress.trial(renderer, level, search.counts(index)[1], conditions)
                 search.note(index, outcome.success)
                 trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
-                curve.write(json.dumps(plain(trials.line()), allow_nan=False) + "\n")
-                cell.progress("searching", len(trials.all), self._settings.most, None)
+                write_line(trials.line())
+                run.progress("searching", len(trials.all), self._settings.most, None)
         record.metrics = self._metrics(search, trials)
         for place, prediction in enumerate(self.stress.predicted(renderer, conditions)):
             name = f"predicted_{place}" if place else "predicted"
@@ -89,12 +88,14 @@ class Stability:
             record.definitions[name] = prediction.formula
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = trials.verdict()
-        record.notes = [*record.notes, *trials.remarks()]
+        record.notes = [*record.notes, *trials.warnings()]
         if trials.first_failure is not None:
-            draw_failure(cell.folder, trials.first_failure, title=f"{record.name}, {record.scene}", unit=self._unit)
+            first, what = trials.first_failure, f"{record.name}, {record.scene}"
+            title = f"{what}: first failure ({first.outcome.failure}) at {first.severity:.3g} {self._unit}"
+            draw_failure(run.folder, first.outcome.images, first.severity, title)
 
     def _check(self, renderer: Renderer) -> None:
-        """Raises Unsupported, before the first trial, where the renderer cannot be given the mild end's setting."""
+        """Raises Unsupported, before the first trial, where the renderer rejects the setting of the mild end."""
         try:
             self.stress.stressed(renderer, self.stress.sweep.mild)
         except (ValueError, TypeError) as error:
@@ -131,33 +132,33 @@ class Stability:
 
 @dataclass
 class _Trials:
-    """All trials of a search, and the mildest that failed and has images."""
+    """All trials of a search, and the mildest failure with images."""
 
     all: list[Trial] = field(default_factory=list)
     first_failure: Trial | None = None
 
     def note(self, trial: Trial) -> None:
-        """Keeps a trial, without its images but for the mildest failure's."""
+        """Keeps a trial; images only of the mildest failure."""
         shown = bool(trial.outcome.images) and not trial.outcome.success
         if shown and (self.first_failure is None or trial.level < self.first_failure.level):
             self.first_failure = trial
         self.all.append(replace(trial, outcome=replace(trial.outcome, images={})))
 
     def verdict(self) -> tuple[RunStatus, str]:
-        """A search of which each trial raised an error has found nothing."""
+        """The status of the run: crashed where every trial raised an error."""
         if all(trial.outcome.failure is Failure.CRASHED for trial in self.all):
             return RunStatus.CRASHED, f"every trial raised an error: {self.all[-1].outcome.message}"
         return RunStatus.OK, ""
 
-    def remarks(self) -> list[str]:
-        """What makes the breakdown doubtful: trials that raised errors, and success that grows with severity."""
+    def warnings(self) -> list[str]:
+        """Reasons to doubt the breakdown: trials that raised errors, or success that grows with severity."""
         raised = [trial.outcome.message for trial in self.all if trial.outcome.failure is Failure.CRASHED]
-        told = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
-        if not self.falls():
-            told.append("success does not fall with severity: there is more at the severe end than at the mild one")
-        return told
+        found = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
+        if not self.decreases():
+            found.append("success does not fall with severity: more trials succeed at the severe end than at the mild")
+        return found
 
-    def falls(self) -> bool:
+    def decreases(self) -> bool:
         """Whether no larger share of the trials succeeds at the severe end than at the mild one."""
         shares = [np.mean([t.outcome.success for t in self.all if t.level == end] or [0.0]) for end in (1.0, 0.0)]
         return bool(shares[0] <= shares[1])
@@ -165,12 +166,12 @@ class _Trials:
     def line(self) -> dict[str, object]:
         """The last trial as a line of the curve."""
         last = self.all[-1]
-        told = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
+        numbers = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
         failed = {"failure": str(last.outcome.failure), "message": last.outcome.message}
-        return {"trial": len(self.all) - 1, **told, **failed, **last.outcome.numbers}
+        return {"trial": len(self.all) - 1, **numbers, **failed, **last.outcome.numbers}
 
     def spent(self) -> float | None:
-        """Field values a ray at the mild end, the median."""
+        """Median field values per ray at the mild end."""
         costs = [trial.outcome.numbers.get("evaluations_per_ray") for trial in self.all if trial.level == 0]
         known = [cost for cost in costs if cost is not None]
         return float(np.median(known)) if known else None

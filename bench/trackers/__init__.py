@@ -1,4 +1,4 @@
-"""Exports finished runs to where others keep theirs; never during a run, and nothing here can lose one."""
+"""Exports finished runs to experiment trackers; never during a run, and a failed export loses no run."""
 
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -6,20 +6,20 @@ from typing import Any, Protocol, runtime_checkable
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Takes a finished run."""
+    """Exports finished runs to an experiment tracker."""
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Exports a run.
 
         Args:
             folder: of the run, with its curve and pictures.
-            record: as `bench.report.records.read_record` gives it.
+            record: as `bench.records.record.read_record` gives it.
         """
         ...
 
 
 class Nothing:
-    """Exports nothing."""
+    """The tracker that exports nothing."""
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Does nothing."""

@@ -1,4 +1,4 @@
-"""What a tracker is given of a run: flat settings, last values, curves."""
+"""A run's data as trackers take it: flat settings, final values, and curves."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def values(record: dict[str, Any]) -> dict[str, float]:
 
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:
-    """The lines of `curve.jsonl`: iteration, and its finite numbers by name; none where there is no curve."""
+    """The lines of `curve.jsonl` as iteration and finite numbers by name; empty where there is no curve."""
     path = folder / "curve.jsonl"
     if not path.is_file():
         return []

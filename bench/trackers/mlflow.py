@@ -1,4 +1,4 @@
-"""MLflow: a run for each of ours, with settings, numbers, curve and pictures."""
+"""Exports runs to MLflow, with their settings, numbers, curves and pictures."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -6,10 +6,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.report.records import started
+from bench.records.record import started
 from bench.trackers.content import curve, settings, values
 
-METRICS, PARAMETERS = 1000, 100  # most that one call of log_batch takes
+METRICS, PARAMETERS = 1000, 100  # largest numbers that one call of log_batch takes
 LONGEST = 500  # characters of a parameter's value
 
 
@@ -28,12 +28,12 @@ class MLflow:
     artifacts: str
 
     def __post_init__(self) -> None:
-        if find_spec("mlflow") is None:  # now, not after a night of runs
+        if find_spec("mlflow") is None:  # checked before the run, not after it
             raise ValueError("tracker=mlflow needs MLflow: pip install -e '.[mlflow]'")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
-        """Makes a run in MLflow; it ends FINISHED if ours ended ok, else FAILED."""
-        from mlflow import MlflowClient, entities  # slow, and needed only now
+        """Makes a run in MLflow; its status is FINISHED where the run ended ok, else FAILED."""
+        from mlflow import MlflowClient, entities  # slow to import, and needed only here
 
         client = MlflowClient(tracking_uri=self.uri)
         known = client.get_experiment_by_name(self.experiment)

@@ -1,4 +1,4 @@
-"""TensorBoard: an event file in each run folder, with the curve, the last values and the settings."""
+"""Exports runs to TensorBoard: an event file per run, with the curve, the final values and the settings."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -19,12 +19,12 @@ class TensorBoard:
     folder: str
 
     def __post_init__(self) -> None:
-        if find_spec("tensorboard") is None:  # now, not after a night of runs
+        if find_spec("tensorboard") is None:  # checked before the run, not after it
             raise ValueError("tracker=tensorboard needs TensorBoard: pip install -e '.[tensorboard]'")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Writes the run's event file."""
-        from torch.utils.tensorboard import SummaryWriter  # slow, and needed only now
+        from torch.utils.tensorboard import SummaryWriter  # slow to import, and needed only here
 
         with SummaryWriter(str(Path(self.folder) / record["id"])) as writer:
             for iteration, line in curve(folder):
@@ -32,5 +32,5 @@ class TensorBoard:
                     writer.add_scalar(f"curve/{name}", value, iteration)
             for name, value in values(record).items():
                 writer.add_scalar(name.replace(".", "/"), value, 0)
-            told = {"status": record["status"], "reason": record["reason"], **settings(record["config"])}
-            writer.add_text("settings", "\n".join(f"    {name}: {text}" for name, text in told.items()))
+            summary = {"status": record["status"], "reason": record["reason"], **settings(record["config"])}
+            writer.add_text("settings", "\n".join(f"    {name}: {text}" for name, text in summary.items()))

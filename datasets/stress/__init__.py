@@ -1,4 +1,4 @@
-"""Scenes that make renderers fail: closed-form truth, and one number that says how severe each is."""
+"""Scenes that make renderers fail, with closed-form truth and one number for their severity."""
 
 from datasets.stress.scenes import SCENES, Exam
 from datasets.stress.solids import FirstHit, Solid

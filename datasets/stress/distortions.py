@@ -1,6 +1,6 @@
-"""What becomes of a distance when a network, a quantisation or a mistake stands for it. All claim to be distances.
+"""Distortions of a distance field, as by a network, quantisation or an error. All still claim to be distances.
 
-A distortion takes a field, a severity in the units of conf/stress, and what it may draw.
+A distortion takes a field, a severity in the units of conf/stress, and a random generator.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from renderers.field import Field
 from renderers.fields.analytic import Shape
 
 Distortion = Callable[[Field, float, np.random.Generator], Field]
-RIPPLES = 15.0  # radians a scene unit
+RIPPLES = 15.0  # radians per scene unit
 WAVES = 32  # random cosines that make a perturbation
 
 
@@ -42,7 +42,7 @@ def perturbed(field: Field, severity: float, draw: np.random.Generator) -> Field
 
 
 def coarse_floats(field: Field, severity: float, draw: np.random.Generator) -> Field:
-    """A cube with points and values rounded to so many bits of a mantissa: float32 has 24, bfloat16 has 8."""
+    """A cube with points and values rounded to `severity` bits of mantissa: float32 has 24, bfloat16 has 8."""
     bits = round(severity)
 
     def rounded(numbers: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Scenes that are swept from easy to impossible: each makes an exam of a severity, in the unit sphere.
+"""Scenes of growing severity, from easy to impossible, in the unit sphere; each makes an Exam at a severity.
 
-Severities are in the units that conf/stress states. What is drawn (turns, places) depends on the generator alone, so
-that every renderer sits the same exams.
+Severities are in the units of conf/stress. Random turns and places depend on the generator alone, so that every
+renderer gets the same exams.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from datasets.stress import distortions
-from datasets.stress.judged import Judged
-from datasets.stress.solids import FirstHit, Solid, ball, box, half_space, rod
+from datasets.stress.solids import FirstHit, ReferenceTruth, Solid, box, half_space, rod, sphere_solid
 from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays
 from renderers.field import Field, Kind
@@ -29,13 +28,13 @@ ALL_AROUND = (0.0, 360.0)
 CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
 CUBE = 0.5  # half its side length
 CUBE_VIEW = 44.0  # degrees: it fills the picture
-GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, as a share of the sine
+GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, divided by the angle's sine
 SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the picture is wide
 
 
 @runtime_checkable
 class Truth(Protocol):
-    """A field that knows its own first hits."""
+    """A field whose first hits are known."""
 
     @property
     def field(self) -> Field: ...
@@ -48,11 +47,11 @@ class Exam:
     """One rendering with its truth.
 
     Args:
-        field: what the renderer is given; it may lie about its kind on purpose.
+        field: that the renderer gets; its stated kind may be wrong on purpose.
         camera: of the rendering.
-        truth: of the scene; where the field is distorted, of what it was before.
-        solid: makes the truth of parameters, where the exam asks for gradients towards them; else None.
-        parameters: where these gradients are taken.
+        truth: of the scene; where the field is distorted, of the undistorted one.
+        solid: gives the solid of parameters, where gradients towards them are tested; else None.
+        parameters: at which these gradients are taken.
     """
 
     field: Field
@@ -62,7 +61,7 @@ class Exam:
     parameters: Float[Tensor, "n"] | None = None
 
 
-Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, draws, and pixels a side
+Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, random generator, and W of W x W pixels
 
 
 def thin_plate(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -79,7 +78,7 @@ def wires(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 
 
 def nested_shells(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """Three boxes whose walls have a thickness, one in the other, without the corner towards the camera."""
+    """Three nested boxes whose walls have a thickness, cut open at the corner towards the camera."""
     shells = box((0.15,) * 3) - box((0.15 - severity,) * 3)
     for half in (0.32, 0.5):
         shells |= box((half,) * 3) - box((half - severity,) * 3)
@@ -87,7 +86,7 @@ def nested_shells(severity: float, draw: np.random.Generator, resolution: int) -
 
 
 def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A wavy sheet, 0.03 high, of a frequency in radians a scene unit; its slope makes its distance wrong."""
+    """A wavy sheet, 0.03 high, of a frequency in radians per scene unit; its slope makes its distance wrong."""
 
     def value(points: Tensor) -> Tensor:
         return points[..., 2] - 0.03 * torch.sin(severity * points[..., :2]).prod(dim=-1)
@@ -95,11 +94,11 @@ def bumps(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     wavy = Shape(value, Kind.DISTANCE)
     slope = (1 + (0.03 * severity) ** 2) ** 0.5  # the product of two sines has a slope of at most its frequency
     camera = _camera(draw, resolution, azimuth=(-20, 20), elevation=(-20, 20), field_of_view=20.0)
-    return Exam(wavy, camera, Judged(wavy, lipschitz=slope, thinnest=min(0.01, 0.2 / severity)))
+    return Exam(wavy, camera, ReferenceTruth(wavy, lipschitz=slope, thinnest=min(0.01, 0.2 / severity)))
 
 
 def tiny_objects(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """49 cubes of half a side length, 0.16 apart, corners to the camera; pixels are 0.036 wide at 64 pixels a side."""
+    """49 cubes of half a side length, 0.16 apart, corners to the camera; pixels are 0.036 wide at 64 x 64."""
     cube = box((severity,) * 3).turned(_corner_to_z())
     row = _seven(lambda place: cube.moved((0.16 * place - 0.48, 0.0, 0.0)))
     sheet = _seven(lambda place: row.moved((0.0, 0.16 * place - 0.48, 0.0)))
@@ -120,7 +119,7 @@ def gap(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
 
 
 def csg_difference(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """Three walls of a thickness: a cube without another one, whose field is only a bound; from within or without."""
+    """Three walls of a thickness: a cube minus a shifted one, whose field is only a bound; from inside or outside."""
     walls = box((0.4,) * 3) - box((0.4,) * 3).moved((severity,) * 3)
     side = 180.0 * draw.integers(2)
     azimuth, elevation = CORNER["azimuth"], CORNER["elevation"]
@@ -130,7 +129,7 @@ def csg_difference(severity: float, draw: np.random.Generator, resolution: int) 
 
 
 def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A plane seen at an angle, in degrees, as much of it at any. Its parameters: an offset and two tilts."""
+    """A plane seen at an angle, in degrees, the same part of it at each. Its parameters: an offset and two tilts."""
 
     def solid(parameters: Tensor) -> Solid:
         offset, right, forward = parameters
@@ -143,40 +142,40 @@ def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -
 
 
 def near_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A ball from a camera at a distance from its surface; below 0.5 it stands within the unit sphere."""
-    return _seen(ball(0.5), draw, resolution, distance=0.5 + severity, field_of_view=20.0)
+    """A sphere from a camera at a distance from its surface; below 0.5 the camera is within the unit sphere."""
+    return _seen(sphere_solid(0.5), draw, resolution, distance=0.5 + severity, field_of_view=20.0)
 
 
 def far_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube from a distance, through a lens as long."""
+    """A cube from a distance, with a field of view that keeps its image size."""
     return _cube(draw, resolution, distance=severity, field_of_view=2 * degrees(atan(1.0 / severity)))
 
 
 def camera_inside(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A camera within a ball, at a depth below its surface: no ray has a first hit."""
-    return _seen(ball(0.5), draw, resolution, distance=0.5 - severity, field_of_view=60.0)
+    """A camera within a sphere, at a depth below its surface: no ray has a first hit."""
+    return _seen(sphere_solid(0.5), draw, resolution, distance=0.5 - severity, field_of_view=60.0)
 
 
 def wide_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube from nearby, through a lens of an angle in degrees."""
+    """A cube from nearby, with a field of view in degrees."""
     return _cube(draw, resolution, distance=1.8, field_of_view=severity)
 
 
 def narrow_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube through a lens of an angle in degrees: pixels become small."""
+    """A cube with a field of view in degrees: pixels become small."""
     return _cube(draw, resolution, field_of_view=severity)
 
 
 def empty_scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A field that comes as near to zero as this, on a sheet across the view, and has no surface."""
+    """A field without a surface, whose least value, on a sheet across the view, is the severity."""
     sheet = half_space((0.0, 0.0, 1.0), 0.0)
     field = Shape(lambda points: sheet.field(points).abs() + severity, Kind.BOUND)
     camera = _camera(draw, resolution, azimuth=(-30, 30), elevation=(-30, 30))
-    return Exam(field, camera, ball(0.0))
+    return Exam(field, camera, sphere_solid(0.0))
 
 
 def _distorted(distortion: distortions.Distortion) -> Scene:
-    """The cube through a distorted field, judged by the undistorted cube."""
+    """The cube with a distorted field, compared with the undistorted cube."""
 
     def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
         exam = _cube(draw, resolution)
@@ -186,11 +185,11 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
 
 
 def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A smaller cube behind a ball of a radius, up to 0.1, in which the field is not a number."""
+    """A smaller cube behind a sphere of a radius, up to 0.1, in which the field is NaN."""
     cube = box((0.42,) * 3)
     exam = _seen(cube, draw, resolution, field_of_view=38.0, **CORNER)
     center = 0.87 * torch.nn.functional.normalize(exam.camera.center, dim=0)  # the cube's corner lies at 0.73
-    hole = ball(severity).moved(center).field
+    hole = sphere_solid(severity).moved(center).field
 
     def value(points: Tensor) -> Tensor:
         return torch.where(hole(points) < 0, torch.nan, exam.field(points))
@@ -199,7 +198,7 @@ def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> E
 
 
 def cube(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube as it is, for a severity that is the renderer's own."""
+    """An undisturbed cube, for a severity that is a renderer's setting."""
     return _cube(draw, resolution)
 
 

@@ -1,6 +1,6 @@
-"""Solids with closed-form ray intersections beside their fields, so that a rendering can be judged without another.
+"""Solids with a field and closed-form ray intersections: the truth that renderings are compared with.
 
-A solid knows the spans of a ray that lie within it; union and difference are those of the spans.
+A solid gives the spans of a ray that lie within it; union and difference are those of the spans.
 """
 
 from collections.abc import Callable
@@ -10,21 +10,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from renderers import reference
 from renderers.camera import Rays, sphere_span
 from renderers.field import Field, autograd_normals
 from renderers.fields import analytic
 from renderers.fields.analytic import Shape
+from renderers.rendering import Status
 
-Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; a span that is not there has its exit first
+Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; of a missing span the exit comes first
 
 
 @dataclass(frozen=True)
 class FirstHit:
-    """The truth of n rays: where each first meets the surface within the sphere; distances only where `hit`."""
+    """The true first hits of n rays within the unit sphere; distances only where `hit`."""
 
     distance: Float[Tensor, "n"]
     hit: Bool[Tensor, "n"]
-    inside: Bool[Tensor, "n"]  # the ray begins within the solid, so that it has no first hit
+    inside: Bool[Tensor, "n"]  # the ray begins inside the solid, so that it has no first hit
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor
     return torch.where(first.hit, (normals * rays.directions).sum(-1).abs(), 1.0)
 
 
-def ball(radius: analytic.Numbers) -> Solid:
-    """A ball about the origin."""
+def sphere_solid(radius: analytic.Numbers) -> Solid:
+    """A sphere about the origin."""
 
     def spans(rays: Rays) -> Spans:
         approach = -(rays.origins * rays.directions).sum(-1)
@@ -143,13 +145,13 @@ def rod(radius: analytic.Numbers, half_height: analytic.Numbers) -> Solid:
 
 
 def _span(near: Tensor, far: Tensor, there: Tensor) -> Spans:
-    """One span a ray; where it is not there its exit comes first, and no gradient flows."""
+    """One span per ray; where it is missing its exit comes first, and no gradient flows."""
     nowhere = torch.full_like(near, torch.inf)
     return torch.stack([torch.where(there, near, nowhere), torch.where(there, far, -nowhere)], dim=-1)[:, None]
 
 
 def _without(first: Spans, second: Spans) -> Spans:
-    """What lies in a span of the first and in none of the second."""
+    """The parts of the first spans that lie in none of the second."""
     left = first
     for near, far in (span.unbind(-1) for span in second.unbind(1)):
         there = (far > near)[:, None]
@@ -157,3 +159,23 @@ def _without(first: Spans, second: Spans) -> Spans:
         after = torch.where(there, torch.maximum(left[..., 0], far[:, None]), torch.inf)
         left = torch.cat([torch.stack([left[..., 0], before], -1), torch.stack([after, left[..., 1]], -1)], dim=1)
     return left
+
+
+@dataclass(frozen=True)
+class ReferenceTruth:
+    """A field whose first hits are found by the reference tracer.
+
+    Args:
+        field: evaluated in float64.
+        lipschitz: a bound on the length of its gradient.
+        thinnest: parts thinner than this along a ray may be missed, in scene units.
+    """
+
+    field: Field
+    lipschitz: float
+    thinnest: float
+
+    def trace(self, rays: Rays) -> FirstHit:
+        """The first hits of flat rays [n]; without gradient."""
+        found = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
+        return FirstHit(found.distance, found.hit, found.status == Status.STARTED_INSIDE)

@@ -14,12 +14,12 @@ from torch import Tensor
 from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
-LEAST_SHARE = 1e-6  # of the larger part of a norm: what is less counts as that, an error of a millionth at most
+LEAST_SHARE = 1e-6  # smaller parts of a norm are raised to this share of the largest: an error of 1e-6 at most
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A Field made of a formula. `|` is union, `&` intersection, `-` difference."""
+    """A Field from a formula. `|` is union, `&` intersection, `-` difference."""
 
     function: Callable[[Tensor], Tensor]
     kind: Kind = Kind.DISTANCE
@@ -115,7 +115,8 @@ def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
 
     Args:
         half_sizes: along x, y and z, in scene units, positive.
-        exponents: p across x and y, q towards z, each 1 or more: 1 is an octahedron, 2 an ellipsoid, many a box.
+        exponents: p across x and y, q towards z, each 1 or more: 1 gives an octahedron, 2 an ellipsoid, large ones
+            nearly a box.
     """
 
     def bound(points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A field between samples on a grid: any shape whose distances can be computed, ready for a renderer."""
+"""A field interpolated between samples on a grid: for any shape whose distances can be computed."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from renderers.field import Flops, Kind
 
-FLOPS = Flops(value=40, gradient=60)  # eight products and sums, and what finds them; an estimate
+FLOPS = Flops(value=40, gradient=60)  # eight products and sums, and their indices; an estimate
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The DeepSDF decoder: a network of points and a shape code, bound to one code before anything is rendered."""
+"""The DeepSDF decoder: a network of points and a shape code, bound to one code before rendering."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from renderers.checks import check_at_least
 from renderers.field import Flops, Kind
 
-CHUNK = 2048  # points a pass: keeps the activations in cache (measured on CPUs: 65,536 is 1.3 times slower)
+CHUNK = 2048  # points per pass: keeps the activations in cache (measured on CPUs: 65,536 is 1.3 times slower)
 
 
 class Decoder(nn.Module):
@@ -21,7 +21,7 @@ class Decoder(nn.Module):
 
     Args:
         layers: hidden layers, at least 1.
-        width: neurons a hidden layer.
+        width: neurons per hidden layer.
         code_length: numbers in a shape's code; 0 for a network of one shape.
         skip: index of the hidden layer whose input also takes the code and the point; 0 for no skip.
         narrow: make the layer before the skip narrower, so that its output and the second input have `width` together,
@@ -82,7 +82,7 @@ class BoundDecoder:
 
     @property
     def flops(self) -> Flops:
-        """A multiplication and an addition a weight; as much again towards points and code, twice towards weights."""
+        """A multiplication and an addition per weight; as much again towards points and code, twice towards weights."""
         value = 2 * sum(weight.numel() for weight, _ in (*self.hidden, self.last))
         return Flops(value, value if self._frozen else 2 * value)
 
@@ -106,7 +106,7 @@ class BoundDecoder:
         return values.view(points.shape[:-1])
 
     def _forward(self, points: Tensor, gates: tuple[Tensor, ...] = ()) -> Tensor:
-        """The values; where `gates` are given, they take what each ReLU lets through."""
+        """The values; fills `gates`, where given, with True where a ReLU is open."""
         features = points
         for index, (weight, bias) in enumerate(self.hidden):
             if index == self.skip and index:
@@ -134,7 +134,7 @@ class BoundDecoder:
 class _FrozenDecoder(torch.autograd.Function):
     """A decoder whose weights need no gradient, in less memory and time than a graph takes.
 
-    All that the backward pass must know is where each ReLU was open: a byte a neuron. It works chunk by chunk, and only
+    The backward pass needs to know only which ReLUs were open: one byte per neuron. It works chunk by chunk, and only
     on the points whose value has a gradient other than zero.
     """
 

@@ -11,7 +11,7 @@ from renderers.field import Field, Flops, Kind
 
 @dataclass(frozen=True)
 class Moved:
-    """A shape that was scaled, then moved: world = M (scale * own); values stay distances.
+    """A shape that was scaled, then moved: world = M (scale * local); values stay distances.
 
     Args:
         inner: the shape in its own axes.
@@ -37,5 +37,5 @@ class Moved:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         scale = self.similarity[6].exp()
         motion = rigid(self.similarity[:6])
-        own = (points - motion[:3, 3]) @ motion[:3, :3] / scale
-        return scale * self.inner(own)
+        local = (points - motion[:3, 3]) @ motion[:3, :3] / scale
+        return scale * self.inner(local)

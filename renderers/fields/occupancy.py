@@ -1,4 +1,4 @@
-"""DVR's network: occupancy and texture of points and a shape code, bound to one code before anything is rendered."""
+"""DVR's network: occupancy and texture of points and a shape code, bound to one code before rendering."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from renderers.checks import check_at_least
 from renderers.field import Flops
 
 BLOCKS = 5  # DVR, Sec. 3.5
-CHUNK = 2048  # points a pass: bounds memory, and changes nothing
+CHUNK = 2048  # points per pass: bounds memory, does not change results
 
 
 class OccupancyNetwork(nn.Module):
@@ -23,7 +23,7 @@ class OccupancyNetwork(nn.Module):
         x + B relu(A relu(x)); the width is an argument; the weights start as torch draws them.
 
     Args:
-        width: neurons a layer.
+        width: neurons per layer.
         code_length: numbers in a shape's code; 0 for a network of one shape.
     """
 
@@ -40,7 +40,7 @@ class OccupancyNetwork(nn.Module):
         self.texture_head = nn.Linear(width, 3)
 
     def at(self, code: Float[Tensor, "*shapes code_length"]) -> "BoundOccupancy":
-        """Occupancy and texture of one code, or of a batch of codes; what a code adds to a block is worked out once."""
+        """Occupancy and texture of one code, or of a batch of codes; a code's shift of each block is computed once."""
         if code.shape[-1] != self.code_length:
             raise ValueError(f"code must end in {self.code_length} numbers, not {code.shape[-1]}")
         return BoundOccupancy(self, tuple(shift(code) for shift in self.shifts))
@@ -55,7 +55,7 @@ class BoundOccupancy:
 
     @property
     def flops(self) -> Flops:
-        """Of a logit: a multiplication and an addition a weight; as much again towards points, twice with weights."""
+        """Of a logit: a multiplication and an addition per weight; as much again towards points, twice with weights."""
         network = self.network
         layers = nn.ModuleList([network.first, network.blocks, network.occupancy_head])
         value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
@@ -63,7 +63,7 @@ class BoundOccupancy:
         return Flops(value, value if frozen else 2 * value)
 
     def logits(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Of the probability of being inside; for a batch of codes [*shapes, length], of points [*shapes, n, 3]."""
+        """Logits of being inside; for a batch of codes [*shapes, length], of points [*shapes, n, 3]."""
         return self._outputs(points, self.network.occupancy_head).squeeze(-1)
 
     def colours(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -88,7 +88,7 @@ class BoundOccupancy:
 
 
 class _Block(nn.Module):
-    """Two layers around which the input is led past."""
+    """Two layers with a skip connection around them."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

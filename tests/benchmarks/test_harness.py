@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.records import Record, RunStatus
-from bench.report.html import write_index
-from tests.test_isolation import FAILING, ROOT
+from bench.records.record import Record, RunStatus
+from bench.report.write.html import write_index
+from tests.run.driving import FAILING, ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +26,14 @@ def seconds_of(results: Path) -> list[dict[str, float]]:
 def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
     """Cells that take 10 s by themselves, in a sweep: what the sweep takes beyond them, a cell."""
     cells, pause = 4, 1.0
-    arguments = (*FAILING, *CELL[2:], "task.iterations=8", f"+renderer.pause={pause}", "seed=0,1,2,3", "isolation=off")
+    arguments = (
+        *FAILING,
+        *CELL[2:],
+        "task.optimiser.iterations=8",
+        f"+renderer.pause={pause}",
+        "seed=0,1,2,3",
+        "isolation=off",
+    )
     walls = {}
     for isolation in ("off", "process"):
         command = [sys.executable, "-m", "bench", "-m", *arguments[:-1], f"isolation={isolation}"]

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from bench.autodecoder import initialise_to_sphere
 from bench.config import load
-from bench.environment import MemoryPeak, gemm_peak
+from bench.machine.environment import MemoryPeak, gemm_peak
+from bench.shape_prior.autodecoder import initialise_to_sphere
 from datasets.views import ViewSampler
 from renderers.field import Counts, Meter
 from renderers.fields.mlp import Decoder
@@ -75,7 +75,7 @@ def test_rendering_reaches_most_of_the_rate_of_a_matrix_product(benchmark, decod
 def test_memory_stays_low_and_does_not_grow_with_the_steps(decoder):
     rises = {}
     for steps in (50, 400):
-        work = step(decoder, 512, backward=True, steps=steps, samples=1)
+        work = step(decoder, 512, backward=True, steps=steps, n_gradient_samples=1)
         memory = MemoryPeak(CPU)
         work()
         rises[steps] = memory.growth()

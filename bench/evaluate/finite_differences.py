@@ -1,0 +1,139 @@
+"""Derivatives of distance towards code and camera by central differences in float64: the truth for gradients."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from renderers.camera import Camera, Rays, sphere_span
+from renderers.field import Field
+from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.reference import trace
+
+STEP = 1e-6  # of a central difference, in units of the parameter: a network has few kinks within so short a step
+ROOT_STEPS = 6  # of the secant method, from the undisturbed root
+RESIDUAL = 1e-12  # |field| above which the secant method has not converged
+CLEAR = 1e-3  # scene units before the hit within which the ray may be near the surface
+BEFORE = 256  # samples of the ray up to there
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Derivatives of the distance along m rays, and where they hold: where visibility does not change."""
+
+    code: Float[Tensor, "m directions"]
+    camera: Float[Tensor, "m 6"]
+    valid: Bool[Tensor, "m"]
+
+
+def differences(
+    decoder: Decoder,
+    code: Float[Tensor, "code_length"],
+    directions: Float[Tensor, "code_length directions"],
+    *,
+    camera: Camera,
+    pixels: Int[Tensor, "m"],
+    distance: Float[Tensor, "m"],
+) -> Differences:
+    """Central differences of the distance to the surface that the rays of some pixels hit.
+
+    Args:
+        decoder, code: in float64.
+        directions: of the code, as unit columns.
+        camera: in float64; its six derivatives are towards `Camera.moved`'s twist.
+        pixels: indices into the flattened image.
+        distance: to the hits.
+    """
+    rays = camera.rays().flat()[pixels]
+    with torch.no_grad():
+        shifts = STEP * torch.cat([directions.T, -directions.T])
+        moved, found = _roots(decoder.at(code + shifts), rays, distance)
+        by_code = ((moved[: len(shifts) // 2] - moved[len(shifts) // 2 :]) / (2 * STEP)).T
+        hits = rays.at(distance)
+        change = decoder.at(code + shifts)(hits.expand(len(shifts), -1, -1)) - decoder.at(code)(hits)
+        margin = 4 * change.abs().max()  # of the field, not of the distance, which moves far near grazing
+        valid = found.all(dim=0) & _clear(decoder.at(code), rays, distance, margin=margin)
+        columns = []
+        for twist in STEP * torch.eye(6, dtype=torch.float64):
+            (ahead, ok), (behind, ok_too) = (
+                _roots(decoder.at(code[None]), camera.moved(sign * twist).rays().flat()[pixels], distance)
+                for sign in (1, -1)
+            )
+            columns.append((ahead - behind)[0] / (2 * STEP))
+            valid &= ok[0] & ok_too[0]
+    return Differences(by_code, torch.stack(columns, dim=1), valid)
+
+
+def image_differences(
+    field_at: Callable[[Tensor], Field],
+    directions: Float[Tensor, "code_length directions"],
+    *,
+    camera: Camera,
+    pixels: Int[Tensor, "m"],
+    step: float,
+    supersampling: int,
+    lipschitz: float,
+) -> Float[Tensor, "m directions"]:
+    """Central differences of a supersampled image of distances, across the silhouette.
+
+    A pixel is the mean over supersampling^2 rays of the distance to the surface or, without a hit, to where the ray
+    leaves the unit sphere. What comes into view or leaves it counts here.
+
+    Args:
+        field_at: the field at a shift of the code.
+        directions: of the code, as unit columns.
+        camera: in float64.
+        pixels: indices into the flattened image.
+        step: of the difference, large enough that the outline moves by a fraction of a pixel.
+        supersampling: S of S x S rays per pixel.
+        lipschitz: bound on the gradient of the field, for the tracer.
+    """
+    rays = subrays(camera, pixels, supersampling)
+    columns = []
+    for direction in directions.T:
+        ahead, behind = (
+            trace(field_at(sign * step * direction), rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0).distance
+            for sign in (1, -1)
+        )
+        columns.append((ahead - behind).mean(dim=1) / (2 * step))
+    return torch.stack(columns, dim=1)
+
+
+def subrays(camera: Camera, pixels: Int[Tensor, "m"], count: int) -> Rays:
+    """The rays [m, count^2] through a regular grid in each of some pixels."""
+    fine = camera.resized(camera.height * count, camera.width * count).rays()
+    rows, columns = pixels // camera.width, pixels % camera.width
+    inner = torch.arange(count)
+    down = (rows[:, None] * count + inner)[:, :, None].expand(-1, count, count).reshape(len(pixels), -1)
+    across = (columns[:, None] * count + inner)[:, None, :].expand(-1, count, count).reshape(len(pixels), -1)
+    return Rays(fine.origins[down, across], fine.directions[down, across])
+
+
+def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, "m"]) -> tuple[Tensor, Tensor]:
+    """Roots of a batch of fields, a row each, along m rays near known roots; and which of them were found."""
+
+    def values(distance: Tensor) -> Tensor:
+        return field(rays.origins + distance[..., None] * rays.directions)
+
+    codes = len(field.hidden[0][1])
+    first = start.expand(codes, -1)
+    second = first + 10 * STEP
+    first_value, second_value = values(first), values(second)
+    for _ in range(ROOT_STEPS):
+        still = (second_value == first_value) | (second_value == 0)
+        change = torch.where(still, 1.0, second_value - first_value)
+        third = second - second_value * (second - first) / change
+        first, first_value, second = second, second_value, torch.where(still, second, third)
+        second_value = values(second)
+    return second, (second_value.abs() < RESIDUAL) & ((second - start).abs() < CLEAR)
+
+
+def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, "m"], *, margin: Tensor) -> Bool[Tensor, "m"]:
+    """Whether the field stays above a margin along the ray up to the hit."""
+    entry, _, _ = sphere_span(rays)
+    shares = torch.linspace(0, 1, BEFORE, dtype=distance.dtype)
+    along = entry[:, None] + shares * (distance - CLEAR - entry)[:, None]
+    values = field(rays.origins[:, None] + along[..., None] * rays.directions[:, None])
+    return (values > margin).all(dim=1)

@@ -1,0 +1,80 @@
+"""Float64 renderings of a network in a view, made once and cached by a hash of weights and camera."""
+
+import hashlib
+import os
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from bench.records.files import digest, file_lock
+from bench.shape_prior.autodecoder import Prior
+from renderers.camera import Camera
+from renderers.field import Field, autograd_normals, steepest
+from renderers.reference import trace
+
+VERSION = 1  # raise it when the reference changes
+LEAST_STEP = 2e-4  # scene units: what is thinner along a ray may be missed; a pixel at 512 x 512 is 4.6e-3 wide
+RADIUS = 1.0  # scene units, of the sphere that rays start on
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A rendering of a field in float64, on the CPU; distance and normals are 0 where nothing is hit."""
+
+    distance: Float[Tensor, "height width"]
+    normals: Float[Tensor, "height width 3"]
+    hit: Bool[Tensor, "height width"]
+
+
+def in_float64(prior: Prior) -> Prior:
+    """A copy of a prior in float64, on the CPU."""
+    return Prior(deepcopy(prior.decoder).cpu().double(), prior.codes.cpu().double())
+
+
+def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
+    """The reference of a prior's first shape in a view, from `folder`, or made and stored there.
+
+    Raises:
+        ValueError: where the stored one cannot be read.
+    """
+    key = _key(prior, camera)
+    path = folder / f"reference-{key}.safetensors"
+    if not path.is_file():
+        with file_lock(folder, key):
+            if not path.is_file():  # else another run has made it meanwhile
+                _store(prior, camera, path)
+    try:
+        return Reference(**load_file(path))
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"the reference {path} cannot be read ({error}): delete it, and it is made again") from error
+
+
+def _store(prior: Prior, camera: Camera, path: Path) -> None:
+    exact = in_float64(prior)
+    scratch = path.with_suffix(f".{os.getpid()}.partial")
+    save_file(vars(make_reference(exact.decoder.at(exact.codes[0]), camera)), scratch)
+    scratch.replace(path)
+
+
+def make_reference(field: Field, camera: Camera) -> Reference:
+    """Traces a float64 field through every pixel's centre."""
+    rays = camera.double().rays()
+    lipschitz = steepest(field, radius=RADIUS)
+    rendering = trace(field, rays, lipschitz=lipschitz, least_step=LEAST_STEP, radius=RADIUS)
+    normals = torch.zeros_like(rendering.points)
+    normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
+    return Reference(rendering.distance * rendering.hit, normals, rendering.hit)
+
+
+def _key(prior: Prior, camera: Camera) -> str:
+    weights = hashlib.sha256()
+    for tensor in (*prior.decoder.state_dict().values(), prior.codes[0]):
+        weights.update(tensor.cpu().contiguous().numpy().tobytes())
+    numbers = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
+    return digest({"version": VERSION, "weights": weights.hexdigest(), "camera": numbers})

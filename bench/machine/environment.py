@@ -1,0 +1,151 @@
+"""The environment of a run: commit, versions, hardware, threads, load, and the machine's peak rate."""
+
+import ctypes
+import hashlib
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+GEMM_SIZE = 1024  # of the square matrices whose product is timed
+PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
+
+
+def pick_device(wanted: str) -> torch.device:
+    """The device of `device=auto|cpu|cuda`.
+
+    Raises:
+        ValueError: where cuda is requested and there is none.
+    """
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda, but PyTorch sees no GPU: set device=cpu, or install a CUDA build of torch")
+    return torch.device("cuda" if wanted == "cuda" or (wanted == "auto" and torch.cuda.is_available()) else "cpu")
+
+
+def describe(device: torch.device) -> dict[str, Any]:
+    """The environment as plain data for the record."""
+    return {
+        "commit": _git("rev-parse", "HEAD"),
+        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD")) else "",
+        "python": platform.python_version(),
+        **{package.replace("-", "_"): version(package) for package in PACKAGES},
+        "torch": torch.__version__,  # with its build, which the package of some builds leaves out of its own version
+        "platform": platform.platform(),
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "load_at_start": os.getloadavg()[0],
+        "gemm_peak_flops": gemm_peak(device),
+    }
+
+
+def gemm_peak(device: torch.device, repeats: int = 5) -> float:
+    """Best rate of a float32 matrix product on this device with the current threads, in operations per second."""
+    matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device)
+    best = float("inf")
+    for _ in range(repeats + 1):  # one more, since the first one is a warm-up
+        synchronise(device)
+        start = time.perf_counter()
+        matrix @ matrix
+        synchronise(device)
+        best = min(best, time.perf_counter() - start)
+    return 2 * GEMM_SIZE**3 / best
+
+
+def synchronise(device: torch.device) -> None:
+    """Waits until the device has finished its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class MemoryPeak:
+    """Measures the largest rise of memory since the measurement began.
+
+    On a GPU, it is memory allocated by PyTorch; else the process's resident set, whose high-water mark Linux lets a
+    process reset. `growth` is None where neither is available.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.earlier = 0  # growth before the last pause
+        able = self._reset()
+        if device.type == "cuda":
+            self.start: int | None = torch.cuda.memory_allocated(device)
+        else:
+            self.start = _resident("VmRSS") if able else None
+
+    def growth(self) -> int | None:
+        """The largest rise above the start so far, in bytes."""
+        if self.start is None:
+            return None
+        if self.device.type == "cuda":
+            peak: int | None = torch.cuda.max_memory_allocated(self.device)
+        else:
+            peak = _resident("VmHWM")
+        return None if peak is None else max(peak - self.start, self.earlier)
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """A context whose memory does not count."""
+        before = self.growth()
+        yield
+        after = self.growth()
+        if before is not None and after is not None and after > before:
+            self.earlier = before
+            self._reset()
+
+    def _reset(self) -> bool:
+        """Resets the high-water mark; False where that is not possible."""
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+            return True
+        _give_back_free_memory()
+        return _reset_high_water()
+
+
+def _give_back_free_memory() -> None:
+    """Returns freed memory to the system, so that later allocations raise the resident set."""
+    with suppress(OSError, AttributeError):  # glibc only
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _reset_high_water() -> bool:
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _resident(field: str) -> int | None:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return int(line.split()[1]) * 1024
+    return None
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _git(*arguments: str) -> str:
+    try:
+        return subprocess.run(
+            ["git", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=10, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -1,0 +1,229 @@
+"""Candidates with a formula: one part, or a union of several. Every part has a pose; sizes are logarithms."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bench.models.model import Model, Seen
+from renderers.camera import rigid
+from renderers.checks import check_at_least
+from renderers.field import Flops, Kind
+from renderers.fields.analytic import Shape, sphere, superquadric
+from renderers.fields.analytic import box as exact_box
+
+LEARNING_RATE = 0.01  # of Adam: what one step may change, in scene units, radians or shares of a size
+MIN_HALF_SIZE = 0.01  # scene units: least half size of a part at its start
+MAX_POINTS, MAX_CLUSTER_POINTS = 3000, 200  # most points that are clustered, and most of one cluster for its box
+CUBE_HALF_SIZE = 0.3  # scene units: of the cube whose corners are used where too few points are known
+CLUSTERINGS = 6  # each is a start of a union
+MISSED_QUANTILE = 0.75  # of the errors of a smaller union: new parts begin at the points above it
+ROUND_LOGIT, EDGED_LOGIT = 0.0, -1.5  # initial rounding of a box: logit of radius over least half size
+EXPONENTS = (1.0, 20.0)  # of a superquadric: 1 is an octahedron, 20 nearly a box
+
+
+def sphere_part(parameters: Float[Tensor, "4"]) -> Shape:
+    """A sphere from its centre and the logarithm of its radius."""
+    return sphere(parameters[3].exp(), parameters[:3])
+
+
+def ellipsoid(parameters: Float[Tensor, "9"]) -> Shape:
+    """An ellipsoid from its pose, see `_placed`, and the logarithms of its half axes."""
+    return _placed(sphere(1.0).stretch(parameters[6:9].exp()), parameters)
+
+
+def box(parameters: Float[Tensor, "9"]) -> Shape:
+    """A box from its pose, see `_placed`, and the logarithms of its half sizes."""
+    return _placed(exact_box(parameters[6:9].exp()), parameters)
+
+
+def rounded(parameters: Float[Tensor, "10"]) -> Shape:
+    """A rounded box: as a box, then the logit of its edges' radius over its least half size; at 1 it is a capsule."""
+    return union(parameters[None])
+
+
+def union(parameters: Float[Tensor, "parts 10"]) -> Shape:
+    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long."""
+    sizes = parameters[:, 6:9].exp()
+    radii = torch.sigmoid(parameters[:, 9]) * sizes.amin(-1)
+    turns = _turn(parameters)
+    cores = exact_box(sizes - radii[:, None])
+
+    def bound(points: Tensor) -> Tensor:
+        local = torch.einsum("...pi,pij->...pj", points[..., None, :] - parameters[:, :3], turns)
+        return (cores(local) - radii).amin(-1)
+
+    return Shape(bound, Kind.DISTANCE if len(parameters) == 1 else Kind.BOUND)
+
+
+def quadric(parameters: Float[Tensor, "11"]) -> Shape:
+    """A superquadric: as an ellipsoid, then the logits of two exponents between `EXPONENTS`, on a logarithmic scale."""
+    low, high = EXPONENTS
+    powers = low * (high / low) ** torch.sigmoid(parameters[9:11])
+    return _placed(superquadric(parameters[6:9].exp(), powers), parameters)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape with a formula: its field, its initial parameters after pose and sizes, and its operations per value."""
+
+    shape: Callable[[Tensor], Shape]
+    extra: tuple[float, ...]
+    flops: int
+
+
+PARTS = {
+    "sphere": Part(sphere_part, (), 10),
+    "ellipsoid": Part(ellipsoid, (), 50),
+    "box": Part(box, (), 50),
+    "rounded_box": Part(rounded, (ROUND_LOGIT,), 55),
+    "superquadric": Part(quadric, (0.0, 0.0), 110),
+}
+
+
+@dataclass(frozen=True)
+class OnePart:
+    """A part of `PARTS` that begins in the smallest box about the observed points."""
+
+    name: str
+    follows: ClassVar[bool] = False
+    tries: ClassVar[int] = 1
+
+    @property
+    def flops(self) -> int:
+        """An estimate: a power counts as 20."""
+        return PARTS[self.name].flops
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """A sphere about the points' middle, or the part in their oriented box."""
+        part = PARTS[self.name]
+        around = _subsampled(seen.points)
+        if self.name == "sphere":
+            middle = (around.amax(0) + around.amin(0)) / 2
+            radius = torch.linalg.vector_norm(around - middle, dim=-1).mean()
+            parameters = torch.cat([middle, radius.log()[None]])
+        else:
+            parameters = torch.cat([_fitting_box(around), torch.tensor(part.extra)])
+        return [_model(self.name, parameters, lambda tensors: part.shape(tensors[0]), self.flops, seen)]
+
+
+@dataclass(frozen=True)
+class UnionOf:
+    """A union of rounded boxes.
+
+    Some starts have one part about each of `count` clusters of the observed points. One start keeps the parts of a
+    smaller union, and adds parts about clusters of the points that this union is furthest from.
+    """
+
+    count: int
+    follows: ClassVar[bool] = False
+    tries: ClassVar[int] = CLUSTERINGS + 1
+
+    def __post_init__(self) -> None:
+        check_at_least("K of union_K", self.count, 2, "union_2 is the smallest")
+
+    @property
+    def name(self) -> str:
+        return f"union_{self.count}"
+
+    @property
+    def flops(self) -> int:
+        return self.count * PARTS["rounded_box"].flops
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """One start for each clustering, and one from the previous union, if there is one."""
+        old = [] if seen.previous is None else _parts_of(seen.previous)
+        kept = old if len(old) < self.count else []
+        if not len(seen.points):
+            choices = [[*kept, *_random_boxes(self.count - len(kept), seen.seed)]]
+        else:
+            points = _subsampled(seen.points)
+            choices = [_cluster_boxes(points, self.count, seen.seed + start) for start in range(CLUSTERINGS)]
+            if kept:
+                error = seen.previous_values(points).abs()
+                missed = points[error >= error.quantile(MISSED_QUANTILE)]
+                choices.append([*kept, *_cluster_boxes(missed, self.count - len(kept), seen.seed)])
+        return [
+            _model(self.name, torch.stack(parts), lambda parameters: union(parameters[0]), self.flops, seen)
+            for parts in choices
+        ]
+
+
+def _model(name: str, parameters: Tensor, shape: Callable[[list[Tensor]], Shape], flops: int, seen: Seen) -> Model:
+    free = parameters.float().to(seen.device).requires_grad_()
+    return Model(
+        name,
+        [free],
+        lambda parameters: replace(shape(parameters), flops=Flops(flops, 2 * flops)),
+        LEARNING_RATE,
+        metric=True,
+    )
+
+
+def _placed(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
+    """The shape turned by the rotation vector, parameters 3 to 5, and moved by the translation, the first three."""
+    return shape.rotate(_turn(parameters)).translate(parameters[:3])
+
+
+def _turn(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
+    """Rotation matrices of the rotation vectors, parameters 3 to 5."""
+    vector = parameters[..., 3:6]
+    return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
+
+
+def _subsampled(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
+    """At most about `MAX_POINTS` of the points; the corners of a cube at the origin where there are fewer than four."""
+    if len(points) < 4:
+        return CUBE_HALF_SIZE * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    every = max(len(points) // MAX_POINTS, 1)
+    return points[::every].cpu()
+
+
+def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
+    """Pose and logarithmic half sizes of the smallest box about the points."""
+    import trimesh  # here, since it takes a second and most runs do not need it
+
+    to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + _jitter(len(points)))
+    place = np.linalg.inv(to_box)
+    angle, axis, _ = trimesh.transformations.rotation_from_matrix(place)
+    sizes = np.log(np.maximum(extents / 2, MIN_HALF_SIZE))
+    return torch.from_numpy(np.concatenate([place[:3, 3], angle * np.array(axis), sizes])).float()
+
+
+def _jitter(count: int) -> Float[np.ndarray, "n 3"]:
+    """A little noise, so that points on a plane have a box with a volume."""
+    return 1e-4 * np.random.default_rng(0).standard_normal((count, 3))
+
+
+def _cluster_boxes(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Float[Tensor, "10"]]:
+    """A rounded box about each of `count` clusters of the points (k-means)."""
+    from scipy.cluster.vq import kmeans2
+
+    _, labels = kmeans2(points.numpy().astype(np.float64), count, minit="++", rng=np.random.default_rng(seed))
+    clusters = [points[torch.from_numpy(labels == label)] for label in range(count)]
+    return [torch.cat([_cluster_box(cluster, points), torch.tensor([EDGED_LOGIT])]) for cluster in clusters]
+
+
+def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, "9"]:
+    """The smallest box about a cluster; a small one in its middle where it has too few points for a box."""
+    if len(cluster) >= 4:
+        return _fitting_box(cluster[:: -(-len(cluster) // MAX_CLUSTER_POINTS)])
+    middle = cluster.mean(0) if len(cluster) else points.mean(0)
+    return torch.cat([middle, torch.zeros(3), torch.full((3,), MIN_HALF_SIZE).log()])
+
+
+def _random_boxes(count: int, seed: int) -> list[Float[Tensor, "10"]]:
+    """Rounded boxes at random places, for where no point is known."""
+    draw = torch.Generator().manual_seed(seed)
+    sizes = torch.full((3,), CUBE_HALF_SIZE).log()
+    places = CUBE_HALF_SIZE * (2 * torch.rand(count, 3, generator=draw) - 1)
+    return [torch.cat([place, torch.zeros(3), sizes, torch.tensor([EDGED_LOGIT])]) for place in places]
+
+
+def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:
+    """The parts of a union; none of another model."""
+    return list(model.parameters[0].detach().cpu()) if model.candidate.startswith("union_") else []

@@ -1,0 +1,210 @@
+"""The field of an unknown shape: a code of the dataset's prior (`field=prior`), or a fitted candidate."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+
+from bench.evaluate.evaluate import Evaluation, evaluate
+from bench.evaluate.metrics import DEFINITIONS
+from bench.models.candidates import ModelSettings
+from bench.models.fit import FitProblem, Fitter
+from bench.models.growth import Growth, grow
+from bench.models.observations import Observations
+from bench.models.views import Views
+from bench.pictures.filmstrip import Filmstrip
+from bench.pictures.run_figures import Given
+from bench.pictures.views import draw_run
+from bench.records.files import curve_file
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.solve.observed_view import Weights
+from bench.solve.problem import InverseTask, check_field_gradient
+from bench.solve.solve import COSTS, draw, note_costs, note_result, solve_task
+from datasets.scene import Scene
+from datasets.truth import Truth
+from renderers.field import Field
+from renderers.rendering import Renderer
+
+PRIOR = "prior"
+NOT_RENDERED = ("part", "phase", "candidate", "eikonal", "rays_share")  # keys that curves of other runs lack
+ENDED = {
+    "field": "the candidate that field=auto ended on, or the one that was requested",
+    "field_parameters": "the number of its parameters",
+    "field_error, field_standard_error": "of the held-out observations: as NAME.error of task=capacity, in "
+    "scene units; of photographs the mean difference of colours from 0 to 1; through the renderer as configured, "
+    "so that what renderer.epsilon=auto adds to a surface is not in it",
+    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends; 0 for photographs",
+    "field_overhead": "seconds of all fits, also of candidates without improvement, over those of the last one's; "
+    "without checkpoints on what is held out",
+    "field_overhead_judged": "the same with checkpoints and with finding the starts",
+    "fields_tried": "candidates that were tried",
+}
+
+
+@runtime_checkable
+class ShapeTask(InverseTask, Protocol):
+    """A task whose unknown is a shape: a prior's code, or any field fitted for the task's iterations."""
+
+    def observations(
+        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
+    ) -> tuple[Observations, Given]:
+        """The observations that a field is fitted to, some of them held out, and what pictures show of them."""
+        ...
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """The field that a run asks for.
+
+    Args:
+        name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
+        models: the fields to choose from, and the settings of their fits; not read for "prior".
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+
+    name: str
+    models: ModelSettings | None
+
+    def __post_init__(self) -> None:
+        if not self.of_prior:
+            self.models.requested(self.name)
+
+    @property
+    def of_prior(self) -> bool:
+        """Whether it is a code of the dataset's prior."""
+        return self.name == PRIOR
+
+    def solve(self, task: ShapeTask, run: RunContext) -> None:
+        """Executes a task whose unknown is a shape.
+
+        Raises:
+            Unsupported: where the renderer cannot do what the task or its field needs.
+        """
+        if self.of_prior:
+            solve_task(task, run)
+        else:
+            self._solve_by_growth(task, run)
+
+    def known_shape(self, run: RunContext, weights: Weights, otherwise: Callable[[], Field]) -> Field:
+        """The scene's true shape, for a task with another unknown; fitted before the task's clock begins.
+
+        Args:
+            run: its record notes what was fitted.
+            weights: of a view's loss.
+            otherwise: gives the shape for `field=prior`, where no field is fitted.
+
+        Raises:
+            Unsupported: where the renderer has no gradient towards the field.
+            ValueError: where no field could be fitted.
+        """
+        if self.of_prior:
+            return otherwise()
+        inputs, settings = run.inputs, self.models
+        check_field_gradient(inputs.renderer)
+        truth = Truth(inputs.scene.mesh)
+        views = Views(truth, inputs.views, settings.views, weights, inputs.renderer, inputs.device)
+
+        def on_line(name: str, line: dict[str, Any]) -> None:
+            run.progress(f"fitting {name}", line["iteration"] + 1, settings.fit.iterations, line["total"])
+
+        fitter = Fitter(views.observations(inputs.seed), settings.fit, inputs.seed, inputs.device, on_line)
+        growth = grow(fitter, settings.requested(self.name), settings.growth)
+        if growth.fitted.failed:
+            reason = growth.fitted.evidence.reason
+            raise ValueError(f"no field was found for the known shape: {reason}; field=prior takes the shape itself")
+        run.record.notes = [*run.record.notes, *growth.summary(self.name)]
+        return growth.fitted.model.frozen()
+
+    def _solve_by_growth(self, task: ShapeTask, run: RunContext) -> None:
+        """Executes a task by early growth, or with the one field that was requested."""
+        inputs, record = run.inputs, run.record
+        check_field_gradient(inputs.renderer)
+        record.definitions = DEFINITIONS | COSTS | ENDED
+        observations, given = task.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
+        lines: list[dict[str, Any]] = []
+        with curve_file(run.folder) as write_line:
+
+            def on_line(name: str, line: dict[str, Any]) -> None:
+                lines.append({**line, "candidate": name})
+                write_line(lines[-1])
+                run.progress(f"fitting {name}", line["iteration"] + 1, task.optimiser.iterations, line["total"])
+
+            settings = replace(self.models.fit, iterations=task.optimiser.iterations)
+            fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
+            growth = grow(fitter, self.models.requested(self.name), self.models.growth)
+        clock = time.perf_counter()
+        _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
+        first, last = growth.first, growth.fitted.model.frozen()
+        record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
+        metrics, notes = after.metrics | ended(growth), tuple(growth.summary(self.name))
+        status, reason = verdict(growth, after)
+        note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
+        curve = rendered(lines, growth.fitted.evidence.candidate)
+        filmstrip = Filmstrip(inputs, "by candidate")
+        for name, field in growth.fields.items():
+            filmstrip.add(name, field)
+        draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
+        record.seconds["evaluation"] = time.perf_counter() - clock
+
+
+def rendered(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:
+    """The curve of a candidate's fit through the renderer, its trial and the rest joined, with one clock."""
+    fit = [line for line in lines if line["phase"] == FitProblem.phase and line["candidate"] == candidate]
+    clock, curve = 0.0, []
+    for place, line in enumerate(fit):
+        step = line["seconds"] - (fit[place - 1]["seconds"] if place else 0.0)
+        clock += step if step > 0 else line["seconds"]
+        numbers = {name: value for name, value in line.items() if name not in NOT_RENDERED}
+        curve.append({**numbers, "iteration": place, "seconds": clock})
+    return curve
+
+
+def ended(growth: Growth) -> dict[str, Any]:
+    """The field that growth ended on, as metrics."""
+    evidence = growth.fitted.evidence
+    error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
+    return {
+        "field": evidence.candidate,
+        "field_parameters": evidence.parameters,
+        "field_error": evidence.mean,
+        **error,
+        "field_footprint": growth.footprint,
+        "field_overhead": growth.overhead,
+        "field_overhead_judged": growth.overhead_judged,
+        "fields_tried": len(growth.tried),
+    }
+
+
+def verdict(growth: Growth, after: Evaluation) -> tuple[RunStatus, str]:
+    """How the run ended: a fit that does not improve on its warm start has not failed, one that gets worse has."""
+    evidence, initial = growth.fitted.evidence, growth.initial_error
+    if evidence.error is None:
+        return RunStatus(evidence.status), evidence.reason
+    if after.failure is not None:
+        return after.failure
+    if initial is not None and evidence.mean > growth.footprint:
+        noise = evidence.error.noise_of_difference(initial)
+        if evidence.mean - initial.mean > noise:
+            ends = f"{initial.mean:.4g} before the first fit, {evidence.mean:.4g} at the end"
+            return RunStatus.NOT_REACHED, f"the held-out error rose by more than its noise: {ends}"
+    return RunStatus.OK, ""
+
+
+def _note_growth(run: RunContext, fitter: Fitter, growth: Growth, *, observed: int) -> None:
+    iterations, values = sum(evidence.iterations for evidence in growth.tried), int(growth.total("evaluations"))
+    rays = max(iterations * fitter.observations.rays, 1)
+    evaluations = {
+        "value": values,
+        "gradient": int(growth.total("gradients")),
+        "per_ray": growth.total("evaluations") / rays,
+        "rays_per_iteration": fitter.observations.rays,
+        "observed": observed,
+        "iterations": iterations,
+    }
+    seconds = {"forward": 0.0, "backward": 0.0} | fitter.spent
+    note_costs(run.record, seconds=seconds, flops=int(growth.total("flops")), evaluations=evaluations)

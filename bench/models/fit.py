@@ -1,0 +1,224 @@
+"""Fits a candidate: a warm start without a renderer, then with the renderer's loss; the same rays for all."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bench.models.analytic import OnePart
+from bench.models.candidates import FitSettings
+from bench.models.choice import Evidence
+from bench.models.held_out import HeldOutError
+from bench.models.model import Candidate, Model, Seen
+from bench.models.observations import Observations, generator
+from bench.models.warm_start import WarmStart, scattered
+from bench.records.record import RunStatus
+from bench.setup.auto import rays_share
+from bench.solve.latent_code import Terms
+from bench.solve.optimise import History, optimise
+from bench.solve.problem import NotReached, OptimiserSettings, Unsupported, check_kind
+from renderers.adaptive_samples import fresh
+from renderers.field import Counts, Field, Meter
+from renderers.rendering import Renderer
+
+EIKONAL_POINTS = 512
+SPENT = ("seconds", "evaluations", "gradients", "flops")  # the costs in an Evidence
+NEAR_ENOUGH = 0.1  # loss: where a warm start begins below it, divergence is measured from it
+SCREENING = 8  # each of several starts gets 1/8 of a warm start, then the best one a whole one
+EIKONAL_SEED = 7  # of the points, which differ between iterations
+CHECKPOINTS = {4**power for power in range(1, 12)}  # iterations after which a candidate is evaluated
+PARTS_RATE, WHOLE_RATE = 0.03, 5e-3  # learning rates of warm starts: of parts, and of networks and grids
+
+
+@dataclass(eq=False)
+class Fitted:
+    """A candidate during its fit.
+
+    Args:
+        candidate: the candidate.
+        previous: the model that it began with, if any.
+        model: its current field.
+        renderer: through which it is fitted, with its own measured thickness where it follows the shape.
+        evidence: its result and cost so far.
+        initial_error: its held-out error after the warm start, where it was evaluated.
+    """
+
+    candidate: Candidate
+    previous: Model | None
+    model: Model
+    renderer: Renderer
+    evidence: Evidence
+    initial_error: HeldOutError | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether its loss became NaN or diverged, the renderer does not support it, or it could not be fitted."""
+        return self.evidence.status is not RunStatus.OK
+
+
+@dataclass(frozen=True)
+class Fitter:
+    """Fits candidates to the same observations.
+
+    Args:
+        observations: given and held-out rays.
+        settings: of the fits.
+        seed: of all random draws.
+        device: of the fits.
+        on_line: called after each iteration with the candidate's name and a line of the curve.
+        part: of the run that the lines belong to.
+    """
+
+    observations: Observations
+    settings: FitSettings
+    seed: int
+    device: torch.device
+    on_line: Callable[[str, dict[str, Any]], None]
+    part: str = "growth"
+    spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by phase
+
+    def begin(self, candidate: Candidate, previous: Model | None, *, evaluate: bool = True) -> Fitted:
+        """A candidate's model after its warm start; with `evaluate`, its held-out error is computed as well."""
+        clock, sphere, points = time.perf_counter(), None, self.observations.points
+        if previous is None and candidate.follows:
+            sphere = self.begin(OnePart("sphere"), None, evaluate=False)
+            previous = sphere.model
+        started = time.perf_counter()
+        seen = Seen(points.cpu(), previous, self.seed, self.device)
+        models = candidate.starts(seen)
+        placing = time.perf_counter() - started
+        target = previous.frozen() if candidate.follows and previous is not None else None
+        free = self.observations.free
+        starts = [(self._fitted(candidate, model, previous), self._start(model, free, target)) for model in models]
+        screened = self.settings.warm_iterations // SCREENING if len(starts) > 1 else 0
+        for fitted, start in starts:
+            self._warm_start(fitted, start, screened)
+        fitted, start = min(starts, key=lambda pair: inf if pair[0].failed else pair[1].error())
+        self._warm_start(fitted, start, self.settings.warm_iterations)
+        spent = [other.evidence for other, _ in starts] + ([] if sphere is None else [sphere.evidence])
+        for name in SPENT:
+            setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in spent))
+        fitted.evidence.seconds += placing
+        if previous is not None:
+            counted = [seen.counts, *(start.target_counts for _, start in starts)]
+            fitted.evidence.evaluations += sum(counts.value for counts in counted)
+            fitted.evidence.flops += sum(counts.flops(previous.frozen()) or 0 for counts in counted)
+        if evaluate:
+            self._evaluate(fitted)
+            fitted.initial_error = fitted.evidence.error
+        fitted.evidence.wall += time.perf_counter() - clock
+        return fitted
+
+    def _start(self, model: Model, free: Float[Tensor, "n 3"], target: Field | None) -> WarmStart:
+        return WarmStart(model, self.observations.points, free, target, self.settings.warm_points, self.seed)
+
+    def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:
+        """A candidate's model as a Fitted; it has failed where the renderer does not support its kind of field."""
+        evidence = Evidence(candidate.name, model.size, model.bytes, candidate.flops)
+        fitted = Fitted(candidate, previous, model, fresh(self.observations.renderer), evidence)
+        try:
+            check_kind(self.observations.renderer, model.frozen())
+        except Unsupported as error:
+            fitted.evidence.status, fitted.evidence.reason = RunStatus.UNSUPPORTED, str(error)
+        return fitted
+
+    def _warm_start(self, fitted: Fitted, start: WarmStart, iterations: int) -> None:
+        if iterations and not fitted.failed:
+            rate = PARTS_RATE if fitted.model.metric else WHOLE_RATE
+            self._run(fitted, start, OptimiserSettings(iterations, rate, "cosine"), checkpoints=False)
+
+    def fit(self, fitted: Fitted, iterations: int, *, checkpoints: bool) -> None:
+        """Continues a candidate's fit, then evaluates it; with `checkpoints`, evaluates it on the way as well."""
+        if fitted.failed or iterations < 1:
+            return
+        clock = time.perf_counter()
+        through = self.observations.through(fitted.renderer)
+        problem = FitProblem(fitted.model, through, self.settings, fitted.evidence.iterations)
+        settings = OptimiserSettings(iterations, fitted.model.learning_rate, "ramped")
+        fitted.evidence.iterations += self._run(fitted, problem, settings, checkpoints=checkpoints)
+        self._evaluate(fitted)
+        fitted.evidence.wall += time.perf_counter() - clock
+
+    def _run(
+        self, fitted: Fitted, problem: "FitProblem | WarmStart", settings: OptimiserSettings, *, checkpoints: bool
+    ) -> int:
+        """Runs the optimisation loop, adds its cost to the evidence, and gives the number of iterations that it ran."""
+        history, evidence = History(), fitted.evidence
+        before, shape = {name: getattr(evidence, name) for name in SPENT}, fitted.model.field()
+
+        def on_step(line: dict[str, Any]) -> None:
+            spent = {"evaluations": history.counts.value, "gradients": history.counts.gradient}
+            spent |= {"seconds": line["seconds"], "flops": history.counts.flops(shape) or 0}
+            for name, amount in spent.items():
+                setattr(evidence, name, before[name] + amount)
+            step = line["iteration"] + 1
+            if checkpoints and history.status is RunStatus.OK and step in CHECKPOINTS and step < settings.iterations:
+                self._evaluate(fitted)
+            where = {"part": self.part, "phase": problem.phase, "iteration": evidence.iterations + line["iteration"]}
+            share = {"rays_share": problem.share} if isinstance(problem, FitProblem) else {}
+            self.on_line(evidence.candidate, {**line, **where, **share})
+
+        try:
+            optimise(problem, settings, self.device, history=history, on_step=on_step, least_reference=NEAR_ENOUGH)
+        except NotReached as error:
+            history.status, history.reason = RunStatus.NOT_REACHED, str(error)
+        for name, seconds in history.seconds.items():
+            self.spent[name] = self.spent.get(name, 0.0) + seconds
+        evidence.status, evidence.reason = history.status, history.reason
+        if fitted.failed:
+            evidence.error = None
+        return len(history.curve)
+
+    def _evaluate(self, fitted: Fitted) -> None:
+        """Evaluates a candidate on the held-out rays, and notes a checkpoint."""
+        evidence = fitted.evidence
+        if not fitted.failed:
+            evidence.error = self.observations.error(fitted.model.frozen())
+            evidence.checkpoints.append({name: getattr(evidence, name) for name in SPENT} | {"error": evidence.mean})
+
+
+@dataclass
+class FitProblem:
+    """Fits the parameters of a candidate with a renderer; see `bench.solve.problem.Objective`."""
+
+    model: Model
+    observations: Observations
+    settings: FitSettings
+    iterations_before: int  # iterations before this part of the fit
+    share: float = 0.0  # of the rays that the last iteration used
+    error: float = inf  # of the last iteration, in scene units
+    counts: Counts = field(default_factory=Counts)
+    phase: ClassVar[str] = "fit"
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The parameters that the optimiser changes."""
+        return self.model.parameters
+
+    def loss(self, iteration: int) -> Terms:
+        """The renderer's terms, the eikonal term, and their sum."""
+        counted, place, settings = (
+            Meter(self.model.field(), self.counts),
+            self.iterations_before + iteration,
+            self.settings,
+        )
+        self.error = self.error if iteration else inf  # iteration 0 runs twice: once as warm-up
+        self.share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
+        terms = self.observations.terms(counted, place, self.share)
+        self.error = self.observations.depth_error(terms)
+        if not self.model.metric and settings.eikonal_weight:
+            points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, place))
+            terms["eikonal"] = settings.eikonal_weight * _slope_error(counted, points)
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+
+def _slope_error(shape: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """The mean square of |grad f| - 1 (Gropp et al. 2020)."""
+    leaf = points.detach().requires_grad_()
+    (gradient,) = torch.autograd.grad(shape(leaf).sum(), leaf, create_graph=True)
+    return (torch.linalg.vector_norm(gradient, dim=-1) - 1).square().mean()

@@ -1,0 +1,107 @@
+"""The error of a field on held-out rays; it never uses the true geometry."""
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from renderers.boundary import rendered
+from renderers.camera import Rays
+from renderers.field import Field, autograd_normals
+from renderers.rendering import Renderer
+
+MISSED = 10.0  # footprints: the error of a ray on which only field or observation hits, and the largest error
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """The error over held-out rays, and its standard error.
+
+    Where field and observation both hit, the error of a ray is the distance between the two points along the field's
+    normal, at most `MISSED` footprints. Where only one of them hits, it is `MISSED` footprints. The mean is over all
+    rays on which at least one hits.
+
+    Args:
+        sums: of each group of rays: errors of hits; counts of hits with a known distance, of rays on which only one
+            hits, and of rays on which at least one hits.
+        missed: error of a ray on which only one hits, in scene units.
+    """
+
+    sums: Float[np.ndarray, "groups 4"]
+    missed: float
+
+    @property
+    def mean(self) -> float:
+        """The mean error, in scene units."""
+        return float(_means(self.sums.sum(0, keepdims=True), self.missed)[0])
+
+    @property
+    def standard_error(self) -> float:
+        """The standard error of the mean, by the jackknife over groups (Efron and Tibshirani 1993).
+
+        Rays of a group are not independent. A whole view counts as one group, as do the rays held out of a fitted one.
+        """
+        return _jackknife(self._without_each())
+
+    def noise_of_difference(self, other: "HeldOutError") -> float:
+        """The standard error of the difference of the two means, over the same groups."""
+        return _jackknife(self._without_each() - other._without_each())
+
+    def some(self, groups: Int[np.ndarray, " n"]) -> "HeldOutError":
+        """The error of some of the groups."""
+        return HeldOutError(self.sums[groups], self.missed)
+
+    def _without_each(self) -> Float[np.ndarray, " groups"]:
+        return _means(self.sums.sum(0) - self.sums, self.missed)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out rays and their observations.
+
+    Args:
+        rays: in one row.
+        distance: along the ray, where `observed`.
+        observed: whether the distance is known.
+        mask: whether the ray hits.
+        group: which group a ray belongs to, from 0: a view, or a part of one.
+        footprint: half a pixel, in scene units.
+    """
+
+    rays: Rays
+    distance: Float[Tensor, " n"]
+    observed: Bool[Tensor, " n"]
+    mask: Bool[Tensor, " n"]
+    group: Int[Tensor, " n"]
+    footprint: float
+
+    @torch.no_grad()
+    def error(self, field: Field, renderer: Renderer) -> HeldOutError:
+        """The error of a field, rendered by a renderer."""
+        missed = MISSED * self.footprint
+        rendering = rendered(renderer, field, self.rays)
+        compared = rendering.hit & self.observed
+        apart = torch.zeros_like(self.distance)
+        normals = autograd_normals(field, rendering.points[compared])
+        flat = torch.linalg.vector_norm(normals, dim=-1) < 0.5  # no normal: the distance along the ray counts
+        cosine = torch.where(flat, 1.0, (normals * self.rays.directions[compared]).sum(-1).abs())
+        apart[compared] = ((rendering.distance - self.distance)[compared].abs() * cosine).clamp_max(missed)
+        parts = [apart, compared, rendering.hit ^ self.mask, rendering.hit | self.mask]
+        sums = [torch.bincount(self.group, part.double()) for part in parts]
+        return HeldOutError(torch.stack(sums, dim=1).cpu().numpy(), missed)
+
+
+def _means(sums: Float[np.ndarray, "n 4"], missed: float) -> Float[np.ndarray, " n"]:
+    """The mean errors of hits and of misses, weighted by their shares of the rays on which at least one hits."""
+    errors, hits, disagree, either = sums.T
+    share = disagree / np.maximum(either, 1)
+    of_hits = np.where(hits > 0, errors / np.maximum(hits, 1), missed)  # no known distance is hit: the largest error
+    return (1 - share) * of_hits + share * missed
+
+
+def _jackknife(values: Float[np.ndarray, " groups"]) -> float:
+    count = len(values)
+    return float(np.sqrt((count - 1) / count * np.square(values - values.mean()).sum())) if count > 1 else inf

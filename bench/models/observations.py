@@ -1,0 +1,211 @@
+"""The observations that a field is fitted to, and those that are held out."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf, nan
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bench.models.held_out import HeldOut, HeldOutError
+from bench.solve.latent_code import Terms
+from bench.solve.observed_view import GivenView
+from renderers.adaptive_samples import at_max_samples
+from renderers.camera import Rays, sphere_span
+from renderers.field import Field
+from renderers.rendering import Renderer
+
+FREE = 4  # points known to lie outside, on each ray that has some
+
+
+@runtime_checkable
+class Observations(Protocol):
+    """Observations that a field is fitted to through a renderer, and held-out ones."""
+
+    @property
+    def renderer(self) -> Renderer: ...
+
+    @property
+    def footprint(self) -> float:
+        """Half a pixel, in scene units (DIST, Eq. 10), the error to reach; 0 where errors have another unit."""
+        ...
+
+    @property
+    def rays(self) -> int:
+        """Number of rays rendered in an iteration."""
+        ...
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """Known points of the surface; may be empty."""
+        ...
+
+    @property
+    def free(self) -> Float[Tensor, "n 3"]:
+        """Points that are known to lie outside."""
+        ...
+
+    def through(self, renderer: Renderer) -> "Observations":
+        """The same, compared through another renderer."""
+        ...
+
+    def terms(self, field: Field, iteration: int, share: float) -> Terms:
+        """The weighted terms of an iteration's loss, over a share of its rays."""
+        ...
+
+    def depth_error(self, terms: Terms) -> float:
+        """The depth error of an iteration's terms, in scene units; NaN where they have another unit."""
+        ...
+
+    def error(self, field: Field) -> HeldOutError:
+        """The error of a field on the held-out observations."""
+        ...
+
+
+@dataclass(frozen=True)
+class RayObservations:
+    """Rays of one or more views in one row: some are held out, and an iteration draws from the others.
+
+    Args:
+        given: all rays that are not held out.
+        held_out: the other rays.
+        rays: number drawn in an iteration.
+        seed: of the draws, which are the same for every candidate.
+    """
+
+    given: GivenView
+    held_out: HeldOut
+    rays: int
+    seed: int
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer that compares a field with the given rays."""
+        return self.given.renderer
+
+    @property
+    def footprint(self) -> float:
+        """Half a pixel, in scene units (DIST, Eq. 10)."""
+        return self.held_out.footprint
+
+    @cached_property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """Points of the surface at the pixels whose depth is given."""
+        observed = self.given.observed
+        distance = self.given.depth[observed] / self.given.depth_of_distance[observed]
+        return self.given.rays[observed].at(distance)
+
+    @cached_property
+    def through_sphere(self) -> Int[Tensor, " n"]:
+        """Indices of the given rays that meet the unit sphere; the others carry no information."""
+        _, _, meets = sphere_span(self.given.rays)
+        return meets.nonzero().squeeze(-1)
+
+    def through(self, renderer: Renderer) -> "RayObservations":
+        """The same, compared through another renderer."""
+        return replace(self, given=replace(self.given, renderer=renderer))
+
+    def terms(self, field: Field, iteration: int, share: float) -> Terms:
+        """The weighted terms of the loss, over the rays that are drawn for an iteration."""
+        count = max(round(share * self.rays), 1)
+        drawn = torch.randint(len(self.through_sphere), (count,), generator=generator(self.seed, iteration))
+        some = self.given.some(self.through_sphere[drawn.to(self.through_sphere.device)])
+        with torch.random.fork_rng():  # a renderer's draws are the same for every candidate as well
+            torch.manual_seed(generator(self.seed, iteration).initial_seed())
+            return some.compare(field, iteration)
+
+    def error(self, field: Field) -> HeldOutError:
+        """The error of a field on the held-out rays."""
+        return self.held_out.error(field, at_max_samples(self.renderer))
+
+    def depth_error(self, terms: Terms) -> float:
+        """The mean depth error; a silhouette loss is a length for some renderers only, so it is left out."""
+        weight = self.given.settings.depth_weight
+        return (float(terms["depth"].detach()) / weight or inf) if weight else nan  # 0: nothing was hit
+
+    @cached_property
+    def free(self) -> Float[Tensor, "n 3"]:
+        """Points that are known to lie outside: in front of observed depths, and on background rays."""
+        given = self.given
+        entry, leave, meets = sphere_span(given.rays)
+        seen_to = torch.where(given.observed, given.depth / given.depth_of_distance, leave)
+        empty = given.observed if given.mask is None else given.observed | ~given.mask
+        chosen = (meets & empty).nonzero().squeeze(-1)
+        draw = torch.Generator().manual_seed(self.seed)
+        share = torch.rand(FREE, len(chosen), generator=draw).to(entry.device)
+        distance = entry[chosen] + share * (seen_to[chosen] - entry[chosen])
+        return given.rays[chosen].at(distance).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Holdout:
+    """Which rays are held out.
+
+    Args:
+        share: of the rays with a known depth and of the others, from 0 to 1.
+        whole: groups that are held out as a whole.
+        footprint: half a pixel, in scene units.
+        seed: of the draw.
+    """
+
+    share: float
+    whole: tuple[int, ...]
+    footprint: float
+    seed: int
+
+
+def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays: int) -> RayObservations:
+    """Holds out whole groups, and a share of the rays of the others.
+
+    Args:
+        view: of rays in one row.
+        group: which view, or part of one, a ray belongs to, from 0.
+        split: which rays are held out.
+        rays: number drawn in an iteration.
+
+    Raises:
+        ValueError: where too few depths are given to hold some out.
+    """
+    draw = torch.Generator().manual_seed(split.seed)
+    out = torch.isin(group, torch.tensor(split.whole))
+    for kind in (view.observed.cpu(), ~view.observed.cpu()):
+        places = (kind & ~out).nonzero().squeeze(-1)
+        count = round(split.share * len(places))
+        out[places[torch.randperm(len(places), generator=draw)[:count]]] = True
+    out = out.to(view.observed.device)
+    given = view.some((~out).nonzero().squeeze(-1))
+    held_out = held(view, out, group, split.footprint)
+    if len(held_out.group[held_out.observed].unique()) < 2:
+        raise ValueError(
+            f"a field without a prior is evaluated on held-out depths, and {int(view.observed.sum())} depths are too "
+            "few to hold some out: give more (task.points=100), or set field=prior"
+        )
+    return RayObservations(given, held_out, rays, split.seed)
+
+
+def together(views: list[GivenView]) -> GivenView:
+    """Several views joined into one row of rays."""
+    parts = {
+        name: torch.cat([getattr(view, name).flatten() for view in views])
+        for name in ("depth", "depth_of_distance", "observed")
+    }
+    flat = [view.rays.flat() for view in views]
+    rays = Rays(torch.cat([rays.origins for rays in flat]), torch.cat([rays.directions for rays in flat]))
+    masks = [view.mask.flatten() for view in views if view.mask is not None]
+    return replace(views[0], rays=rays, **parts, mask=torch.cat(masks) if masks else None)
+
+
+def held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:
+    """The held-out rays `out` of a view that have an observation: a depth, or a mask."""
+    known = (out & view.observed if view.mask is None else out).nonzero().squeeze(-1)
+    part = view.some(known)
+    mask = part.observed if part.mask is None else part.mask
+    numbered = group.to(known.device)[known].unique(return_inverse=True)[1]
+    return HeldOut(part.rays, part.depth / part.depth_of_distance, part.observed, mask, numbered, footprint)
+
+
+def generator(seed: int, iteration: int) -> torch.Generator:
+    """The random generator of an iteration, the same for every candidate."""
+    return torch.Generator().manual_seed(seed * 1_000_003 + iteration)

@@ -1,0 +1,136 @@
+"""Fits all candidates to one shape, chooses the one that it needs, and checks that choice."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from bench.models.choice import Choice, Evidence, choose, is_as_good
+from bench.models.fit import Fitted, Fitter
+from bench.models.held_out import HeldOutError
+from bench.models.model import Candidate
+from bench.models.views import Views
+from renderers.adaptive_samples import at_max_samples
+from renderers.boundary import rendered
+from renderers.camera import Rays
+from renderers.checks import check_at_least
+from renderers.field import Counts, Meter
+from renderers.rendering import Renderer
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """How a choice is checked on further views.
+
+    Args:
+        views: number of further views.
+        seeds: number of random draws from them.
+        drawn: views in each draw.
+    """
+
+    views: int
+    seeds: int
+    drawn: int
+
+    def __post_init__(self) -> None:
+        check_at_least("task.checks.seeds", self.seeds, 1, "20 resolve 95 %")
+        check_at_least("task.checks.drawn", self.drawn, 2, "8 give a standard error")
+        check_at_least("task.checks.views", self.views, self.drawn, f"{3 * self.drawn} give different draws")
+
+
+@dataclass
+class Study:
+    """The fits of all candidates to the same observations.
+
+    Args:
+        fitter: fits with the configured renderer.
+        pixel_precise: the same renderer at pixel precision.
+        fewest_rays: share of the rays that the fit at pixel precision begins with.
+    """
+
+    fitter: Fitter
+    pixel_precise: Renderer
+    fewest_rays: float
+    fits: list[Fitted] = field(default_factory=list)
+
+    def fit_all(self, candidates: list[Candidate]) -> Iterator[Fitted]:
+        """Fits every candidate; each may begin from the best one before it."""
+        fitter = replace(self.fitter, part="fit_all")
+        for candidate in candidates:
+            best = min(self._succeeded, key=lambda fitted: fitted.evidence.mean, default=None)
+            fitted = fitter.begin(candidate, None if best is None else best.model)
+            fitter.fit(fitted, fitter.settings.iterations, checkpoints=True)
+            self.fits.append(fitted)
+            yield fitted
+
+    def choose(self) -> tuple[Choice, Fitted]:
+        """The recommended candidate and its fit."""
+        choice = choose([fitted.evidence for fitted in self.fits], self.fitter.observations.footprint)
+        return choice, next(fitted for fitted in self.fits if fitted.evidence is choice.chosen)
+
+    def check(self, chosen: Fitted, views: Views, settings: CheckSettings) -> dict[str, float]:
+        """The share of random draws of further views on which the choice holds; see `shares`."""
+        observations, further = self.fitter.observations, views.further(settings.views, self.fitter.seed)
+        renderer = at_max_samples(observations.renderer)
+        errors = {fitted: further.error(fitted.model.frozen(), renderer) for fitted in self._succeeded}
+        footprint, seed = observations.footprint, self.fitter.seed
+        return shares(errors[chosen], list(errors.values()), settings, footprint=footprint, seed=seed)
+
+    def refit(self, chosen: Fitted) -> Evidence:
+        """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
+
+        It is evaluated as all others are.
+        """
+        settings = replace(self.fitter.settings, fewest_rays=self.fewest_rays)
+        observations = self.fitter.observations.through(self.pixel_precise)
+        fitter = replace(self.fitter, settings=settings, observations=observations, part="frugal", spent={})
+        fitted = fitter.begin(chosen.candidate, chosen.previous, evaluate=False)
+        fitter.fit(fitted, settings.iterations, checkpoints=False)
+        if not fitted.failed:
+            fitted.evidence.error = self.fitter.observations.error(fitted.model.frozen())
+        return fitted.evidence
+
+    @torch.no_grad()
+    def precision(self, fitted: Fitted, rays: Rays) -> dict[str, float]:
+        """Evaluations for rendering rays with either renderer, and the hits that only one of them has."""
+        plain, shape, counts = self.fitter.observations.renderer, fitted.model.frozen(), (Counts(), Counts())
+        hits = [
+            rendered(at_max_samples(renderer), Meter(shape, count), rays).hit
+            for renderer, count in zip((plain, self.pixel_precise), counts, strict=True)
+        ]
+        lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
+        return {
+            "precision.evaluations": counts[0].value,
+            "precision.evaluations_auto": counts[1].value,
+            "precision.hits": int(hits[0].sum()),
+            "precision.lost": lost,
+            "precision.gained": gained,
+        }
+
+    @property
+    def _succeeded(self) -> list[Fitted]:
+        return [fitted for fitted in self.fits if fitted.evidence.error is not None]
+
+
+def shares(
+    chosen: HeldOutError, candidates: list[HeldOutError], settings: CheckSettings, *, footprint: float, seed: int
+) -> dict[str, float]:
+    """The shares of random draws of views on which a choice is as good as the draw's best candidate, and holds.
+
+    Args:
+        chosen: errors of the choice in all views.
+        candidates: errors of all candidates.
+        settings: the number of draws, and of views in each.
+        footprint: half a pixel, in scene units: a choice with an error below it holds as well.
+        seed: of the draws.
+    """
+    draw, within, held = np.random.default_rng([seed, 4]), 0, 0
+    for _ in range(settings.seeds):
+        drawn = draw.choice(settings.views, settings.drawn, replace=False)
+        best = min((error.some(drawn) for error in candidates), key=lambda error: error.mean)
+        as_good = is_as_good(chosen.some(drawn), best)
+        within += as_good
+        held += as_good or chosen.some(drawn).mean <= footprint
+    found = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": held / settings.seeds}
+    return {"held_out_seeds": settings.seeds, **found}

@@ -1,0 +1,293 @@
+"""Pictures of a run: its input, the shape before and after, and the truth. Not part of any timing."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from bench.pictures.size_chart import Candidates, panels
+from bench.pictures.style import BOTH, MISSED, PAPER, SCREEN, SPURIOUS, WRONG, bare, silhouette_image
+from datasets.scene import View
+
+LIGHT = np.array([-0.35, -0.6, -0.72])  # from the camera's upper left, in camera axes
+TERMS = {
+    "total": "#222222",
+    "depth": "#1f77b4",
+    "photometric": "#1f77b4",
+    "silhouette": "#d62728",
+    "normals": "#2ca02c",
+    "code": "#7f7f7f",
+}
+KINDS = {"background": PAPER, "hit": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": WRONG}  # of pixels
+MOST_PHOTOGRAPHS = 4  # shown, in two rows
+
+
+@dataclass(frozen=True)
+class ViewPair:
+    """Two views of one shape: by the given camera, and by one from behind."""
+
+    title: str
+    front: View
+    back: View
+
+
+@dataclass(frozen=True)
+class Given:
+    """The input of a run: depths of a view, or photographs.
+
+    Args:
+        view: of the scene.
+        observed: its pixels whose depth was given.
+        photographs: all of them, or None.
+        mask: whether the silhouette was given as well.
+    """
+
+    view: View
+    observed: Bool[np.ndarray, "height width"]
+    photographs: Float[np.ndarray, "views height width 3"] | None = None
+    mask: bool = True
+
+    @property
+    def summary(self) -> str:
+        """The input in words."""
+        if self.photographs is not None:
+            return f"{len(self.photographs)} photographs"
+        return f"{'mask and ' if self.mask else ''}{int(self.observed.sum())} depths"
+
+
+def draw_all(
+    folder: Path,
+    *,
+    pairs: tuple[ViewPair, ViewPair, ViewPair],
+    given: Given,
+    curve: list[dict[str, Any]],
+    title: str,
+) -> None:
+    """Writes the pictures of a run: summary.png and its parts.
+
+    Args:
+        folder: the run folder.
+        pairs: views before, after, and of the truth.
+        given: the input of the run.
+        curve: lines of curve.jsonl.
+        title: of the summary.
+    """
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(SCREEN):
+        figures = {
+            "input": _input(given),
+            "depth": _row(pairs, _show_depth, "Depth (camera z, scene units)"),
+            "normals": _row(pairs, _show_normals, "Normals (right, up, towards the camera as red, green, blue)"),
+            "silhouette": _row(pairs[:2], _show_silhouette(pairs[2]), "Silhouette error"),
+            "curve": _curve(curve),
+            "summary": _summary(pairs, given, title),
+        }
+        for name, figure in figures.items():
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+
+
+def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
+    """Writes the terms of a loss over iterations and seconds."""
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(SCREEN):
+        _curve(curve).savefig(path, dpi=110, bbox_inches="tight")
+
+
+def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
+    """Writes a picture that compares a view with the true one: normals of both, missed and spurious pixels."""
+    matplotlib.use("Agg")
+    both = ViewPair("rendered", found, found), ViewPair("reference", true, true)
+    with matplotlib.rc_context(SCREEN):
+        figure = Figure(figsize=(9.2, 3.5), layout="constrained")
+        axes = figure.subplots(1, 3)
+        for axis, pair in zip(axes, both, strict=False):
+            _show_normals(axis, pair, both)
+            axis.set_title(f"normals, {pair.title}")
+        _show_silhouette(both[1])(axes[2], both[0], both)
+        axes[2].set_title("silhouette error")
+        figure.suptitle(title)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
+def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, title: str) -> None:
+    """Writes images.npz and failure.png: rendered and true distances, and the kind of error of each pixel.
+
+    Args:
+        folder: the run folder.
+        images: "distance", "true_distance" and "kinds", a place in `KINDS` for each pixel; all [height, width].
+        severity: of the trial.
+        title: of the picture.
+    """
+    np.savez_compressed(folder / "images.npz", severity=severity, **images)  # type: ignore[arg-type]
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(SCREEN):
+        figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+        found, true, kinds = figure.subplots(1, 3)
+        true_distance = images["true_distance"]
+        known = true_distance[np.isfinite(true_distance)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+        for axis, name, heading in ((found, "distance", "found"), (true, "true_distance", "truth")):
+            shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
+            axis.set_title(f"distance along the ray, {heading}")
+            bare(axis)
+        figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
+        kinds.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
+        kinds.set_title("kind of error")
+        bare(kinds)
+        there = [name for number, name in enumerate(KINDS) if (images["kinds"] == number).any()]
+        patches = [Patch(facecolor=KINDS[name], edgecolor="#888888", label=name) for name in there]
+        kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
+        figure.suptitle(title)
+        figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
+
+
+def draw_ladder(folder: Path, metrics: dict[str, Any], title: str) -> None:
+    """Writes ladder.png into a run folder."""
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(SCREEN):
+        figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+        panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
+        figure.suptitle(title)
+        figure.savefig(folder / "ladder.png", dpi=110)
+
+
+def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
+    columns = {
+        "depth": _show_depth,
+        "normals": _show_normals,
+        "silhouette error": _show_silhouette(pairs[2]),
+        "from behind": _show_shaded,
+    }
+    figure = Figure(figsize=(9.2, 7.4), layout="constrained")
+    axes = figure.subplots(3, 4)
+    for row, pair in zip(axes, pairs, strict=True):
+        for axis, (name, show) in zip(row, columns.items(), strict=True):
+            if pair is pairs[2] and name == "silhouette error":
+                _show_given(axis, given)
+                axis.set_xlabel(f"given: {given.summary}")
+            else:
+                image = show(axis, pair, pairs)
+            if pair is pairs[0]:
+                axis.set_title(name)
+            if name == "depth":
+                axis.set_ylabel(pair.title, weight="bold")
+                depth_image = image
+    figure.colorbar(depth_image, ax=axes[:, 0], location="bottom", shrink=0.85, pad=0.02, label="camera z, scene units")
+    figure.suptitle(title)
+    return figure
+
+
+def _row(pairs: tuple[ViewPair, ...], show: Any, title: str) -> Figure:
+    figure = Figure(figsize=(3.2 * len(pairs) + 0.6, 3.5), layout="constrained")
+    axes = figure.subplots(1, len(pairs))
+    for axis, pair in zip(axes, pairs, strict=True):
+        image = show(axis, pair, pairs)
+        axis.set_title(pair.title)
+    if show is _show_depth:
+        figure.colorbar(image, ax=axes, shrink=0.8)
+    figure.suptitle(title)
+    return figure
+
+
+def _input(given: Given) -> Figure:
+    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+    axis = figure.subplots()
+    points = _show_given(axis, given, inches=3.5)
+    if given.photographs is None:
+        figure.colorbar(points, ax=axis, label="depth (scene units)", shrink=0.8)
+    axis.set_title(f"Given: {given.summary}")
+    return figure
+
+
+def _curve(curve: list[dict[str, Any]]) -> Figure:
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
+        for name, colour in TERMS.items():
+            values = [line[name] for line in curve if name in line]
+            if any(value > 0 for value in values):
+                axis.semilogy([line[key] for line in curve], values, label=name, color=colour, lw=1.4)
+        axis.set_xlabel(label)
+    figure.axes[0].set_ylabel("weighted loss")
+    if figure.axes[0].lines:
+        figure.axes[0].legend(frameon=False)
+    return figure
+
+
+def _show_depth(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
+    low, high = _depth_range(pairs)
+    shown = np.where(pair.front.mask.numpy(), pair.front.depth.numpy(), np.nan)
+    part = window([other.front.mask.numpy() for other in pairs])
+    return bare(axis).imshow(shown[part], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
+
+
+def _show_normals(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
+    flipped = _camera_normals(pair.front) * [1, -1, -1]  # to right, up, towards the camera
+    shown = np.where(pair.front.mask.numpy()[..., None], flipped / 2 + 0.5, 1.0).clip(0, 1)
+    return bare(axis).imshow(shown[window([other.front.mask.numpy() for other in pairs])])
+
+
+def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
+    shade = 0.25 + 0.75 * (_camera_normals(pair.back) @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
+    shown = np.where(pair.back.mask.numpy(), shade, 1.0)
+    part = window([other.back.mask.numpy() for other in pairs])
+    return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
+
+
+def _show_silhouette(truth: ViewPair) -> Any:
+    def show(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> None:
+        found, true = pair.front.mask.numpy(), truth.front.mask.numpy()
+        image = silhouette_image(found, true)
+        missed, spurious = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
+        part = window([other.front.mask.numpy() for other in (*pairs, truth)])
+        bare(axis).imshow(image[part], interpolation="nearest")
+        label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
+        axis.text(0.02, 0.10, f"missed {missed:.1f} %", color=MISSED, **label)
+        axis.text(0.02, 0.02, f"spurious {spurious:.1f} %", color=SPURIOUS, **label)
+
+    return show
+
+
+def _show_given(axis: Any, given: Given, inches: float = 2.0) -> Any:
+    """Shows some photographs; or the mask, and a square as large as a pixel for each depth, on axes `inches` wide."""
+    if given.photographs is not None:
+        places = np.linspace(0, len(given.photographs), MOST_PHOTOGRAPHS, endpoint=False).astype(int)
+        chosen = given.photographs[places]
+        return bare(axis).imshow(np.concatenate([np.concatenate(chosen[:2], 1), np.concatenate(chosen[2:], 1)], 0))
+    mask = given.view.mask.numpy()
+    rows, columns = window([mask])
+    bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axis.set_xlim(columns.start - 0.5, columns.stop - 0.5)
+    axis.set_ylim(rows.stop - 0.5, rows.start - 0.5)
+    at = np.nonzero(given.observed)
+    size = (72 * inches / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
+    return axis.scatter(
+        at[1], at[0], c=given.view.depth.numpy()[at], s=size, cmap="viridis_r", marker="s", linewidths=0
+    )
+
+
+def window(masks: list[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
+    """The smallest square part of an image that holds all masks, with a margin."""
+    together = np.any(masks, axis=0)
+    if not together.any():
+        return slice(0, together.shape[0]), slice(0, together.shape[1])
+    low = np.array([np.nonzero(together.any(1 - axis))[0][0] for axis in (0, 1)])
+    high = np.array([np.nonzero(together.any(1 - axis))[0][-1] + 1 for axis in (0, 1)])
+    size = min(int((high - low).max() * 1.12) + 2, min(together.shape))
+    start = np.clip((low + high - size) // 2, 0, np.array(together.shape) - size)
+    return slice(start[0], start[0] + size), slice(start[1], start[1] + size)
+
+
+def _camera_normals(view: View) -> Float[np.ndarray, "height width 3"]:
+    return view.normals.numpy() @ view.camera.world_to_camera[:3, :3].numpy().T
+
+
+def _depth_range(pairs: tuple[ViewPair, ...]) -> tuple[float, float]:
+    depths = np.concatenate([pair.front.depth.numpy()[pair.front.mask.numpy()] for pair in pairs])
+    return (float(depths.min()), float(depths.max())) if depths.size else (0.0, 1.0)

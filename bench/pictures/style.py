@@ -1,0 +1,216 @@
+"""The style of all pictures and figures: width, type size, and each preset's colour, marker and line."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from matplotlib import colormaps, rc_context
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, ListedColormap, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+WIDTH = 7.0  # inches: two columns of a paper
+RC = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "legend.frameon": False,
+    "axes.grid": True,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "savefig.dpi": 300,
+    "pdf.fonttype": 42,
+}
+# For the pictures in run folders, which are seen on a screen: larger type, no grid.
+SCREEN = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
+# Pixels of a rendered silhouette compared with the true one: in the true one only, in the rendered one only, in both,
+# in none; and pixels that show a wrong surface.
+MISSED, SPURIOUS, BOTH, PAPER, WRONG = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff", "#f2a600"
+
+
+@dataclass(frozen=True)
+class Look:
+    """The colour, marker and line of a row in every figure."""
+
+    colour: str
+    marker: str
+    line: Any = "-"
+
+
+_DIST, _DVR, _IDR, _NAIVE = Look("#0072b2", "s"), Look("#d1495b", "^"), Look("#6a3d9a", "D"), Look("#111111", "o")
+_LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<", "-.")
+_PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
+# By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
+KNOWN = {
+    "naive": _NAIVE,
+    "naive_serial": _NAIVE,
+    "naive_practical": Look("#8a8a8a", "s", "--"),
+    "naive_practical_parallel": Look("#e69f00", "^"),
+    "naive_parallel": Look("#5b4a3f", "p", "--"),
+    "dist": _DIST,
+    "dist_paper": _PAPER_DIST,
+    "dist_dynamic": Look("#56b4e9", "v", "--"),
+    "dist_aggressive": Look("#d55e00", "D"),
+    "dist_coarse_to_fine": Look("#009e73", "P"),
+    "dist_coarse_to_fine_100": Look("#cc79a7", "X", "--"),
+    "dist_capped": Look("#f0a35e", "d", "--"),
+    "dist_step_back": Look("#8b2252", "v", "-."),
+    "dist_step_floor": Look("#b8860b", "<", "--"),
+    "dist_slope_bound": Look("#66a61e", ">", "-."),
+    "dist_official_clamp": Look("#2f9e9e", "<", "-."),
+    "dvr": _DVR,
+    "dvr_64": _DVR,
+    "dvr_official_slope": Look("#e7a1ab", "^", "--"),
+    "idr": _IDR,
+    "deepsdf": Look("#009e73", "P", "-."),
+    "dist_mask": _DIST,
+    "dist_depth": _LIGHT_DIST,
+    "dist_mask_paper": _PAPER_DIST,
+    "dist_depth_paper": _PAPER_DIST_DEPTH,
+    "dvr_mask": _DVR,
+    "idr_mask": _IDR,
+    "naive_mask": _NAIVE_OF_METHODS,
+    "multiview_dist": _LIGHT_DIST,
+    "multiview_restarts": _DIST,
+    "multiview_paper": _PAPER_DIST_DEPTH,
+    "multiview_dvr": _DVR,
+    "multiview_idr": _IDR,
+    "multiview_naive": _NAIVE_OF_METHODS,
+    "pose_dist": _LIGHT_DIST,
+    "pose_dist_starts": _DIST,
+    "pose_dvr": _DVR,
+    "pose_idr": _IDR,
+    "pose_icp_point": Look("#8fbc5a", "v", "--"),
+    "pose_icp_plane": Look("#e69f00", "d", "--"),
+    "pose_icp_plane_starts": Look("#b36b00", "P", "-."),
+}
+_COLOURS = (
+    *("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#b8860b", "#8b2252", "#2f6f8f", "#556b2f", "#c04000"),
+)
+_MARKERS = ("<", ">", "p", "h", "*", "d", "8")
+_LINES = ("-", "--", "-.", (0, (1, 1)))
+
+
+def look(preset: str) -> Look:
+    """The look of a row, which depends on its preset alone, so that it is the same in every figure and report."""
+    if preset in KNOWN:
+        return KNOWN[preset]
+    drawn = crc32(preset.encode("utf-8", "backslashreplace"))
+    picks = ((drawn >> shift) % len(choices) for shift, choices in ((0, _COLOURS), (8, _MARKERS), (16, _LINES)))
+    colour, marker, line = picks
+    return Look(_COLOURS[colour], _MARKERS[marker], _LINES[line])
+
+
+def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:
+    """Makes a function draw with `RC`; matplotlib's settings are restored after it."""
+    return rc_context(RC)(function)
+
+
+def log_axis(axes: Axes, letter: str, values: Any) -> None:
+    """Makes the axis "x" or "y" logarithmic, with plain numbers as ticks; values that are not positive are not drawn.
+
+    Without positive values, or where they lie within a factor of 2, the axis stays linear.
+    """
+    positive = [x for x in finite(values) if x > 0]
+    if not positive or 1 < max(positive) / min(positive) < 2:
+        return
+    getattr(axes, f"set_{letter}scale")("log", nonpositive="mask")
+    ratio = max(positive) / min(positive)  # where it is small, ticks at decades alone would be too few
+    digits = {2, 3, 4, 5, 6, 7, 8} if ratio < 4 else {2, 5} if ratio < 100 else set()
+    axis = getattr(axes, f"{letter}axis")
+    axis.set_major_formatter(FuncFormatter(lambda x, _: short(x)))
+    axis.set_minor_formatter(FuncFormatter(lambda x, _: short(x) if int(f"{x:.0e}"[0]) in digits else ""))
+
+
+def short(x: float) -> str:
+    """A number as a short text for ticks, such as 5e-5, 0.02 or 10."""
+    mantissa, power = f"{x:.0e}".split("e")
+    return f"{x:g}" if 1e-3 <= abs(x) < 1e4 or x == 0 else f"{mantissa}e{int(power)}"
+
+
+def error_colours() -> Colormap:
+    """The colour map of errors, from light grey to black, in which `MISSED` and `SPURIOUS` can be seen."""
+    colours = ListedColormap(colormaps["Greys"](np.linspace(0.12, 1.0, 256)))
+    return colours.with_extremes(bad=PAPER)
+
+
+def rounded_up(x: float) -> float:
+    """The smallest of 1, 2, 5, 10, 20, 30, 45, 60, 90, 180 that is not below x: the end of a scale of degrees."""
+    return next((end for end in (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0) if end >= x), 180.0)
+
+
+def finite(values: Any) -> list[float]:
+    """The values as floats, with nan, which is not drawn, for those that are missing or not finite."""
+    return [float(x) if isinstance(x, Real) and math.isfinite(x) else math.nan for x in values]
+
+
+def needs_log(values: Any, factor: float = 20.0) -> bool:
+    """Whether the positive values differ by more than a factor, too much for a linear axis."""
+    positive = [x for x in finite(values) if x > 0]
+    return bool(positive) and max(positive) > factor * min(positive)
+
+
+def labelled(*axes: Axes) -> dict[str, Any]:
+    """The legend's handle for each label of some axes, each label once."""
+    return {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
+
+
+def legend_below(figure: Figure, *axes: Axes, columns: int = 4) -> None:
+    """Draws one legend of some axes below them."""
+    named = labelled(*axes)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns)
+
+
+def bare(axis: Any) -> Any:
+    """Prepares axes for a picture: a thin frame, no ticks, no grid; gives the axes."""
+    axis.set(xticks=[], yticks=[])
+    axis.grid(False)
+    for spine in axis.spines.values():
+        spine.set(visible=True, color="#bbbbbb")
+    return axis
+
+
+def window(masks: Sequence[np.ndarray], margin: float = 0.08) -> tuple[float, float, float]:
+    """The square part of pictures that contains all masks, with a margin.
+
+    Args:
+        masks: [height, width], of the same aspect ratio; their sizes may differ.
+        margin: as a share of the masks' extent.
+
+    Returns:
+        Its upper edge, left edge and side, in units of the larger side of a picture; a square of the smaller side
+        where no mask has a pixel.
+    """
+    largest = [max(mask.shape) for mask in masks]
+    smallest = min((min(mask.shape) / of for mask, of in zip(masks, largest, strict=True)), default=1.0)
+    low, high = np.ones(2), np.zeros(2)
+    for mask, of in zip(masks, largest, strict=True):
+        for axis in (0, 1) if mask.any() else ():
+            places = np.nonzero(mask.any(1 - axis))[0]
+            low[axis], high[axis] = min(low[axis], places[0] / of), max(high[axis], (places[-1] + 1) / of)
+    if (low > high).any():
+        return 0.0, 0.0, smallest
+    side = min(smallest, float((high - low).max()) * (1 + margin))
+    spans = np.array(masks[0].shape) / largest[0]
+    top, left = np.clip((low + high - side) / 2, 0, spans - side)
+    return float(top), float(left), side
+
+
+def silhouette_image(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Compares two masks [height, width] as a picture [height, width, 3]: `BOTH`, `MISSED`, `SPURIOUS` on `PAPER`."""
+    cases = [(found & true)[..., None], (true & ~found)[..., None], (found & ~true)[..., None]]
+    return np.select(cases, [np.array(to_rgb(colour)) for colour in (BOTH, MISSED, SPURIOUS)], np.array(to_rgb(PAPER)))

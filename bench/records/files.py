@@ -1,0 +1,73 @@
+"""Writes plain data to files: JSON with non-finite numbers, atomic writes, locks, and hashes."""
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+# JSON has no infinity: these strings stand for the floats.
+_NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+
+
+def file_lock(folder: Path, name: str) -> FileLock:
+    """A lock between processes on a name in a folder: one process holds it, the others wait."""
+    locks = folder / ".locks"
+    locks.mkdir(parents=True, exist_ok=True)
+    return FileLock(locks / name)
+
+
+def digest(data: Any) -> str:
+    """A hash of plain data, the same whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file atomically: under a temporary name in the same folder, flushed to the disk, then renamed."""
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with scratch.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def curve_file(folder: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Opens `folder/curve.jsonl` and gives a function that writes a line; each line is in the file at once."""
+    with (folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
+        yield lambda line: curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
+
+
+def to_json(data: Any) -> str:
+    """JSON text of some data, with non-finite floats as the strings "inf", "-inf" and "nan"."""
+    return json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """The same data with non-finite floats, which JSON lacks, as the strings "inf", "-inf" and "nan"."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if not isinstance(value, str | int | float | None) and hasattr(value, "item"):
+        value = value.item()  # a NumPy or PyTorch scalar
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def decoded(value: Any) -> Any:
+    """The same data with the strings "inf", "-inf" and "nan" as floats: the inverse of `plain`."""
+    if isinstance(value, dict):
+        return {name: decoded(inner) for name, inner in value.items()}
+    return _NON_FINITE.get(value, value) if isinstance(value, str) else value

@@ -1,0 +1,61 @@
+"""Formats numbers for readers: three significant digits, `∞` for infinite, `–` for missing."""
+
+import math
+
+MISSING = "–"
+INFINITE = "∞"
+
+
+def number(x: int | float | str | None, scale: float = 1.0) -> str:
+    """`x * scale` to three significant digits, such as 0.0123, 12.3, 1230 or 1.23e-7.
+
+    Zero is "0"; None is missing; not a number is "nan". A string is returned unchanged.
+    """
+    if isinstance(x, str):
+        return x
+    if x is None:
+        return MISSING
+    value = float(x) * scale
+    if not math.isfinite(value):
+        return "nan" if math.isnan(value) else f"{'-' if value < 0 else ''}{INFINITE}"
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.2e}".split("e")
+    power = int(exponent)
+    if -4 <= power < 6:
+        return f"{float(f'{mantissa}e{exponent}'):.{max(0, 2 - power)}f}"
+    return f"{mantissa}e{power}"
+
+
+def count(n: int | float | None) -> str:
+    """A count, whole below 1000 and then with k, M, G, T, P for powers of 1000, such as 999, 12.3k or 1.43M."""
+    if n is None or not math.isfinite(n):
+        return number(n)
+    if abs(n) < 999.5:
+        return f"{n:.0f}"
+    power = min(int(f"{abs(n):.2e}".split("e")[1]) // 3, 5)
+    return f"{number(n, 1000.0**-power)}{' kMGTP'[power]}"
+
+
+def size(n: int | float | None) -> str:
+    """A number of bytes with its unit, in powers of 1000, such as 512 B or 1.43 GB."""
+    if n is None or not math.isfinite(n):
+        return number(n)
+    text = count(n)
+    return f"{text} B" if text[-1].isdigit() else f"{text[:-1]} {text[-1]}B"
+
+
+def seconds(x: int | float | None) -> str:
+    """A length of time with its unit: 12.3 ms, 12.3 s, 34.5 min, 2.31 h; minutes from 120 s, hours from 120 min."""
+    if x is None or not math.isfinite(x):
+        return number(x)
+    if abs(x) < 1 and x != 0:
+        return f"{number(x, 1000.0)} ms"
+    if abs(x) < 120:
+        return f"{number(x)} s"
+    return f"{number(x, 1 / 60)} min" if abs(x) < 7200 else f"{number(x, 1 / 3600)} h"
+
+
+def interval(low: float | None, high: float | None) -> str:
+    """The ends of an interval, such as [0.12, 0.34]; empty where there is none."""
+    return "" if low is None or math.isnan(low) else f"[{number(low)}, {number(high)}]"

@@ -1,0 +1,151 @@
+"""The record of a run: the schema of `record.json`, and how it is written and read."""
+
+import json
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from bench.records.files import decoded, to_json, write_text
+
+SCHEMA = 1
+# Keys of a configuration that change no result, and are left out of its hash.
+NEUTRAL_KEYS = frozenset(
+    ("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun", "tracker")
+)
+NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
+LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked")  # fields that old records may lack
+
+
+class RunStatus(StrEnum):
+    """How a run ended."""
+
+    OK = "ok"
+    DIVERGED = "diverged"
+    NAN = "nan"
+    EMPTY = "empty"
+    NOT_REACHED = "not_reached"
+    TIMEOUT = "timeout"
+    OOM = "oom"
+    CRASHED = "crashed"
+    KILLED = "killed"
+    UNSUPPORTED = "unsupported"
+
+
+NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no record.json
+
+
+def now() -> str:
+    """The current time in UTC, to the millisecond."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+@dataclass
+class Record:
+    """The content of `record.json`. A new record has the status killed, which holds until its run ends."""
+
+    id: str
+    task: str
+    renderer: str
+    dataset: str
+    seed: int | None
+    config: dict[str, Any]
+    method: str = ""  # the chosen file of conf/method; empty where none was chosen
+    scene: str = ""
+    started: str = field(default_factory=now)
+    status: RunStatus | str = RunStatus.KILLED
+    reason: str = "the run is under way, or was killed before it could say why"
+    metrics: dict[str, Any] = field(default_factory=dict)
+    metrics_start: dict[str, Any] = field(default_factory=dict)
+    definitions: dict[str, Any] = field(default_factory=dict)
+    evaluations: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, Any] = field(default_factory=dict)
+    peak_memory_bytes: int | float | None = None
+    flops: int | float | None = None
+    gemm_fraction: float | int | None = None
+    environment: dict[str, Any] = field(default_factory=dict)
+    reused: bool = False
+    notes: list[str] = field(default_factory=list)
+    config_hash: str = ""
+    code: str = ""  # hash of the code that ran, and of the files that it read
+    asked: str = field(default_factory=now)  # when it was last requested; a reused run ran earlier
+    ended: str = ""  # empty while it is under way, and where it was killed before it could write this
+    log: list[str] = field(default_factory=list)  # the last lines of log.txt, where the run failed
+
+    @property
+    def name(self) -> str:
+        """Its name in tables: its label, or else that of its renderer, or else the renderer's name."""
+        return row_name(self.config, self.renderer)
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> "Record":
+        """The record of data that `read_record` has checked; unknown fields are ignored."""
+        known = {item.name: data[item.name] for item in fields(cls) if item.name in data}
+        return cls(**{**known, "status": RunStatus(data["status"])})
+
+    def write(self, folder: Path) -> None:
+        """Writes `record.json` atomically."""
+        write_text(folder / "record.json", to_json({"schema": SCHEMA, **self.__dict__}))
+
+
+def row_name(config: dict[str, Any], renderer: str) -> str:
+    """The name of a run's row: the label of its configuration, or of its renderer's node, or the renderer's name."""
+    return config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The record of one run folder, with non-finite numbers as floats and the folder's name under `folder`.
+
+    Raises:
+        OSError, ValueError, RecursionError: where it cannot be read; the message gives the reason.
+    """
+    try:
+        record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"record.json is not JSON in UTF-8 ({error})") from error
+    if not isinstance(record, dict):
+        raise ValueError(f"record.json must hold an object, found {type(record).__name__}")
+    if record.get("schema") != SCHEMA:
+        raise ValueError(f"record.json must have schema {SCHEMA}, found {record.get('schema')!r}")
+    record.setdefault("notes", [])
+    record.setdefault("asked", record.get("started"))
+    record |= {name: decoded(record[name]) for name in NUMERIC if name in record}
+    _check(record)
+    started(record), requested(record)  # a time that cannot be read is an error here, not later in a sort
+    return record | {"folder": folder.name}
+
+
+def requested(record: dict[str, Any]) -> datetime:
+    """When the run was last requested; a reused one ran earlier."""
+    return _time(record["asked"])
+
+
+def started(record: dict[str, Any]) -> datetime:
+    """When the run started; a time without an offset is UTC."""
+    return _time(record["started"])
+
+
+def _check(record: dict[str, Any]) -> None:
+    """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`."""
+    hints = get_type_hints(Record)
+    for item in fields(Record):
+        if item.name not in record:
+            if item.name in LATER:
+                continue
+            raise ValueError(f"record.json must have the field {item.name!r}, found none")
+        if not isinstance(record[item.name], _classes(hints[item.name])):
+            raise ValueError(f"{item.name} in record.json has the wrong type, found {type(record[item.name]).__name__}")
+
+
+def _classes(hint: Any) -> tuple[type, ...]:
+    """The classes that a type hint of a field allows."""
+    if isinstance(hint, UnionType):
+        return tuple(cls for part in get_args(hint) for cls in _classes(part))
+    return (get_origin(hint) or hint,)
+
+
+def _time(text: str) -> datetime:
+    time = datetime.fromisoformat(text)
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

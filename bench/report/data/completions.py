@@ -1,0 +1,94 @@
+"""The runs of Table 2: their errors by family, row and number of points, and pairs of rows."""
+
+import math
+from collections import Counter
+
+import numpy as np
+
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import SCALE, Row, RunKey, by_shape, error, family, row_of, run_key, setting
+from bench.report.data.statistics import median
+
+TABLE2 = Selection("table2", ("completion", "deepsdf"), ("dataset", "task"), ("points",))
+POINTS = ("dense", "50%", "10%", "100", "50", "20")
+Cell = tuple[str, Row, str]  # family, row, points
+ERROR = (
+    "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000. "
+    "A run that did not end ok, or was planned and not run, counts as infinite."
+)
+
+
+class Completions:
+    """The errors of an experiment's runs, by family, row and points, then by shape and seed."""
+
+    def __init__(self, experiment: Experiment):
+        self.errors: dict[Cell, dict[RunKey, float]] = {}
+        self.statuses: dict[Cell, Counter[str]] = {}
+        self.observed: dict[tuple[str, str], list[float]] = {}
+        for record in experiment.records:
+            cell = (family(record), row_of(record), str(setting(record["config"], "task", "points")))
+            self.errors.setdefault(cell, {})[run_key(record)] = SCALE * error(record, "chamfer_l2")
+            self.statuses.setdefault(cell, Counter())[record["status"]] += 1
+            if (count := record["evaluations"].get("observed")) is not None:
+                self.observed.setdefault((cell[0], cell[2]), []).append(count)
+        self.families = list(dict.fromkeys(name for name, _, _ in self.errors))
+        self.rows = list(dict.fromkeys(row for _, row, _ in self.errors))
+        found = {points for _, _, points in self.errors}
+        self.points = [p for p in POINTS if p in found] + sorted(found - {*POINTS})
+
+    def rows_of(self, name: str) -> list[Row]:
+        """The rows of a family."""
+        return [row for row in self.rows if any((name, row, points) in self.errors for points in self.points)]
+
+    def median(self, *cell: str | Row) -> float | None:
+        """The median over shapes and seeds of a family, row and points; None where nothing was planned."""
+        return float(median(list(self.errors[cell].values()))) if cell in self.errors else None
+
+    def over_points(self, name: str, row: Row) -> dict[RunKey, float]:
+        """The geometric mean over all numbers of points for each shape and seed of a row; infinite where one failed.
+
+        A shape and seed that was not planned for every number of points of the family is left out.
+        """
+        wanted = [p for p in self.points if any((name, other, p) in self.errors for other in self.rows)]
+        cells = [self.errors.get((name, row, p), {}) for p in wanted]
+        runs = [run for run in cells[0] if all(run in cell for cell in cells)] if cells else []
+        return {run: float(np.exp(np.mean(np.log([cell[run] for cell in cells])))) for run in runs}
+
+    def pair(self, name: str, row: Row, other: Row) -> list[list[np.ndarray]]:
+        """The values of `over_points` for two rows of a family, for the runs that both have, as an array per shape."""
+        mine, others = self.over_points(name, row), self.over_points(name, other)
+        common = [run for run in mine if run in others]
+        return [by_shape({run: errors[run] for run in common}) for errors in (mine, others)]
+
+    def failures(self, name: str, row: Row) -> tuple[int, int]:
+        """The number of a row's runs in a family that did not end ok, and the number of all."""
+        total = sum((self.statuses.get((name, row, points), Counter()) for points in self.points), Counter())
+        return total.total() - total["ok"], total.total()
+
+    def failed_shapes(self, name: str, row: Row) -> tuple[int, int]:
+        """The number of a row's shapes in a family with a run that did not end ok, and the number of all."""
+        cells = [self.errors.get((name, row, points), {}) for points in self.points]
+        worst: dict[object, float] = {}
+        for (shape, _), error_of_run in [item for cell in cells for item in cell.items()]:
+            worst[shape] = max(worst.get(shape, 0.0), error_of_run)
+        return sum(map(math.isinf, worst.values())), len(worst)
+
+    def given(self, name: str, points: str) -> float | None:
+        """The median number of observed points in a family's depth images."""
+        found = self.observed.get((name, points))
+        return float(np.median(found)) if found else None
+
+
+def shapes_per_cell(runs: Completions) -> str:
+    """The number of shapes per cell, and the largest coverage of an interval over so few, as a note."""
+    counts = {len(by_shape(errors)) for errors in runs.errors.values()}
+    least = min(counts)
+    number = f"{least}" if len(counts) == 1 else f"{least} to {max(counts)}"
+    bound = 100 * (1 - 2.0 ** (1 - least))
+    few = f" An interval of {least} covers {bound:.0f} % at most." if 1 < least < 6 else ""
+    return f"Shapes per cell: {number}.{few}"
+
+
+def heading(points: str) -> str:
+    """The heading of a column of the tables."""
+    return f"{points} pts" if points.isdigit() else points

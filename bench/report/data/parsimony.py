@@ -1,0 +1,190 @@
+"""The runs of the parsimony experiment, one per scene, with their candidates, and the savings of `field=auto`."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import PurePath
+from typing import Any
+
+from bench.pictures.size_chart import Candidates
+from bench.records import format
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import SCALE, Record, family, index, measured, row_of, setting
+
+PARSIMONY = Selection("parsimony", ("capacity",), ("dataset",))
+NETWORK = "network_8x512"  # the papers' network: that of DeepSDF and DIST, without a code
+COSTS = ("seconds", "flops", "evaluations")
+REACHED, NOT_REACHED, FAILED, NOT_FITTED = "reached", "not reached", "failed", "not fitted"
+SETTINGS = {  # settings that captions name
+    "fitted": ("models", "views", "fitted"),
+    "held_out": ("models", "views", "held_out"),
+    "share": ("models", "views", "share"),
+    "seeds": ("task", "checks", "seeds"),
+    "drawn": ("task", "checks", "drawn"),
+    "iterations": ("models", "fit", "iterations"),
+}
+NAMING: tuple[tuple[Callable[[Record], Any], str], ...] = (  # parts of a scene's name, where scenes differ in them
+    (lambda record: row_of(record).name, "{}"),
+    (index, "shape {}"),
+    (lambda record: record["seed"], "seed {}"),
+)
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """A run under the name of its scene; it has no candidates where it did not end ok."""
+
+    name: str
+    record: Record
+    candidates: Candidates
+
+    @property
+    def ok(self) -> bool:
+        """Whether it ended ok and has a recommended and a best candidate."""
+        return self.record["status"] == "ok" and None not in (self.candidates.chosen, self.candidates.best)
+
+    @property
+    def status(self) -> str:
+        """The outcome for readers."""
+        return self.record["status"].replace("_", " ") if self.record["status"] != "ok" else "no field recommended"
+
+    def number(self, name: str) -> int | float | None:
+        """The value of a metric; None where there is no such number, or the run did not end ok."""
+        return measured(self.record, name) if self.ok else None
+
+    def word(self, name: str) -> str | None:
+        """The value of a metric that is text; None where there is no such text, or the run did not end ok."""
+        value = self.record["metrics"].get(name)
+        return value if self.ok and isinstance(value, str) else None
+
+    def get(self, name: str) -> int | float | str | None:
+        """The value of a metric, a number or text."""
+        number = self.number(name)
+        return self.word(name) if number is None else number
+
+    def in_footprints(self, error: float | None) -> float | None:
+        """An error in scene units as a multiple of half a pixel."""
+        return None if error is None else error / self.candidates.footprint
+
+
+def scene_runs(experiment: Experiment) -> list[SceneRun]:
+    """All runs, sorted by the size of the recommended candidate, then by name; those that did not end ok come last.
+
+    A mesh has the name of its file, unless two scenes would have the same name.
+    """
+    families = {family(record) for record in experiment.records}
+    stems = {name: PurePath(name).stem for name in families}
+    short = stems if len(set(stems.values())) == len(families) else {name: name for name in families}
+    naming = [(part, words) for part, words in NAMING if len({part(record) for record in experiment.records}) > 1]
+    runs = []
+    for record in experiment.records:
+        name = ", ".join([short[family(record)], *(words.format(part(record)) for part, words in naming)])
+        runs.append(SceneRun(name, record, Candidates.of(record["metrics"] if record["status"] == "ok" else {})))
+    return sorted(runs, key=lambda run: (not run.ok, run.number("recommended_parameters") or 0, run.name))
+
+
+def named_settings(experiment: Experiment) -> dict[str, float]:
+    """The settings that captions name; nan where the configuration lacks one."""
+    requested = experiment.requested()
+    config = {"models": requested.get("ladder"), **requested}  # the node's name in older records
+    found = {name: setting(config, *path) for name, path in SETTINGS.items()}
+    known = {name: math.nan if value is None else value for name, value in found.items()}
+    return {**known, "percent": 100 * known["share"]}
+
+
+def failures(runs: list[SceneRun], fits: Callable[[SceneRun], dict[str, str | None]]) -> list[str]:
+    """A line for each failed fit: the scene, the fit and the reason.
+
+    Args:
+        runs: all runs.
+        fits: gives the reasons of failure of a run's fits, by their names; None or empty for a fit that succeeded.
+    """
+    return [f"{run.name}, {fit}: {reason}" for run in runs for fit, reason in fits(run).items() if reason]
+
+
+def spread(value: float | None, error: float | None) -> str:
+    """A mean with its standard error, times 1000."""
+    mean = format.number(value, SCALE)
+    return mean if value is None or error is None else f"{mean} ± {format.number(error, SCALE)}"
+
+
+def factor(x: float | None, *, above: bool = False) -> str:
+    """A ratio as text, such as 0.43× or 184k×; > 45× where `above` says that it is a lower bound."""
+    if x is None or math.isnan(x):
+        return format.MISSING
+    return f"{'> ' if above else ''}{format.count(x) if abs(x) >= 1000 else format.number(x)}×"
+
+
+def over(first: float | None, second: float | None) -> float | None:
+    """The ratio of the two; None where one is missing, or the second is 0."""
+    return None if first is None or not second else first / second
+
+
+@dataclass(frozen=True)
+class Saving:
+    """The savings of `field=auto` and of pixel precision on a scene."""
+
+    run: SceneRun
+
+    @property
+    def state(self) -> str:
+        """Whether the papers' network reached the error of field=auto; empty where there is no such error."""
+        network = self.run.candidates.result(NETWORK)
+        if not self.run.ok or self.run.number("auto.error") is None:
+            return ""
+        if network is None:
+            return NOT_FITTED
+        if network.numbers.get("seconds_at_auto") is not None:
+            return REACHED
+        return FAILED if network.error is None else NOT_REACHED
+
+    @cached_property
+    def network(self) -> dict[str, float | None]:
+        """The network's costs until it reached that error, or of its whole fit where it did not."""
+        names = {REACHED: "{}_at_auto", NOT_REACHED: "{}", FAILED: "{}"}
+        if self.state not in names:
+            return dict.fromkeys(COSTS)
+        return {cost: self.run.number(f"{NETWORK}.{names[self.state].format(cost)}") for cost in COSTS}
+
+    def ratio(self, cost: str) -> float | None:
+        """The network's cost over that of `field=auto`; a lower bound where the error was not reached."""
+        bounded = self.state in (REACHED, NOT_REACHED)
+        return over(self.network[cost], self.run.number(f"auto.{cost}")) if bounded else None
+
+    def pixel_precise(self, name: str) -> float | None:
+        """A number of the fit at pixel precision over that of the plain fit; None where a fit failed."""
+        chosen = self.run.candidates.chosen
+        if chosen is None or self.run.number("frugal.error") is None:
+            return None
+        return over(self.run.number(f"frugal.{name}"), chosen.numbers.get(name))
+
+    @property
+    def errors(self) -> tuple[float | None, float | None]:
+        """The errors of the recommended candidate's plain fit and its fit at pixel precision, in half pixels."""
+        plain, pixel_precise = (self.run.number(name) for name in ("recommended_error", "frugal.error"))
+        return self.run.in_footprints(plain), self.run.in_footprints(pixel_precise)
+
+    def failure(self, name: str) -> str:
+        """The status of a failed fit; empty for others."""
+        return (self.run.word(f"{name}.failed") or "").partition(":")[0]
+
+    @cached_property
+    def ratios(self) -> dict[str, float | None]:
+        """All of these numbers, by their names in the CSV."""
+        return {
+            **{f"network.{cost}": self.network[cost] for cost in COSTS},
+            **{f"ratio.{cost}": self.ratio(cost) for cost in COSTS},
+            **{f"frugal_over_plain.{name}": self.pixel_precise(name) for name in ("evaluations", "seconds", "error")},
+            "precision.saved": self.precision,
+        }
+
+    def get(self, name: str) -> int | float | str | None:
+        """One of `ratios`, or else a metric of the run."""
+        return self.ratios[name] if name in self.ratios else self.run.get(name)
+
+    @property
+    def precision(self) -> float | None:
+        """The share of evaluations that rendering held-out rays at pixel precision saves."""
+        share = over(self.run.number("precision.evaluations_auto"), self.run.number("precision.evaluations"))
+        return None if share is None else 1 - share

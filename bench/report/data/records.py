@@ -1,0 +1,158 @@
+"""Reads values from a record: its row, shape, numbers and settings; and groups runs by shape."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.records.record import row_name
+
+SCALE = 1000.0  # of Chamfer distances, in tables and figures
+ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
+OURS = "renderers."  # beginning of the targets of this project's renderers
+# Presets of older records, which have none, by their labels.
+FORMER = {
+    "Naive sphere tracing": "naive_serial",
+    "+ practical grad.": "naive_practical",
+    "+ parallel": "naive_practical_parallel",
+    "+ dynamic": "dist_dynamic",
+    "+ aggressive": "dist_aggressive",
+    "+ coarse-to-fine": "dist_coarse_to_fine",
+    "+ coarse-to-fine, 100 steps": "dist_coarse_to_fine_100",
+    "DIST with mask": "dist_mask",
+}
+Record = dict[str, Any]
+RunKey = tuple[Hashable, Hashable]  # shape, seed
+
+
+@dataclass(frozen=True)
+class Row:
+    """The row of a table to which a run belongs: a preset, which decides colours and published numbers, and a name.
+
+    Args:
+        preset: the file of conf/method, or else of conf/renderer.
+        name: the run's label, or else the renderer's label, or else the renderer's file.
+    """
+
+    preset: str
+    name: str
+
+
+def row_of(record: Record) -> Row:
+    """The row of a record. Older records have no presets: they are identified by their labels."""
+    config = record["config"]
+    name = str(row_name(config, record["renderer"]))
+    if "method" in record:
+        return Row(record["method"] or record["renderer"], name)
+    return Row(FORMER.get(name, name), name)
+
+
+def base_renderer(record: Record) -> str:
+    """The renderer of which a preset is a variant: its class in lower case; for a user's class, its preset."""
+    target = str(setting(record["config"], "renderer", "_target_") or "")
+    return target.rpartition(".")[2].lower() if target.startswith(OURS) else record["renderer"]
+
+
+def family(record: Record) -> str:
+    """The name of the record's dataset: the family, or the end of the path of a mesh file or folder."""
+    path = setting(record["config"], "dataset", "path")
+    return "/".join(Path(path).absolute().parts[-2:]) if path else record["dataset"]
+
+
+def iterations_of(record: Record) -> int | None:
+    """The number of the optimiser's iterations, which older records have among the task's settings."""
+    config = record["config"]
+    return setting(config, "task", "optimiser", "iterations") or setting(config, "task", "iterations")
+
+
+def index(record: Record) -> Any:
+    """The number of the shape in its family."""
+    return record["config"].get("index")
+
+
+def measured(record: Record, name: str) -> int | float | None:
+    """The metric of that name; None where there is no such number."""
+    value = record["metrics"].get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def error(record: Record, name: str) -> float:
+    """The metric of that name as the run's error: infinite where the run did not end ok, or has no such number."""
+    value = measured(record, name) if record["status"] == "ok" else None
+    return math.inf if value is None or math.isnan(value) else value
+
+
+def loop_seconds(record: Record) -> float | None:
+    """The seconds in the optimisation loop; None where the record does not have them."""
+    spent = [record["seconds"].get(name) for name in ("forward", "backward")]
+    return None if None in spent else sum(spent)
+
+
+def value_evaluations(record: Record) -> float | None:
+    """The number of field values computed in the loop; None where the record does not have it."""
+    return record["evaluations"].get("value")
+
+
+def median_of_known(values: Iterable[float | None]) -> float | None:
+    """The median of the values that are known; None where there is none."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def setting(config: dict[str, Any], *path: str) -> Any:
+    """The value of a configuration under nested keys; None where a key is missing."""
+    node: Any = config
+    for key in path:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
+
+
+def shape(record: Record) -> tuple[str, Any]:
+    """The shape of a run: its family and its number there."""
+    return family(record), index(record)
+
+
+def run_key(record: Record) -> RunKey:
+    """The shape and the seed, which runs of different rows must share to be compared."""
+    return shape(record), record["seed"]
+
+
+def by_run(records: list[Record], value: Callable[[Record], float]) -> dict[RunKey, float]:
+    """A number of each run, by its shape and seed."""
+    return {run_key(record): value(record) for record in records}
+
+
+def by_shape(values: dict[RunKey, float]) -> list[np.ndarray]:
+    """The numbers of runs as an array per shape, with an entry per seed."""
+    shapes: dict[Hashable, list[float]] = {}
+    for (of, _), value in values.items():
+        shapes.setdefault(of, []).append(value)
+    return [np.array(group) for group in shapes.values()]
+
+
+def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
+    """A line with the headings and the definition of each metric that is shown.
+
+    Args:
+        records: of the experiment. The key of a definition can name several metrics, such as "lost, false", all that
+            begin alike, such as "depth_error", or that of one band, such as "frontal.code_cosine".
+        names: heading by metric.
+    """
+    lines: dict[str, str] = {}
+    for record in records:
+        for key, text in record["definitions"].items():
+            parts = [part.strip().rsplit(".", 1)[-1] for part in key.split(",")]
+            found = [h for name, h in names.items() if any(name == p or name.startswith(f"{p}_") for p in parts)]
+            if found:
+                lines.setdefault(", ".join(dict.fromkeys(found)), text)
+    return [f"{headings}: {text}" for headings, text in lines.items()]
+
+
+def repeated(records: list[Record]) -> str:
+    """The number of repeats of the times, as text; empty where no record has it."""
+    times = Counter(n for record in records if (n := measured(record, "repeats")) is not None)
+    return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""

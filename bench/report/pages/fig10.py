@@ -1,0 +1,98 @@
+"""Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import ONE_WAY, SCALE, Row, RunKey, by_shape, error, family, row_of, run_key, setting
+from bench.report.data.statistics import Interval, bootstrap, median
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, shown, text, to_data, to_table
+
+PLACE = 50
+READS = (Selection("fig10", ("multiview",), ("dataset", "task"), ("focal", "start_scale")),)
+PANELS = {"focal": "focal length / the scene's", "start_scale": "noise in the initial code (prior's σ)"}
+NEUTRAL = 1.0  # default value of both conditions
+NOTES = (
+    "One condition varies, the other is at 1. The noise is that of a random code, in standard deviations of the "
+    "prior's training codes: 0 is the mean shape.",
+    "A run that did not end ok counts as infinite, drawn at the upper edge. The paper (Fig. 10, a chart without "
+    "numbers) finds its method robust to both.",
+)
+Cell = tuple[str, Row, str, float]  # family, row, condition, value of the condition
+RUNS = (
+    *(FAMILY, *(configured(key, "task", key) for key in PANELS), *IDENTITY),
+    *metrics(ONE_WAY, "chamfer_l2"),
+)
+COLUMNS = (
+    *(text("family", "Family"), text("method", "Method"), text("condition", "Condition"), Column("median", "Median")),
+    shown("95 % interval", lambda line: format.interval(line["low"], line["high"])),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family, method and value of a condition."""
+    cells = _cells(experiment)
+    lines = [
+        {"family": name, "method": row.name, "condition": f"{PANELS[key]}: {value:g}"}
+        | {"median": cell.value, "low": cell.low, "high": cell.high}
+        for (name, row, key, value), cell in cells.items()
+    ]
+    return Result(
+        title="Shape from many views under other focal lengths and starts.",
+        **captioned(
+            experiment,
+            "Median Chamfer distance from truth to prediction (squared scene units, times 1000).",
+            interval="95 % bootstrap intervals over shapes and seeds",
+            notes=NOTES,
+        ),
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, lines),
+        figure=draw(cells),
+    )
+
+
+def _cells(experiment: Experiment) -> dict[Cell, Interval]:
+    """The median for each family, method and value of a condition, with the other condition at its default."""
+    found: dict[Cell, dict[RunKey, float]] = {}
+    for record in experiment.records:
+        values = {key: float(setting(record["config"], "task", key)) for key in PANELS}
+        for key, value in values.items():
+            if all(values[other] == NEUTRAL for other in PANELS if other != key):
+                cell = found.setdefault((family(record), row_of(record), key, value), {})
+                cell[run_key(record)] = SCALE * error(record, ONE_WAY)
+    ordered = sorted(found.items(), key=lambda item: (item[0][0], item[0][1].name, *item[0][2:]))
+    return {cell: bootstrap(by_shape(errors), median, seed=0) for cell, errors in ordered}
+
+
+@style.styled
+def draw(cells: dict[Cell, Interval]) -> Figure:
+    """Draws a row of panels per family, with a panel per condition and a line per method."""
+    families = list(dict.fromkeys(name for name, *_ in cells))
+    figure = Figure(figsize=(style.WIDTH, 2.1 * len(families) + 0.5), layout="constrained")
+    axes = figure.subplots(len(families), len(PANELS), squeeze=False, sharey="row")
+    for line, name in zip(axes, families, strict=True):
+        for axis, key in zip(line, PANELS, strict=True):
+            selected = {(row, x): cell for (n, row, k, x), cell in cells.items() if (n, k) == (name, key)}
+            known = [end for (n, *_), c in cells.items() if n == name for end in (c.value, c.high) if np.isfinite(end)]
+            _panel(axis, selected, 2 * max(known, default=1.0))
+            axis.set(xlabel=PANELS[key], title=name)
+        style.log_axis(line[0], "y", known)
+        line[0].set_ylabel("truth to prediction × 1000\n(scene units²)")
+    style.legend_below(figure, *axes.flat, columns=3)
+    return figure
+
+
+def _panel(axis: Axes, cells: dict[tuple[Row, float], Interval], edge: float) -> None:
+    """Draws the medians of each row with their intervals; values beyond the edge are drawn at it."""
+    for row in dict.fromkeys(row for row, _ in cells):
+        points = [(x, cell) for (other, x), cell in cells.items() if other == row]
+        look, places = style.look(row.preset), [x for x, _ in points]
+        middles = [min(cell.value, edge) for _, cell in points]
+        axis.plot(places, middles, ls=look.line, color=look.colour, marker=look.marker, label=row.name)
+        ends = [min(cell.low, edge) for _, cell in points], [min(cell.high, edge) for _, cell in points]
+        axis.fill_between(places, *ends, color=look.colour, alpha=0.15, lw=0)

@@ -1,0 +1,54 @@
+"""Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
+
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.write import pictures
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, metric, through, to_data
+
+PLACE = 210
+READS = (Selection("fig4", ("ablation",)),)
+NOTES = (
+    "Pictures are cropped to the part with hits. A row that did not finish at the requested size is shown at the "
+    "largest size at which it did.",
+)
+MOST_COLUMNS = 5
+COLUMNS = (  # of a record and its cell of pictures
+    *through(lambda line: line[0], *IDENTITY),
+    *through(
+        lambda line: line[1].images.counted() if line[1].images else {}, *(Column(name) for name in pictures.COUNTED)
+    ),
+    *through(lambda line: line[0], metric("depth_error_median")),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with the reference and a column per row; rows without pictures keep their place."""
+    chosen = experiment.of_newest_scene()
+    cells, missing = pictures.cells(chosen.named(), [chosen.folder(record) for record in chosen.records])
+    return Result(
+        title="Errors of each strategy in the image.",
+        **captioned(
+            chosen,
+            "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
+            "normals.",
+            notes=(*missing, *NOTES),
+        ),
+        data=to_data(COLUMNS, zip(chosen.records, cells[1:], strict=True)),
+        figure=draw(cells),
+    )
+
+
+@style.styled
+def draw(cells: list[pictures.Cell]) -> Figure:
+    """Draws the pictures in as few lines of at most `MOST_COLUMNS` as possible."""
+    lines = -(-len(cells) // MOST_COLUMNS)
+    columns = -(-len(cells) // lines)
+    width = style.WIDTH - 0.7  # the rest is the colour bar's
+    figure = Figure(figsize=(style.WIDTH, lines * (2 * width / max(columns, 3) + 0.35)), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
+    pictures.draw(figure, cells, columns)
+    return figure

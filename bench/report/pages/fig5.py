@@ -1,0 +1,153 @@
+"""Fig. 5 of DIST: loss and Chamfer distance over iterations and time, and their rank correlation."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import curves
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import SCALE, Record, Row
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, to_data
+
+PLACE = 220
+READS = (Selection("fig5", ("completion",)),)
+# Plotted columns of a curve: labels and scales.
+QUANTITIES = {"total": "weighted loss", "chamfer_l2": "Chamfer × 1000 (scene units²)"}
+SCALES = {"total": 1.0, "chamfer_l2": SCALE}
+NOTES = (
+    "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
+    "not used by it. Seconds are those of the optimisation loop.",
+    "Each row's loss contains the silhouette loss of its renderer (the paper's in the rows with a plus), so losses of "
+    "different rows cannot be compared; Chamfer distances can.",
+    "ρ is Spearman's rank correlation between loss and Chamfer over the n iterations of a row's runs that have both; "
+    "points of one run are not independent, so it is no test of significance.",
+)
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """All runs of one row: their curves, the medians over them, and the rank correlation of loss and Chamfer."""
+
+    row: Row
+    runs: int
+    points: pd.DataFrame
+    medians: dict[str, pd.DataFrame]
+    correlation: float | None
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a curve per row, the median over its runs."""
+    found = {record["folder"]: curves.read(experiment.folder(record)) for record in experiment.records}
+    unread = [f"{r['name']}: {why}." for r in experiment.named() if (why := found[r["folder"]][1])]
+    lines = {folder: line for folder, (line, _) in found.items()}
+    strategies = [_strategy(row, records, lines) for row, records in experiment.rows().items()]
+    several = max(strategy.runs for strategy in strategies) > 1
+    runs = ", ".join(f"{strategy.row.name} {strategy.runs}" for strategy in strategies)
+    about = (
+        "Lines are medians over a row's runs; after its end a failed run counts as infinite. Runs per row: "
+        + runs
+        + "."
+    )
+    return Result(
+        title="Loss and Chamfer distance as shapes are completed.",
+        **captioned(
+            experiment,
+            "Loss and Chamfer distance over iterations and seconds, and Chamfer distance over loss.",
+            interval="bands are the minimum and maximum over runs" if several else "one run per row, no interval",
+            notes=(*unread, about if several else "", *NOTES),
+        ),
+        data=_data(experiment.records, lines, strategies),
+        figure=draw(strategies),
+    )
+
+
+@style.styled
+def draw(strategies: list[Strategy]) -> Figure:
+    """Draws loss above and Chamfer below, over iterations and seconds; at the right Chamfer over loss, and a legend."""
+    figure = Figure(figsize=(style.WIDTH, 4.6), layout="constrained")
+    axes = figure.subplots(2, 3)
+    for row, quantity in zip(axes, QUANTITIES, strict=True):
+        for axis, along in zip(row, ("iteration", "seconds"), strict=False):
+            for strategy in strategies:
+                _line(axis, strategy, quantity, along)
+            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration", ylabel=QUANTITIES[quantity])
+            _scale(axis, strategies, quantity, along)
+    for strategy in strategies:
+        look, points = style.look(strategy.row.preset), strategy.points
+        loss, chamfer = (style.finite(points[quantity] * SCALES[quantity]) for quantity in QUANTITIES)
+        axes[0, 2].plot(loss, chamfer, look.marker, color=look.colour, alpha=0.75, markersize=3, label=_entry(strategy))
+    axes[0, 2].set(xlabel=QUANTITIES["total"], ylabel=QUANTITIES["chamfer_l2"])
+    for letter, quantity in (("x", "total"), ("y", "chamfer_l2")):
+        style.log_axis(axes[0, 2], letter, [SCALES[quantity] * x for s in strategies for x in s.points[quantity]])
+    axes[1, 2].axis("off")
+    handles, labels = axes[0, 2].get_legend_handles_labels()
+    axes[1, 2].legend(
+        handles, labels, loc="upper left", borderaxespad=0, labelspacing=0.7, markerscale=1.5, fontsize=6.5
+    )
+    return figure
+
+
+def _line(axis: Any, strategy: Strategy, quantity: str, along: str) -> None:
+    shown, look, scale = strategy.medians[quantity], style.look(strategy.row.preset), SCALES[quantity]
+    middle, low, high = ([scale * x for x in style.finite(shown[name])] for name in ("median", "low", "high"))
+    places = style.finite(shown[along])
+    every = max(len(places) // 6, 1)
+    axis.plot(places, middle, linestyle=look.line, color=look.colour, marker=look.marker, markevery=every, ms=3.5)
+    if strategy.runs > 1:
+        axis.fill_between(places, low, high, color=look.colour, alpha=0.15, lw=0)
+
+
+def _scale(axis: Any, strategies: list[Strategy], quantity: str, along: str) -> None:
+    """Sets a logarithmic axis of values, and of seconds where some rows are much faster than others."""
+    style.log_axis(axis, "y", [x for s in strategies for x in s.medians[quantity]["median"] * SCALES[quantity]])
+    ends = [s.medians[quantity]["seconds"].max() for s in strategies if len(s.medians[quantity])]
+    if along == "seconds" and style.needs_log(ends):
+        style.log_axis(axis, "x", [x for s in strategies for x in s.medians[quantity]["seconds"]])
+
+
+def _strategy(row: Row, records: list[Record], lines: dict[str, pd.DataFrame]) -> Strategy:
+    failed = [record["status"] != "ok" for record in records]
+    runs = [lines[record["folder"]] for record in records]
+    points = pd.concat(runs, ignore_index=True).dropna(subset=["total", "chamfer_l2"])
+    medians = {quantity: curves.median(runs, failed, quantity) for quantity in QUANTITIES}
+    varied = len(points) > 2 and all(points[quantity].nunique() > 1 for quantity in QUANTITIES)
+    correlation = float(spearmanr(points["total"], points["chamfer_l2"]).statistic) if varied else None
+    return Strategy(row, len(records), points, medians, correlation)
+
+
+def _entry(strategy: Strategy) -> str:
+    return f"{strategy.row.name}\n  ρ = {format.number(strategy.correlation)} (n = {len(strategy.points)})"
+
+
+def _data(records: list[Record], lines: dict[str, pd.DataFrame], strategies: list[Strategy]) -> pd.DataFrame:
+    """The CSV, with three kinds of lines: of runs, of medians over a row's runs, and of a row's rank correlation."""
+    rows: list[dict[str, Any]] = []
+    identities = to_data(IDENTITY, records).to_dict("records")
+    for record, identity in zip(records, identities, strict=True):
+        points = _points(lines[record["folder"]]) or [{}]
+        rows += [{"kind": "run", **identity, **point} for point in points]
+    for strategy in strategies:
+        identity = {"row": strategy.row.name, "n": strategy.runs}
+        for quantity, shown in strategy.medians.items():
+            names = {"median": quantity, "low": f"{quantity}_low", "high": f"{quantity}_high"}
+            rows += [{"kind": "median", **identity, **point} for point in _points(shown.rename(columns=names))]
+        rho = {"n": len(strategy.points), "spearman": strategy.correlation}
+        rows.append({"kind": "correlation", "row": strategy.row.name, **rho})
+    return pd.DataFrame(rows, dtype=object)
+
+
+def _points(line: pd.DataFrame) -> list[dict[str, Any]]:
+    """The lines of a curve, with counts as integers."""
+    whole = ("iteration", "value_evaluations")
+    return [
+        {name: int(x) if name in whole and math.isfinite(x) else x for name, x in point.items()}
+        for point in line.to_dict("records")
+    ]

@@ -1,0 +1,124 @@
+"""Fig. 7 of DIST: erosion and dilation of the rendered shape by the convergence threshold epsilon."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from bench.pictures import style
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import Record, measured, setting
+from bench.report.write import pictures
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, metric, through, to_data
+
+PLACE = 230
+READS = (Selection("fig7", ("ablation",)),)
+NOTES = (
+    "Erosion is the number of missed pixels over that of the reference's hits; dilation is the number of spurious "
+    "pixels over the same. The depth error is over pixels that both hit. Epsilon is in scene units.",
+)
+MOST_COLUMNS = 8
+# Lines of the chart: column, colour, fill of the marker, label.
+KINDS = (
+    ("lost_share", style.MISSED, style.MISSED, "erosion"),
+    ("false_share", style.SPURIOUS, style.PAPER, "dilation"),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a column of pictures and a point of the chart per epsilon, the largest first."""
+    chosen = experiment.of_newest_scene()
+    chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
+    titled = [{**record, "name": _title(record)} for record in chosen.records]
+    cells, missing = pictures.cells(titled, [chosen.folder(record) for record in chosen.records])
+    data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, cells[1:]), strict=True))
+    unplaced = int(data["epsilon"].isna().sum())
+    missing += [f"Without an epsilon, and not in the chart: {unplaced} of {len(data)} rows."] if unplaced else []
+    return Result(
+        title="Erosion and dilation of the image by the convergence threshold.",
+        **captioned(
+            chosen,
+            "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
+            "blue) above the angle to the reference's, and erosion, dilation and depth error over epsilon.",
+            notes=(*missing, *NOTES),
+        ),
+        data=data,
+        figure=draw(cells, data),
+    )
+
+
+@style.styled
+def draw(cells: list[pictures.Cell], data: pd.DataFrame) -> Figure:
+    """Draws pictures above and two charts over epsilon below."""
+    columns = min(len(cells), MOST_COLUMNS)
+    lines = -(-len(cells) // columns)
+    height = lines * (2 * (style.WIDTH - 0.7) / max(columns, 3) + 0.4)
+    figure = Figure(figsize=(style.WIDTH, height + 2.2), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(height, 2.2))
+    pictures.draw(above, cells, columns)
+    _charts(below, data[data["epsilon"].notna()])
+    return figure
+
+
+def _charts(figure: SubFigure, data: pd.DataFrame) -> None:
+    shares, depth = figure.subplots(1, 2)
+    for name, rows in data.groupby("renderer", sort=False):
+        _lines(shares, depth, rows, str(name), several=data["renderer"].nunique() > 1)
+    for axis in (shares, depth):
+        axis.set(xlabel="epsilon (scene units)")
+        style.log_axis(axis, "x", data["epsilon"])
+        if len(data):
+            axis.invert_xaxis()  # in the order of the pictures
+            axis.legend()
+    percents = [100 * x for name in ("lost_share", "false_share") for x in style.finite(data[name])]
+    if style.needs_log(percents):
+        shares.set_yscale("symlog", linthresh=0.1)  # so that zero can be drawn
+        shares.yaxis.set_major_formatter("{x:g}")
+    shares.set(ylabel="pixels (% of the reference's hits)", ylim=(0, None))
+    depth.set(ylabel="median depth error (scene units)")
+    style.log_axis(depth, "y", data["depth_error_median"])
+
+
+def _lines(shares: Axes, depth: Axes, rows: pd.DataFrame, name: str, *, several: bool) -> None:
+    """Draws a renderer's lines in both charts."""
+    look, epsilon = style.look(name), style.finite(rows["epsilon"])
+    for key, colour, face, label in KINDS:
+        percent = [100 * x for x in style.finite(rows[key])]
+        how = {"color": colour, "marker": look.marker, "mfc": face, "clip_on": False, "zorder": 3}
+        shares.plot(epsilon, percent, look.line, label=f"{label}, {name}" if several else label, **how)
+    error = style.finite(rows["depth_error_median"])
+    depth.plot(epsilon, error, look.line, marker=look.marker, color=look.colour, label=name)
+
+
+def _counts(record: Record, cell: pictures.Cell) -> dict[str, Any]:
+    """The counts of a record, or else of its picture, and their shares of the reference's hits."""
+    drawn = cell.images.counted() if cell.images is not None else {}
+    counts = {name: measured(record, name) for name in ("size", "hits", "lost", "false")}
+    counts = {name: drawn.get(name) if value is None else value for name, value in counts.items()}
+    return {**drawn, **counts, **{f"{name}_share": _share(counts[name], counts["hits"]) for name in ("lost", "false")}}
+
+
+def _share(part: float | None, whole: float | None) -> float | None:
+    return part / whole if part is not None and whole else None
+
+
+def _epsilon(record: Record) -> float | None:
+    value = setting(record["config"], "renderer", "epsilon")
+    return value if isinstance(value, int | float) and value > 0 else None
+
+
+def _title(record: Record) -> str:
+    epsilon = _epsilon(record)
+    return f"{record['renderer']}, no epsilon" if epsilon is None else f"{epsilon:.0e}".replace("e-0", "e-")
+
+
+COLUMNS = (  # of a record and its counts
+    *through(lambda line: line[0], *IDENTITY, Column("epsilon", value=_epsilon)),
+    *through(lambda line: line[1], *(Column(name) for name in (*pictures.COUNTED, "lost_share", "false_share"))),
+    *through(lambda line: line[0], metric("depth_error_median")),
+)

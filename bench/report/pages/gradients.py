@@ -1,0 +1,133 @@
+"""Errors of gradients against central differences, by renderer and by the angle between ray and surface."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import definitions, measured, row_of
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table, whole
+
+PLACE = 200
+READS = (Selection("gradients", ("gradients",)),)
+BANDS = ("frontal", "oblique", "grazing", "silhouette")
+ERRORS = ("cosine", "scale", "median_error", "p99_error")
+COUNTS = ("pixels", "excluded")
+NUMBERS = (*COUNTS, *(f"{of}_{e}" for of in ("code", "camera") for e in ERRORS), "image_cosine", "image_scale")
+UNSHOWN = ("code_pooled_cosine", "camera_pooled_cosine")  # in the CSV only: the table would be too wide
+NOTES = (
+    "Errors are relative to the length of the true gradient. Pixels are frontal, oblique or grazing by the angle "
+    "between ray and normal; the silhouette is evaluated as one image. A renderer without ray gradients has no numbers "
+    "for the camera.",
+)
+TITLES = ("gradient for the code", "gradient for the camera", "silhouette")  # of the figure's columns
+# Panels of the figure: metric, label of the axis, and the value of an exact gradient.
+PANELS = (
+    ("code_scale", "scale (ratio, right: 1)", 1.0),
+    ("camera_scale", "scale (ratio, right: 1)", 1.0),
+    ("image_scale", "scale (ratio, right: 1)", 1.0),
+    ("code_median_error", "median relative error (ratio)", None),
+    ("camera_median_error", "median relative error (ratio)", None),
+    ("image_cosine", "cosine (right: 1)", 1.0),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line for each renderer and band, including failed runs."""
+    lines = [(record, band) for record in experiment.named() for band in BANDS]
+    data = to_data(COLUMNS, lines)
+    zeros = sum((data[metric] == 0).sum() for metric, _, right in PANELS if right is None)
+    unseen = f"{zeros} errors of exactly zero lie below the figure's logarithmic axes." if zeros else ""
+    return Result(
+        title="Errors of the gradients.",
+        **captioned(
+            experiment,
+            "Cosine and scale of a renderer's gradient against the true one: both are 1 where it is exact.",
+            notes=(*NOTES, unseen, *definitions(experiment.records, {name: _heading(name) for name in NUMBERS})),
+        ),
+        data=data,
+        table=to_table(COLUMNS, lines),
+        figure=draw(data.assign(name=[r["name"] for r, _ in lines], preset=[row_of(r).preset for r, _ in lines])),
+    )
+
+
+@style.styled
+def draw(data: pd.DataFrame) -> Figure:
+    """Draws scale above and median error below, by band, a marker per renderer; the silhouette in a third column."""
+    figure = Figure(figsize=(style.WIDTH, 4.4), layout="constrained")
+    axes = figure.subplots(2, 3, width_ratios=(3, 3, 2)).flat
+    names = list(dict.fromkeys(data["name"]))
+    for axis, (metric, label, right) in zip(axes, PANELS, strict=True):
+        bands = BANDS[3:] if metric.startswith("image") else BANDS[:3]
+        for place, name in enumerate(names):
+            _points(axis, data[data["name"] == name].set_index("band"), metric, bands, (place + 0.5) / len(names) - 0.5)
+        _dress(axis, label, right, bands)
+    for axis, what in zip(figure.axes, TITLES, strict=False):
+        axis.set_title(what)
+    style.legend_below(figure, figure.axes[0], columns=min(len(names), 5))
+    return figure
+
+
+def _points(axis: Axes, rows: pd.DataFrame, metric: str, bands: tuple[str, ...], shift: float) -> None:
+    look = style.look(rows["preset"].iloc[0])
+    values = style.finite(rows.loc[list(bands), metric])
+    places = np.arange(len(bands)) + 0.7 * shift
+    name, status = rows["name"].iloc[0], rows["status"].iloc[0]
+    label = name if status == "ok" else f"{name} ({status})"
+    axis.plot(places, values, look.marker, color=look.colour, label=label, markersize=5, clip_on=False)
+
+
+def _dress(axis: Axes, label: str, right: float | None, bands: tuple[str, ...]) -> None:
+    axis.set(ylabel=label, xticks=range(len(bands)), xticklabels=bands, xlim=(-0.5, len(bands) - 0.5))
+    axis.grid(False, axis="x")
+    for edge in range(1, len(bands)):
+        axis.axvline(edge - 0.5, color="#cccccc", lw=0.6)
+    values = np.concatenate([line.get_ydata() for line in axis.lines if line.get_marker() not in ("", "None")])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        axis.text(0.5, 0.5, "no numbers", transform=axis.transAxes, ha="center", color="#777777")
+    if right is None:
+        style.log_axis(axis, "y", values)
+        return
+    axis.axhline(right, color="#555555", lw=0.8, ls=":", zorder=1.5)
+    if values.size and np.abs(values).max() > 5:
+        axis.set_yscale("symlog", linthresh=2.0)
+        axis.yaxis.set_major_formatter("{x:g}")
+
+
+def _of_band(name: str) -> Callable[[Any], Any]:
+    return lambda line: measured(line[0], f"{line[1]}.{name}")
+
+
+def _cosine(value: float | None) -> str:
+    """A cosine with five decimals, to show small differences from 1."""
+    return f"{value:.5f}" if value is not None and math.isfinite(value) else format.number(value)
+
+
+def _heading(name: str) -> str:
+    """A metric's name for a reader, such as "Code median error"."""
+    return name.replace("_", " ").capitalize()
+
+
+def _column(name: str) -> Column:
+    show = whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
+    return Column(name, _heading(name), _of_band(name), show)
+
+
+COLUMNS = (  # of a record and a band
+    shown("Renderer", lambda line: line[0]["name"]),
+    *through(lambda line: line[0], *IDENTITY),
+    text("band", "Band", lambda line: line[1]),
+    *(_column(name) for name in NUMBERS),
+    *(Column(name, value=_of_band(name)) for name in UNSHOWN),
+    shown("Status", lambda line: line[0]["status"]),
+)

@@ -1,0 +1,130 @@
+"""The oracle of each prior: its best fit to unseen shapes, with pictures and the length of its gradient."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.experiments import Experiment
+from bench.report.data.oracle import PRIORS
+from bench.report.data.records import SCALE, Record, definitions, measured
+from bench.report.write import pictures
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, shown, text, to_data, to_table
+
+PLACE = 70
+READS = (PRIORS,)
+SHOWN = 3  # shapes per family in the figure
+DEFINED = {
+    "chamfer_l2": "Fit",
+    "floor_chamfer_l2": "Floor",
+    "distance_error": "Error of the distance",
+    "slope_median": "|gradient|",
+    "slope_p99": "|gradient|, 99 %",
+}
+NOTES = (
+    "A code of each prior is fitted to the signed distances of an unseen shape (DeepSDF, Eq. 10). The floor is the "
+    "Chamfer distance between two samplings of the true surface. A run that did not end ok counts as infinite.",
+    "Pictures: normals of the true shape and of the fit, in pairs. Histograms: length of the field's gradient within "
+    "0.02 of the true surface, over all shapes of a family; 1 for a distance.",
+)
+
+
+def _ratio(record: Record) -> float | None:
+    fit, floor = measured(record, "chamfer_l2"), measured(record, "floor_chamfer_l2")
+    return None if fit is None or not floor else fit / floor
+
+
+def _worst(value: float | None, record: Record) -> float:
+    return np.inf if value is None or record["status"] != "ok" else value
+
+
+def _ratios(line: tuple[str, list[Record]]) -> list[float]:
+    return [_worst(_ratio(record), record) for record in line[1]]
+
+
+def _median(name: str, scale: float = 1.0) -> Column:
+    """A column with the median of a metric over a family's shapes."""
+
+    def median(line: tuple[str, list[Record]]) -> str:
+        values = [_worst(measured(record, name), record) for record in line[1]]
+        return format.number(float(statistics.median(values)), scale)
+
+    return shown(DEFINED[name], median)
+
+
+RUNS = (FAMILY, *IDENTITY, *metrics(*DEFINED), Column("ratio", value=_ratio))
+COLUMNS = (  # of a family and its records
+    text("", "Family", lambda line: line[0]),
+    text("", "Shapes", lambda line: len(line[1])),
+    *(_median("chamfer_l2", SCALE), _median("floor_chamfer_l2", SCALE)),
+    Column("", "Fit / floor", lambda line: float(statistics.median(_ratios(line)))),
+    Column("", "largest", lambda line: max(_ratios(line))),
+    *(_median("distance_error"), _median("slope_median"), _median("slope_p99")),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family: the fit of its shapes, and the floor."""
+    families = experiment.families()
+    return Result(
+        title="The best fit of each prior to unseen shapes.",
+        **captioned(
+            experiment,
+            "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its floor; medians over "
+            "shapes.",
+            notes=(*NOTES, *definitions(experiment.records, DEFINED)),
+        ),
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, families.items()),
+        figure=draw(experiment, families),
+    )
+
+
+@style.styled
+def draw(experiment: Experiment, families: dict[str, list[Record]]) -> Figure:
+    """Draws a line per family: pairs of pictures, then the histogram."""
+    figure = Figure(figsize=(style.WIDTH, 1.05 * len(families) + 0.45), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
+    ratios = {"width_ratios": [1] * 2 * SHOWN + [1.7]}
+    axes = figure.subplots(len(families), 2 * SHOWN + 1, squeeze=False, gridspec_kw=ratios)
+    for line, (name, records) in zip(axes, families.items(), strict=True):
+        for axis in line[:-1]:
+            style.bare(axis)
+        line[0].set_ylabel(name)
+        for place, record in enumerate(records[:SHOWN]):
+            _pair(line[2 * place], line[2 * place + 1], experiment, record)
+        _histogram(line[-1], [_lengths(experiment, record) for record in records])
+    for axis, title in zip(axes[0], ("truth", "fit") * SHOWN, strict=False):
+        axis.set_title(title)
+    axes[0, -1].set_title("length of the gradient")
+    return figure
+
+
+def _pair(true: Axes, found: Axes, experiment: Experiment, record: Record) -> None:
+    images, why = pictures.load(experiment.folder(record))
+    if images is None:
+        found.text(0.5, 0.5, why or record["status"], ha="center", va="center", fontsize=5, transform=found.transAxes)
+        return
+    both = ((true, images.reference_normals, images.reference_hit), (found, images.normals, images.hit))
+    for axis, normals, hit in both:
+        axis.imshow(pictures.coloured(normals, hit), interpolation="auto")
+    ratio = _ratio(record)
+    found.set_xlabel("" if ratio is None else f"{format.number(ratio)} × floor", fontsize=6, labelpad=1)
+
+
+def _histogram(axis: Axes, lengths: list[np.ndarray]) -> None:
+    together = np.concatenate(lengths)
+    if together.size:
+        axis.hist(together.clip(0, 2), bins=np.linspace(0, 2, 41), color="#0072b2", density=True)
+    axis.axvline(1.0, color="#777777", lw=0.8, ls=":")
+    axis.set(yticks=[], xlim=(0, 2))
+
+
+def _lengths(experiment: Experiment, record: Record) -> np.ndarray:
+    arrays, _ = pictures.arrays(experiment.folder(record), ("gradient_length",))
+    found = np.asarray(arrays.get("gradient_length", ()), dtype=float)
+    return found[np.isfinite(found)]

@@ -1,0 +1,158 @@
+"""Error over time and over field values, and the time to a target error."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.curves import history_of
+from bench.report.data.experiments import Experiment
+from bench.report.data.records import SCALE, Record, Row, loop_seconds
+from bench.report.data.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
+from bench.report.write import interactive
+from bench.report.write.caption import captioned
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, Column, text, through, to_data, to_table
+
+PLACE = 90
+READS = (COMPLETION.selection,)
+ALONG = {"seconds": "time (seconds)", "value_evaluations": "field values"}
+NOTES = (
+    "Left and middle: Chamfer distance times 1000 during the optimisation, medians over the runs of each renderer's "
+    "main setting; a run that did not end ok is infinite after its end.",
+    f"Right: the share of runs not yet at {SCALE * TARGET:g} × 10⁻³ (Kaplan and Meier); a run that ended above it is "
+    "censored, one that failed remains to the end. The table has all settings, and the median time of the runs that "
+    "reached it.",
+)
+Reached = tuple[float, bool]  # seconds, and whether the target was reached then
+Histories = dict[Row, list[pd.DataFrame]]  # of the runs of each setting
+POINTS = (  # of a record and a point of its history
+    *through(lambda line: line[0], *IDENTITY, FAMILY),
+    *through(
+        lambda line: line[1],
+        *(Column(name) for name in ("iteration", "seconds", "value_evaluations", "error", "loss")),
+    ),
+)
+COLUMNS = (
+    *(text("setting", "Setting"), text("runs", "Runs"), text("reached", "Reached")),
+    Column("median", "Median time to it", show=format.seconds),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per setting: its runs, how many reached the target, and their median time."""
+    rows = settings(experiment, COMPLETION)
+    shown = {row.row: [history_of(experiment, record) for record in row.records] for row in rows}
+    pairs = {row.row: list(zip(row.records, shown[row.row], strict=True)) for row in rows}
+    times = {row: [time_to(history, record) for record, history in of_row] for row, of_row in pairs.items()}
+    points = [
+        (record, point)
+        for of_row in pairs.values()
+        for record, history in of_row
+        for point in history.astype(object).to_dict("records")
+    ]
+    return Result(
+        title="Error over time and over field values.",
+        **captioned(
+            experiment,
+            "Error over seconds and over field values, and the share of runs that have not reached the target.",
+            interval="bands are the quartiles of the runs",
+            notes=(sizes(rows), *NOTES),
+        ),
+        data=to_data(POINTS, points),
+        table=to_table(COLUMNS, [_line(row, of_row) for row, of_row in times.items()]),
+        figure=draw(main_settings(rows), shown, times),
+        page=interactive.curves(rows, shown),
+    )
+
+
+def _line(row: Row, times: list[Reached]) -> dict[str, Any]:
+    reached = [time for time, hit in times if hit]
+    median = float(np.median(reached)) if reached else None
+    return {"setting": row.name, "runs": len(times), "reached": len(reached), "median": median}
+
+
+@style.styled
+def draw(rows: list[Setting], shown: Histories, times: dict[Row, list[Reached]]) -> Figure:
+    """Draws the error over seconds and over evaluations, and the share of runs that have not reached the target."""
+    figure = Figure(figsize=(style.WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for axis, (along, label) in zip(axes, ALONG.items(), strict=False):
+        everything = []  # positions with finite medians: a logarithmic axis needs a point
+        for row in rows:
+            where, low, middle, high = band(shown[row.row], [r["status"] != "ok" for r in row.records], along)
+            look = style.look(row.renderer)
+            axis.plot(where, style.finite(middle), color=look.colour, ls=look.line, label=row.name)
+            axis.fill_between(where, style.finite(low), style.finite(high), color=look.colour, alpha=0.15, lw=0)
+            everything += [*where] if np.isfinite(middle).any() else []
+        errors = [x for row in rows for history in shown[row.row] for x in history["error"]]
+        style.log_axis(axis, "x", everything)
+        style.log_axis(axis, "y", errors if everything else [])
+        axis.set(xlabel=label, ylabel=COMPLETION.heading)
+    _survival(axes[2], {row: times[row.row] for row in rows})
+    style.legend_below(figure, axes[0], columns=5)
+    return figure
+
+
+def _survival(axis: Axes, times: dict[Setting, list[Reached]]) -> None:
+    """Draws the share of each row's runs that have not reached the target; a tick is the end of a run that did not."""
+    known = [time for row in times.values() for time, _ in row if math.isfinite(time)]
+    latest = max(known, default=1.0)
+    for row, reached in times.items():
+        look = style.look(row.renderer)
+        left = survival(reached, latest)
+        end = max(min(time, latest) for time, _ in reached)
+        where, share = np.append(left.times, end), np.append(left.remaining, left.remaining[-1])
+        axis.step(where, share, where="post", color=look.colour)
+        ticks = [time for time, hit in reached if not hit and math.isfinite(time)]
+        at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in ticks]
+        axis.plot(ticks, at, "|", color=look.colour, ms=6)
+    axis.set(xlabel="time (seconds)", ylabel=f"share not yet at {SCALE * TARGET:g}", ylim=(-0.03, 1.03))
+    style.log_axis(axis, "x", known)
+
+
+def survival(reached: list[Reached], latest: float) -> statistics.Survival:
+    """Kaplan and Meier's curve of runs; those with an infinite time, which failed, remain until `latest`."""
+    return statistics.kaplan_meier([min(time, latest) for time, _ in reached], [hit for _, hit in reached])
+
+
+def band(
+    runs: list[pd.DataFrame], failed: list[bool], along: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions along an axis, and the quartiles of the runs' errors there.
+
+    A run's error is that of its last checkpoint, infinite before the first and after the end of a failed run.
+    """
+    ends = [run[along].iloc[-1] for run in runs if len(run)]
+    starts = [run[along][run[along] > 0].min() for run in runs if len(run) > 1]
+    if not starts:
+        return (np.empty(0),) * 4
+    where = np.geomspace(min(starts), max(ends), 60)
+    values = np.full((len(runs), len(where)), np.inf)
+    for row, (run, over) in enumerate(zip(runs, failed, strict=True)):
+        last = np.searchsorted(run[along].to_numpy(), where, side="right") - 1
+        known = last >= 0
+        values[row, known] = run["error"].to_numpy()[last[known]]
+        if over and len(run):
+            values[row, where > run[along].iloc[-1]] = np.inf
+    low, high = (np.quantile(values, q, axis=0, method="nearest") for q in (0.25, 0.75))
+    return where, low, np.median(values, axis=0), high
+
+
+def time_to(history: pd.DataFrame, record: Record) -> Reached:
+    """The time of a run's first checkpoint at the target, else of its end; infinite where it failed or was not run.
+
+    A failed run counts as one that never reaches the target.
+    """
+    if record["status"] != "ok":
+        return math.inf, False
+    below = history[history["error"] <= SCALE * TARGET]
+    if len(below):
+        return float(below["seconds"].iloc[0]), True
+    return loop_seconds(record) or 0.0, False

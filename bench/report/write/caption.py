@@ -1,0 +1,139 @@
+"""Writes captions: what is plotted, n, the interval, what failed, and the machine; everything else becomes notes."""
+
+import textwrap
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+from bench.report.data.experiments import Experiment
+from bench.report.data.records import Record, setting, shape
+
+LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
+MOST_FAILURES = 4  # most failed runs that a caption lists one by one
+WITHOUT_NETWORK = ("scenes", "pixels", "machine")  # parts of the setup for pages without a prior
+
+
+def captioned(
+    experiment: Experiment,
+    plotted: str,
+    *,
+    n: str = "",
+    interval: str = "",
+    notes: Iterable[str] = (),
+    parts: tuple[str, ...] = ("scenes", "pixels", "network", "machine"),
+) -> dict[str, Any]:
+    """The caption of a page, in four sentences, and its notes, as fields of a `Result`.
+
+    Args:
+        experiment: the experiment that the page shows.
+        plotted: what is plotted, as a sentence.
+        n: the sample as text; by default the numbers of runs, shapes and seeds.
+        interval: the kind of interval; empty for none.
+        notes: further notes; empty ones are left out.
+        parts: parts of the setup to name, where they are known.
+    """
+    sample = (n or _sample(experiment)) + (f"; {interval}" if interval else "") + "."
+    setup = "; ".join(found for name in parts if (found := _SETUP[name](experiment)))
+    warnings = (_compared(experiment), _loaded(experiment), _omitted(experiment))
+    sentences = [plotted, f"n = {sample}", _outcome(experiment), f"{setup}." if setup else ""]
+    return {
+        "caption": " ".join(filter(None, sentences)),
+        "notes": [note for note in (*warnings, *notes) if note],
+    }
+
+
+def _sample(experiment: Experiment) -> str:
+    """The numbers of runs, shapes and seeds."""
+    counts = {
+        "run": len(experiment.records),
+        "shape": len({shape(record) for record in experiment.records}),
+        "seed": len({record["seed"] for record in experiment.records}),
+    }
+    runs, shapes, seeds = (f"{count} {_plural(word, count)}" for word, count in counts.items())
+    return f"{runs} ({shapes}, {seeds})"
+
+
+def _scenes(experiment: Experiment) -> str:
+    scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in experiment.records))
+    known = [scene for scene in scenes if scene] or [experiment.records[0]["dataset"]]
+    return f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}"
+
+
+def _pixels(experiment: Experiment) -> str:
+    """The requested resolution, where all runs have the same."""
+    sizes = {setting(record["config"], "view", "resolution") for record in experiment.records}
+    resolution = sizes.pop() if len(sizes) == 1 else None
+    return f"{resolution}×{resolution} pixels" if resolution else ""
+
+
+def _network(experiment: Experiment) -> str:
+    """The layers and width of the prior's decoder."""
+    config = experiment.requested()
+    network = setting(config, "prior", "network") or setting(config, "scale", "network")
+    layers, width = setting(network, "layers"), setting(network, "width")
+    return f"decoder of {layers} layers of {width}" if layers and width else ""
+
+
+def _machines(experiment: Experiment) -> str:
+    machines = [_machine(*machine) for machine in experiment.machines()]
+    return f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines)
+
+
+def _outcome(experiment: Experiment) -> str:
+    """The number of runs that did not end ok: each with its reason or, where they are many, counted by status."""
+    failed = [record for record in experiment.named() if record["status"] != "ok"]
+    total = len(experiment.records)
+    if not failed:
+        return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
+    if len(failed) <= MOST_FAILURES:
+        listed = "; ".join(_failure(record) for record in failed)
+    else:
+        statuses = Counter(record["status"] for record in failed).most_common()
+        listed = ", ".join(f"{count} {status}" for status, count in statuses) + "; reasons in the CSV"
+    subject = f"{len(failed)} of {total} runs" if total > 1 else "The run"
+    return f"{subject} did not end ok: {listed}."
+
+
+def _omitted(experiment: Experiment) -> str:
+    """The number of records of this experiment that are not shown, and the reason; empty where all are shown."""
+    count = experiment.left_out
+    reason = "of this experiment with another scene, setting or machine"
+    return f"Not shown: {count} {_plural('run', count)} {reason}." if count else ""
+
+
+def _compared(experiment: Experiment) -> str:
+    """A warning where the rows' times were measured on different machines or with different numbers of threads."""
+    machines = experiment.machines()
+    if len(machines) < 2:
+        return ""
+    each = [f"{_machine(*machine) or 'unnamed machine'} ({_listed(rows)})" for machine, rows in machines.items()]
+    return f"Times of rows from different machines or numbers of threads do not compare: {'; '.join(each)}."
+
+
+def _loaded(experiment: Experiment) -> str:
+    """A warning where other work on the machine, or a missing synchronisation, makes times doubtful."""
+    doubtful = ("loaded machine", "missing synchronisation")
+    names = [r["name"] for r in experiment.named() if any(note.startswith(doubtful) for note in r["notes"])]
+    rows = "all rows" if len(names) == len(experiment.records) > 1 else _listed(names)
+    return f"Doubtful times, see the notes of the run: {rows}." if names else ""
+
+
+def _machine(cpu: Any, device: Any, threads: Any) -> str:
+    parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
+    return "; ".join([" + ".join(parts), *([f"{threads} {_plural('thread', threads)}"] if threads else [])])
+
+
+def _failure(record: Record) -> str:
+    reason = textwrap.shorten(record["reason"] or "no reason recorded", LONGEST_REASON, placeholder=" …")
+    return f"{record['name']}: {record['status']} ({reason.rstrip('.')})"
+
+
+def _listed(names: list[str], most: int = 4) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _plural(word: str, count: int) -> str:
+    return word if count == 1 else f"{word}s"
+
+
+_SETUP = {"scenes": _scenes, "pixels": _pixels, "network": _network, "machine": _machines}

@@ -1,0 +1,112 @@
+"""Tables: a `Column` defines a value, its name in the CSV, and its heading and text in the readable table."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import pandas as pd
+
+from bench.records import format
+from bench.report.data import records
+from bench.report.data.records import SCALE, measured, row_of, setting
+
+thousandfold = partial(format.number, scale=SCALE)
+
+
+def whole(value: float | None) -> str:
+    """A count as text, without decimals."""
+    return format.number(value) if value is None else f"{value:.0f}"
+
+
+def word(value: Any) -> str:
+    """A name or a number as text, unchanged."""
+    return format.MISSING if value is None else str(value)
+
+
+def percent(share: float | None) -> str:
+    """A share of 1 in whole per cent."""
+    return format.number(share) if share is None else f"{100 * share:.0f} %"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Args:
+        key: its name in the CSV; empty for a column that only the readable table has.
+        heading: in the readable table; empty for a column that only the CSV has.
+        value: gives the raw value of a line; by default `line.get(key)`.
+        show: converts the value to text for readers.
+        words: gives the text of a line for readers, where it depends on more than the value.
+    """
+
+    key: str
+    heading: str = ""
+    value: Callable[[Any], Any] | None = None
+    show: Callable[[Any], str] = format.number
+    words: Callable[[Any], str] | None = None
+
+    def of(self, line: Any) -> Any:
+        """The raw value of a line."""
+        return line.get(self.key) if self.value is None else self.value(line)
+
+    def text(self, line: Any) -> str:
+        """The text of a line for readers."""
+        return self.show(self.of(line)) if self.words is None else self.words(line)
+
+
+def to_data(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
+    """The raw values of all lines, for the CSV."""
+    kept = [column for column in columns if column.key]
+    return pd.DataFrame([[c.of(line) for c in kept] for line in lines], columns=[c.key for c in kept], dtype=object)
+
+
+def to_table(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
+    """The values of all lines as text, for readers."""
+    kept = [column for column in columns if column.heading]
+    return pd.DataFrame([[c.text(line) for c in kept] for line in lines], columns=[c.heading for c in kept])
+
+
+def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:
+    """A column of text."""
+    return Column(key, heading, value, show=word)
+
+
+def shown(heading: str, words: Callable[[Any], str]) -> Column:
+    """A column of the readable table only."""
+    return Column("", heading, words=words)
+
+
+def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
+    """A column with a metric of each record."""
+    return Column(name, heading, lambda record: measured(record, name), show)
+
+
+def metrics(*names: str) -> tuple[Column, ...]:
+    """Columns with metrics of each record, in the CSV only."""
+    return tuple(metric(name) for name in names)
+
+
+def configured(key: str, *path: str, heading: str = "") -> Column:
+    """A column with a setting of each record."""
+    return Column(key, heading, lambda record: setting(record["config"], *path), word)
+
+
+def through(part: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
+    """The columns applied to a part of each line, such as its record."""
+    return tuple(replace(c, value=lambda line, c=c: c.of(part(line))) for c in columns)
+
+
+# Columns that identify a run and give its outcome, for every table of runs.
+IDENTITY = (
+    text("row", value=lambda record: row_of(record).name),
+    *(text(key) for key in ("renderer", "seed")),
+    text("index", value=records.index),
+    *(text(key) for key in ("status", "reason", "folder")),
+)
+FAMILY = text("family", value=records.family)
+LOOP = (
+    Column("loop_seconds", value=records.loop_seconds),
+    Column("value_evaluations", value=records.value_evaluations),
+)

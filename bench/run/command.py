@@ -1,0 +1,151 @@
+"""The command line: Hydra underneath, with one clear line for every mistake."""
+
+import os
+import re
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bench.config import CONF, check_names, nearest, register, renamed
+from bench.records.rows import register_rows
+from bench.run.sweep import Refused, Sweep
+
+CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
+USAGE = 2  # exit status of a command line that asks for what there is not
+FAILED = 1
+EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
+INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+
+def command_line(job: Callable[[DictConfig], None]) -> int:
+    """Composes the configuration of the command line and gives it to `job`, once, or in a sweep once a cell.
+
+    Returns:
+        the exit status: 0, or the status of a mistake that was told on standard error.
+    """
+    register()
+    register_rows()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
+    begun: list[DictConfig] = []
+    raised: list[OSError | ValueError] = []
+
+    def guarded(config: DictConfig) -> None:
+        begun.append(config)
+        try:
+            check_names(config)
+            job(config)
+        except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
+            raised.append(error)
+
+    signal.signal(signal.SIGTERM, _stop)  # as Ctrl-C: the record says what happened
+    program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
+    try:
+        _call(program)
+        if raised:
+            raise raised[0]
+    except KeyboardInterrupt as error:
+        return _tell(str(error) or "stopped by Ctrl-C", INTERRUPTED)
+    except OverrideParseException as error:
+        return _tell(
+            f"cannot read {error.override!r}: write key=value, and quote a value with special characters as "
+            f"'key=\"value\"'",
+            USAGE,
+        )
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
+        return _tell(_explain(error), USAGE)
+    except OSError as error:
+        return _tell(unwritten(error))
+    except Exception as error:
+        what = " ".join(str(error).split())
+        if Sweep.plan is not None:  # a cluster that is not there, a worker that is lost
+            return _tell(f"the launcher stopped: {what}; the same command goes on")
+        if begun:
+            raise
+        return _tell(f"cannot compose {' '.join(sys.argv[1:])!r}: {what}", USAGE)  # Hydra, at a value of an odd type
+    return 0
+
+
+def unwritten(error: OSError) -> str:
+    """One line on what could not be written, and what to do."""
+    where = f" ({error.filename})" if error.filename else ""
+    return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
+
+
+def _call(program: Callable[[], None]) -> None:
+    """Calls it; where a sweep was refused, raises why."""
+    try:
+        program()
+    except Refused as refused:
+        raise refused.why from None
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
+
+
+def _tell(message: str, code: int = FAILED) -> int:
+    if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
+        traceback.print_exc()
+    print(f"error: {message}", file=sys.stderr)
+    return code
+
+
+def _explain(error: Exception) -> str:
+    """One line that names what is wrong and, for an unknown name, the nearest known one."""
+    chain = [error, error.__cause__, error.__context__]
+    for cause in chain:
+        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            missing = str(cause.missing_cfg_file)
+            nested = missing.startswith("hydra/") or "/" not in missing
+            group, _, name = missing.rpartition("/") if nested else missing.partition("/")
+            if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
+                return f"hydra/launcher={name} needs a plugin: pip install -e '.[{extra}]'"
+            what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
+            known = [option for option in cause.options or [] if not option.startswith("_")]  # others build on these
+            own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
+            hint = renamed(f"{group}/{name}") or nearest(name, known)
+            return what + hint + (own if "/" in name or "." in name else "")
+    message = " ".join(str(error).split())
+    if isinstance(error, ConfigCompositionException):
+        if found := re.search(r"Could not override '([^']+)'", message):
+            if (CONF / found[1]).is_dir():
+                return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
+            return f"unknown key {found[1]!r}" + (renamed(found[1]) or nearest(found[1], _known_keys()))
+        if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
+            new = renamed(f"{found[1]}/{found[2]}")
+            return f"unknown {found[1]} {found[2]!r}" + (new or nearest(found[2], _choices(found[1])))
+        if error.__cause__ is not None:
+            detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
+            return f"{message}: {detail}" if detail not in message else message
+    return message
+
+
+def _choices(group: str) -> list[str]:
+    return [path.stem for path in (CONF / group).glob("[!_]*.yaml")]
+
+
+def _known_keys() -> list[str]:
+    """Every dotted key of the configuration with the choices of the command line, as far as these are known."""
+    chosen = [a for a in sys.argv[1:] if (found := CHOICE.fullmatch(a)) and found[2] in _choices(found[1])]
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return list(_dotted(compose("config", chosen)))
+
+
+def _dotted(node: DictConfig, prefix: str = "") -> list[str]:
+    keys = []
+    for key in node:
+        name = f"{prefix}{key}"
+        keys.append(name)
+        child = node._get_node(key)
+        if OmegaConf.is_dict(child) and not child._is_missing() and not child._is_none():
+            keys += _dotted(child, f"{name}.")
+    return keys

@@ -1,0 +1,156 @@
+"""Runs a job in a child process that can be stopped at any moment, and reports how it ended."""
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import psutil
+
+from bench.records.record import RunStatus
+from bench.run.messages import Ended, Job, Message, Started, Step
+
+INTERVAL = 0.05  # seconds between two checks of clock and memory
+GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
+BOOT = 120.0  # seconds in which a child must be ready; a cold disk is slow
+GIB = 2**30
+# Signals that come from outside: from a user, a batch system, or the operating system where memory runs out.
+EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+
+
+@dataclass(frozen=True)
+class RunLimits:
+    """Limits on a run's time and memory.
+
+    Args:
+        seconds: wall-clock time from when the child process is ready; None for no limit.
+        memory: resident memory of the process in GiB; None for nine tenths of the machine's.
+    """
+
+    seconds: float | None
+    memory: float | None
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"time_limit must be positive, not {self.seconds}: 600 is ten minutes, null no limit")
+        if self.memory is not None and not self.memory > 0:
+            raise ValueError(f"memory_limit must be positive, not {self.memory}: 8 is 8 GiB, null all but a tenth")
+
+    @property
+    def bytes(self) -> float:
+        return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a child ended that did not report it itself."""
+
+    status: RunStatus
+    reason: str
+
+
+def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> Ending | None:
+    """Runs a job in a child process, and passes every message of the child to `receive` as it arrives.
+
+    Returns:
+        None where the child finished and sent its final record; else how it ended.
+    """
+    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
+        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["bench.run.child"])  # so that children need not import torch
+    channel, childs = context.Pipe()
+    alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
+    process = context.Process(target=_enter, args=(job, childs, alive))
+    with channel, ours:
+        process.start()
+        childs.close()
+        alive.close()
+        try:
+            ending = _watch(process, channel, limits, receive)
+            process.join(GRACE if ending is None else 0.0)
+            return ending
+        finally:
+            _end(process, channel, receive)
+
+
+def _enter(job: Job, channel: Connection, parent: Connection) -> None:
+    from bench.run.child import main
+
+    main(job, channel, parent)
+
+
+def _watch(
+    process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
+) -> Ending | None:
+    begun, ready, most = time.perf_counter(), False, limits.bytes
+    when = "while setting up"  # until the first step is reported
+    with suppress(psutil.NoSuchProcess):
+        memory = psutil.Process(process.pid)
+    while True:
+        wait([channel, process.sentinel], timeout=INTERVAL)
+        alive = process.is_alive()  # before the messages are read, so that none can arrive after the last read
+        while channel.poll():
+            try:
+                message = channel.recv()
+            except (EOFError, OSError):
+                return _died(process)
+            if isinstance(message, Ended):
+                return None
+            if isinstance(message, Started):
+                begun, ready = time.perf_counter(), True
+            elif isinstance(message, Step):
+                when = message.when
+            receive(message)
+        if not alive:
+            return _died(process)
+        spent = time.perf_counter() - begun
+        if ready and limits.seconds is not None and spent > limits.seconds:
+            return Ending(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {when}")
+        if not ready and spent > BOOT:
+            return Ending(RunStatus.CRASHED, f"its process was not ready within {BOOT:g} s")
+        with suppress(psutil.NoSuchProcess):
+            if memory.memory_info().rss > most:
+                process.kill()  # at once, before the machine runs out of memory
+                return Ending(RunStatus.OOM, f"more than {most / GIB:.3g} GiB of memory (memory_limit), {when}")
+
+
+def _end(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
+    """Sends the child SIGTERM, receives its last messages, and ends it."""
+    if process.is_alive():
+        process.terminate()
+    latest = time.perf_counter() + GRACE
+    with suppress(EOFError, OSError):
+        while (left := latest - time.perf_counter()) > 0 and channel.poll(left):
+            receive(channel.recv())
+    process.join(max(latest - time.perf_counter(), 0.0))
+    if process.is_alive():
+        process.kill()
+    process.join()
+    process.close()
+
+
+def _died(process: BaseProcess) -> Ending:
+    process.join()
+    code = process.exitcode or 0
+    if code >= 0:
+        return Ending(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
+    name = signal.Signals(-code).name
+    if -code in EXTERNAL:
+        hint = "; the operating system does that where memory runs out" if -code == signal.SIGKILL else ""
+        return Ending(RunStatus.KILLED, f"its process was ended by {name}{hint}")
+    return Ending(RunStatus.CRASHED, f"its process died of {name} in native code")
+
+
+def machine_memory() -> int:
+    """Bytes of memory that all processes may use together: the machine's, or a lower limit of its container."""
+    total = psutil.virtual_memory().total
+    for path in (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")):
+        with suppress(OSError, ValueError):
+            total = min(total, int(path.read_text()))
+    return total

@@ -1,0 +1,177 @@
+"""Runs one configuration: claims its folder, runs it in a child process, and always writes its record."""
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from bench.config import Isolation, build, register
+from bench.progress import Report, notice, run_progress
+from bench.records.files import write_text
+from bench.records.folder import Claim, claimed, release
+from bench.records.identity import Identity, identify
+from bench.records.record import Record, RunStatus, now, read_record
+from bench.run.command import unwritten
+from bench.run.messages import Job, Message, Notice, Step
+from bench.run.process import RunLimits, run_isolated
+from bench.run.summary import show
+from bench.trackers import Tracker
+
+LOST = "lost"  # the status that the driver gets of a run whose record could not be written
+LAST_LINES, LAST_BYTES = 80, 16_384  # most of the log that the record of a failed run keeps
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM ended a run, and its record has been written."""
+
+    def __init__(self, folder: Path, record: Record) -> None:
+        super().__init__(f"killed: {record.reason}")
+        self.folder, self.record = folder, record
+
+
+def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
+    """Runs a composed configuration and gives its status.
+
+    The summary of a single run is printed here; a sweep's driver prints a line per run.
+
+    Args:
+        config: configuration of the run.
+        write_index: writes the report's page of a results folder and gives its path.
+
+    Raises:
+        Interrupted: after Ctrl-C or SIGTERM.
+    """
+    register()  # again, since a launcher's worker has not read the command line
+    _stay_in_place(config)
+    single = OmegaConf.is_missing(HydraConfig.get().job, "num")
+    try:
+        folder, record = run(config)
+    except Interrupted as error:
+        if single:
+            show(error.folder, error.record, write_index(error.folder.parent.parent))
+        raise
+    except OSError as error:
+        print(f"error: {unwritten(error)}", file=sys.stderr, flush=True)
+        return LOST
+    if config.verbose:
+        print("\n".join(record.log), file=sys.stderr, flush=True)
+    if single:
+        show(folder, record, write_index(folder.parent.parent))
+    return record.status
+
+
+def _stay_in_place(config: DictConfig) -> None:
+    """Makes `results_dir` relative to the driver's working directory where a launcher's worker has another."""
+    driver = Path(HydraConfig.get().runtime.cwd)
+    if driver != Path.cwd():
+        config.results_dir = str(driver / config.results_dir)
+
+
+def run(config: DictConfig) -> tuple[Path, Record]:
+    """Runs a configuration in its folder, or reuses the finished run there; gives the folder and the record.
+
+    Raises:
+        OSError: where the results folder cannot be written.
+        Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
+    """
+    identity = identify(config, HydraConfig.get().runtime)
+    with claimed(Path(config.results_dir), identity, config.rerun) as claim:
+        if claim.finished is not None:
+            return claim.folder, _reuse(claim.folder, claim.finished)
+        record = _new_record(identity, claim)
+        return claim.folder, _run_anew(config, claim.folder, record)
+
+
+def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
+    """The record of a finished run, with its times, marked as reused."""
+    record = Record.of(finished)
+    record.reused, record.asked = True, now()
+    with suppress(OSError):  # a folder that can only be read is enough
+        record.write(folder)
+    return record
+
+
+def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
+    """Runs a configuration; its record says that it is under way, and at the end how it ended."""
+    record.write(folder)
+    started, interrupted, tracker = time.perf_counter(), False, None
+    try:
+        limits = RunLimits(config.time_limit, config.memory_limit)
+        tracker = build(config.tracker, "tracker", list(config.packages))
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
+        with run_progress(record.name) as progress:
+            _carry_out(Job(config, folder, record), limits, progress)
+    except KeyboardInterrupt as error:
+        who = str(error) or "stopped by Ctrl-C"
+        record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
+        interrupted = True
+    except Exception as error:  # noqa: BLE001 - an error of the harness: a full disk, an invalid limit
+        record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
+    finally:
+        record.seconds["total"] = time.perf_counter() - started
+        record.ended = now()
+        if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
+            record.log = _last_lines(folder / "log.txt")
+        release(folder)
+        record.write(folder)
+    if tracker is not None:
+        _export(tracker, folder, record)
+    if interrupted:
+        raise Interrupted(folder, record)
+    return record
+
+
+def _carry_out(job: Job, limits: RunLimits, progress: Report) -> None:
+    """Does the job in a child process or, for debugging, in this one, and fills its record with what is known."""
+    if job.config.isolation == Isolation.off:
+        from bench.run.execute import execute  # it imports torch, which otherwise only the child does
+
+        execute(job.config, job.folder, job.record, progress=progress, checkpoint=lambda r: r.write(job.folder))
+        return
+
+    def receive(message: Message) -> None:
+        if isinstance(message, Record):
+            vars(job.record).update(vars(message))
+            job.record.write(job.folder)
+        elif isinstance(message, Step):
+            progress(message.phase, message.done, message.total, message.loss)
+        elif isinstance(message, Notice):
+            notice(message.text)
+
+    ending = run_isolated(job, limits, receive)
+    if ending is not None:
+        job.record.status, job.record.reason = ending.status, ending.reason
+
+
+def _export(tracker: Tracker, folder: Path, record: Record) -> None:
+    """Exports a finished run; a failure becomes a note in the record."""
+    try:
+        tracker.export(folder, read_record(folder))
+    except Exception as error:  # noqa: BLE001 - an error of a server, a database, another library
+        record.notes = [*record.notes, f"not exported to the tracker: {' '.join(str(error).split())}"]
+        record.write(folder)
+
+
+def _new_record(identity: Identity, claim: Claim) -> Record:
+    return Record(
+        claim.folder.name,
+        **identity.choices,
+        seed=identity.config["seed"],
+        config=identity.config,
+        config_hash=identity.config_hash,
+        code=identity.code,
+    )
+
+
+def _last_lines(path: Path) -> list[str]:
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - LAST_BYTES, 0))
+            return file.read(LAST_BYTES).decode("utf-8", "replace").splitlines()[-LAST_LINES:]
+    except OSError:
+        return []

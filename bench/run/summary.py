@@ -1,0 +1,99 @@
+"""Prints the summary of a run or a sweep at its end."""
+
+from collections import Counter
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bench.records.format import count, number, seconds
+from bench.records.record import NOT_RUN, Record, RunStatus
+from bench.run.sweep import Plan
+
+ROWS = (  # metric, its name in the table, factor, which direction is better
+    ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),
+    ("accuracy", "accuracy (x1000)", 1000.0, "lower"),
+    ("completeness", "completeness (x1000)", 1000.0, "lower"),
+    ("fscore", "F-score", 1.0, "higher"),
+    ("normal_consistency", "normal consistency", 1.0, "higher"),
+    ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
+    ("mask_iou", "mask IoU", 1.0, "higher"),
+    ("rotation_error_deg", "rotation error (degrees)", 1.0, "lower"),
+    ("translation_error", "translation error (x1000)", 1000.0, "lower"),
+)
+
+
+def show(folder: Path, record: Record, index: Path) -> None:
+    """Prints the outcome of a run; the last line on standard output is its folder."""
+    console = Console(highlight=False)
+    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}"))
+    for heading in ("", "before", "after", "better"):
+        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
+    for name, label, factor, better in ROWS:
+        if name in record.metrics_start:
+            before, after = record.metrics_start[name], record.metrics.get(name)
+            table.add_row(label, number(before, factor), number(after, factor), better)
+    if table.row_count:
+        console.print(table)
+    elif "recommended_field" in record.metrics:
+        console.print(_candidates(record))
+    elif record.metrics:
+        console.print(_measured(record))
+    if "iterations" in record.evaluations:
+        loop = record.seconds["forward"] + record.seconds["backward"]
+        console.print(
+            f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "
+            f"{count(record.evaluations['value'])} values, {count(record.evaluations['gradient'])} gradients, "
+            f"{number(record.evaluations['per_ray'])} values per ray and iteration"
+        )
+    for note in record.notes:
+        print(f"note: {note}")
+    print(f"report: {index}")
+    if record.reused:
+        print(f"reused: the run of {record.started}; rerun=all runs it again")
+    if record.status != RunStatus.OK and not record.reason.startswith("stopped by"):  # the command line prints that
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"{record.status}: {record.reason}", markup=False)
+    print(folder)
+
+
+def show_sweep(plan: Plan, index: Path) -> list[str]:
+    """Prints the outcome of a sweep, the plan's folder last, and gives the status of every planned cell."""
+    statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]
+    counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
+    print(f"{len(plan.cells)} planned: {counts}")
+    if set(statuses) - {"ok", "unsupported"}:
+        print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
+    print(f"report: {index}")
+    print(plan.folder)
+    return statuses
+
+
+def _candidates(record: Record) -> Table:
+    """The error and costs of each candidate of a capacity run; the recommended one is marked."""
+    from bench.pictures.size_chart import Candidates  # only here: it loads matplotlib, which most commands do not need
+
+    candidates = Candidates.of(record.metrics)
+    half_pixel = number(1000 * candidates.footprint)
+    title = f"{record.task}, {record.name}, {record.scene}; half a pixel is {half_pixel} (x1000)"
+    table = Table(box=box.SIMPLE_HEAD, title=escape(title))
+    for heading in ("", "field", "parameters", "bytes", "FLOPs/query", "error (x1000)", "s.e.", "fit"):
+        table.add_column(heading, justify="left" if heading in ("", "field") else "right", no_wrap=heading == "field")
+    for candidate in candidates.results:
+        numbers = candidate.numbers
+        mark = "=>" if candidate is candidates.chosen else "best" if candidate is candidates.best else ""
+        size = f"{numbers['parameters']:,}", count(numbers["bytes"]), count(numbers["flops_per_query"])
+        error = number(numbers.get("error"), 1000), number(numbers.get("standard_error"), 1000)
+        table.add_row(mark, candidate.label, *size, *error, seconds(numbers["seconds"]))
+    return table
+
+
+def _measured(record: Record) -> Table:
+    """All metrics of a task that measures without optimising."""
+    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene}"))
+    table.add_column("")
+    table.add_column("measured", justify="right")
+    for name, value in record.metrics.items():
+        table.add_row(name, number(value))
+    return table

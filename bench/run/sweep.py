@@ -1,0 +1,171 @@
+"""Plans a sweep before its first cell starts, and prints a line as each cell ends."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from bench.config import check_names
+from bench.progress import display
+from bench.records.files import digest
+from bench.records.format import number, seconds
+from bench.records.identity import identify
+from bench.records.plans import Plan, PlannedCell
+from bench.records.record import row_name
+
+SHOWN = (  # metric, its name in the line of a cell, factor
+    ("recommended_field", "recommended", 1.0),
+    ("chamfer_l2", "Chamfer (x1000)", 1000.0),
+    ("rotation_error_deg", "rotation error (degrees)", 1.0),
+)
+INTERVAL = 0.5  # seconds between two checks of which cells have ended
+
+
+class Refused(BaseException):
+    """A sweep cannot be planned. Not an Exception, since Hydra turns those that callbacks raise into warnings."""
+
+    def __init__(self, why: Exception) -> None:
+        super().__init__(str(why))
+        self.why = why
+
+
+class Sweep:
+    """The sweep that this process drives; `plan` is None where it drives none."""
+
+    plan: Plan | None = None
+    shown = ExitStack()
+
+    @classmethod
+    def start(cls, plan: Plan) -> None:
+        """Writes and keeps the plan, and shows the sweep's progress from now on."""
+        plan.write()
+        cls.plan = plan
+        cls.shown.enter_context(followed(plan))
+
+    @classmethod
+    def end(cls) -> Plan | None:
+        """The plan of the sweep that has ended, if there was one."""
+        cls.shown.close()
+        plan, cls.plan = cls.plan, None
+        return plan
+
+
+class Planner(Callback):
+    """Hydra's callback that writes the plan before a sweep's first cell; see conf/config.yaml."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Plans the sweep and starts to follow it."""
+        try:
+            Sweep.start(make_plan(config))
+        except Exception as error:
+            raise Refused(error) from error
+
+
+def make_plan(config: DictConfig) -> Plan:
+    """All cells of the sweep that the command line describes.
+
+    Raises:
+        HydraException, OmegaConfBaseException: where a cell cannot be composed.
+        ValueError: where the sweep has no cell.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    params = OmegaConf.select(config, "hydra.sweeper.params") or {}
+    cells: list[PlannedCell] = []
+    for cell in combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task]):
+        composed = loader.load_sweep_config(config, cell)
+        plain = _without_hydra(composed)
+        check_names(plain)
+        identity = identify(plain, composed.hydra.runtime)
+        cells.append(
+            PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
+        )
+    if not cells:
+        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
+    first = cells[0].config
+    name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
+    return Plan(name, Path(first["results_dir"]), cells)
+
+
+def combinations(texts: list[str]) -> list[list[str]]:
+    """The overrides of each cell, from those of a sweep, such as `seed=0,1`, in the order in which Hydra runs them.
+
+    This is the only function that uses Hydra's sweeper, which is internal to Hydra.
+    """
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    return BasicSweeper.split_arguments(parser.parse_overrides(texts), None)[0]
+
+
+def _without_hydra(config: DictConfig) -> DictConfig:
+    plain = config.copy()
+    OmegaConf.set_struct(plain, False)
+    del plain["hydra"]
+    return plain
+
+
+@contextmanager
+def followed(plan: Plan) -> Iterator[None]:
+    """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
+
+    On a terminal it also shows how many have ended, how many of them failed, and the time left.
+    """
+    with display() as shown:
+        progress = shown.add_task("sweep", total=len(plan.cells), said="")
+        pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
+
+        common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
+
+        def update() -> None:
+            nonlocal failed
+            for cell in list(pending.values()):
+                if record := plan.record(cell):
+                    del pending[cell.id]
+                    failed += record["status"] != "ok"
+                    differing = " ".join(override for override in cell.overrides if override not in common)
+                    print(line(plan.results_dir / "runs" / cell.id, record, differing), flush=True)
+            shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
+
+        def follow() -> None:
+            while not stop.wait(max(INTERVAL, 1e-3 * len(pending))):
+                update()
+
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+            update()
+            shown.remove_task(progress)
+
+
+def line(folder: Path, record: dict[str, Any], differing: str) -> str:
+    """The outcome of a cell in a line that ends with its folder; `differing` are overrides that not all cells have."""
+    name, spent = row_name(record["config"], record["renderer"]), record["seconds"]
+    loop = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
+    parts = [
+        record["status"] + (" (reused)" if record["reused"] else ""),
+        differing,
+        ", ".join((record["task"], name, record["scene"] or record["dataset"])),
+        seconds(loop),
+    ]
+    known = record["metrics"]
+    parts += [f"{label} {number(known[name], factor)}" for name, label, factor in SHOWN if name in known]
+    if "level" in known:
+        parts.append(breakdown(record))
+    return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)
+
+
+def breakdown(record: dict[str, Any]) -> str:
+    """The breakdown of a run of the stability task, in words."""
+    level, unit = record["metrics"]["level"], record["config"]["task"]["stress"]["sweep"]["unit"]
+    if level is None or 0 <= level <= 1:
+        return f"breaks at {number(record['metrics']['breakdown'])} {unit}"
+    return "breaks at once" if level < 0 else "does not break in the sweep"

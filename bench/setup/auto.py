@@ -1,0 +1,131 @@
+"""Settings of a renderer with the value `auto`: the precision of a pixel, and the number of steps that it takes.
+
+Each follows by an equation from the view and the renderer's other settings: `renderer.epsilon=auto`. The number of
+samples per ray follows from the shape and changes during an optimisation: see `renderers.adaptive_samples`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, inf, isnan, log, radians, sin
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from datasets.views import ViewSampler
+from renderers.adaptive_samples import samples
+from renderers.checks import check_positive
+
+AUTO = "auto"
+RADIUS = 1.0  # of the unit sphere, which holds every shape
+
+
+@dataclass(frozen=True)
+class AutoSettings:
+    """Parameters of the equations.
+
+    Args:
+        grazing: least angle between a ray and a surface, in degrees, at which a ray must still converge.
+    """
+
+    grazing: float
+
+    def __post_init__(self) -> None:
+        check_positive("auto.grazing", self.grazing, "DIST, A.1, takes 10")
+        if self.grazing > 90:
+            raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
+
+
+def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> float:
+    """The footprint; see there."""
+    return footprint(view.focal_length, view.distance)
+
+
+def footprint(focal_length: float, distance: float) -> float:
+    """Half a pixel where the shape may be nearest to the camera (DIST, Eq. 10, at theta = 0), in scene units.
+
+    Args:
+        focal_length: in pixels.
+        distance: of the camera from the origin, in scene units.
+    """
+    check_positive("view.distance - 1", distance - RADIUS, "a pixel's size needs a camera outside of the unit sphere")
+    return half_pixel(focal_length, distance - RADIUS)
+
+
+def half_pixel(focal_length: float, depth: float) -> float:
+    """Half a pixel's width at a depth, on the optical axis (DIST, Eq. 10, at theta = 0), in scene units."""
+    return depth / (2 * focal_length)
+
+
+def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+    """Steps from a unit away to a surface that is met at the grazing angle or any larger one (DIST, Eq. 8).
+
+    A step leaves |1 - alpha sin(theta)| of the distance; for alpha > 1 that grows again towards normal incidence.
+
+    Raises:
+        ValueError: where there is no epsilon to reach, or no number of steps reaches it.
+    """
+    if "epsilon" not in renderer:
+        raise ValueError("renderer.steps=auto needs renderer.epsilon, which this renderer does not have: give a number")
+    alpha, epsilon = float(renderer.get("alpha", 1.0)), float(renderer.epsilon)
+    check_positive("renderer.epsilon", epsilon, "renderer.epsilon=auto is half a pixel")
+    left = max(abs(1 - alpha * sin(radians(settings.grazing))), alpha - 1)
+    if left >= 1:
+        raise ValueError(f"renderer.alpha must lie between 0 and 2, not {alpha:g}: steps of others do not converge")
+    return max(ceil(log(epsilon / RADIUS) / log(left)), 1) if left > 0 else 1
+
+
+def rays_share(least: float, footprint: float, error: float) -> float:
+    """The share of an image's pixels at the resolution whose half pixel equals the current error.
+
+    Pixels need be no finer than the error: DIST, Eq. 10, solved for the resolution, whose square is their number.
+
+    Args:
+        least: smallest share.
+        footprint: half a pixel of the whole image, in scene units.
+        error: in scene units.
+    """
+    if not footprint or isnan(error):
+        return 1.0
+    return min(max((footprint / max(error, footprint)) ** 2, least), 1.0)
+
+
+def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+    """The number of samples per ray before any part of the shape has been seen."""
+    return samples(inf, RADIUS)
+
+
+FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
+    "epsilon": epsilon,
+    "steps": steps,
+    "n_ray_samples": first_samples,
+}
+PIXEL_PRECISION = ("epsilon", "steps")  # that follow from the camera alone
+CHANGING = {"n_ray_samples": ("begins with", "and follows the thinnest part that is seen")}  # during an optimisation
+
+
+def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) -> tuple[DictConfig, list[str]]:
+    """The renderer's node with a number for each `auto`, in the order of `FORMULAS`, and a note on each.
+
+    Raises:
+        ValueError: for `auto` where there is no equation.
+    """
+    values: Any = OmegaConf.to_container(renderer, resolve=True)
+    requested = [name for name, value in values.items() if value == AUTO]
+    for name in requested:
+        if name not in FORMULAS:
+            known = ", ".join(FORMULAS)
+            raise ValueError(f"renderer.{name}=auto has no equation: only {known} have one; give a number")
+    node, notes = OmegaConf.create(values), []
+    for name in [name for name in FORMULAS if name in requested]:
+        node[name] = FORMULAS[name](view, node, settings)
+        seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
+        seen += f", for surfaces met at {settings.grazing:g} degrees or more (auto.grazing)" if name == "steps" else ""
+        verb, reason = CHANGING.get(name, ("is", seen))
+        notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
+    return node, notes
+
+
+def at_pixel_precision(renderer: DictConfig) -> DictConfig:
+    """The renderer's node with `auto` for its settings in `PIXEL_PRECISION`; unchanged where it has no epsilon."""
+    names = [name for name in PIXEL_PRECISION if name in renderer and "epsilon" in renderer]
+    return cast(DictConfig, OmegaConf.merge(renderer, dict.fromkeys(names, AUTO)))

@@ -1,0 +1,163 @@
+"""Builds the objects that a run's configuration describes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, cast, runtime_checkable
+
+import torch
+from omegaconf import DictConfig
+
+from bench.config import EvaluationSettings, build
+from bench.machine.environment import pick_device
+from bench.progress import Report
+from bench.records.record import Record
+from bench.setup.auto import AUTO, at_pixel_precision, resolved
+from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior.store import prior_for, prior_settings
+from datasets.dataset import Dataset, Split
+from datasets.scene import Scene, make_scene, scene_name
+from datasets.views import ViewSampler
+from renderers.adaptive_samples import final_note, follow
+from renderers.field import Field
+from renderers.rendering import Renderer
+
+
+@runtime_checkable
+class UnknownField(Protocol):
+    """The field of a task's unknown shape: a code of the dataset's prior, or another field."""
+
+    @property
+    def of_prior(self) -> bool: ...
+
+    @property
+    def models(self) -> Any:
+        """The fields to choose from, `bench.models.candidates.ModelSettings`."""
+        ...
+
+    def solve(self, task: Any, run: "RunContext") -> None:
+        """Executes a task whose unknown is a shape."""
+        ...
+
+    def known_shape(self, run: "RunContext", weights: Any, otherwise: Callable[[], Field]) -> Field:
+        """The scene's true shape, for a task with another unknown; that of `otherwise` where none is fitted."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What a run works with."""
+
+    renderer: Renderer
+    views: ViewSampler
+    scene_name: str
+    make_scene: Callable[[], Scene]
+    make_prior: Callable[[], Prior]
+    evaluation: EvaluationSettings
+    seed: int
+    device: torch.device
+    cache: Path  # folder of priors and references
+    notes: tuple[str, ...] = ()  # on settings with the value `auto`
+    make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
+    field: UnknownField | None = None  # what an unknown shape is made of
+    trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene, made at its first use: not every task needs one."""
+        return self.make_scene()
+
+    @cached_property
+    def pixel_precise(self) -> tuple[Renderer, list[str]]:
+        """The renderer at pixel precision, with no more steps than that takes, and notes on these settings."""
+        return (self.renderer, []) if self.make_pixel_precise is None else self.make_pixel_precise()
+
+    @property
+    def last_notes(self) -> list[str]:
+        """Notes at the end of a run: repairs of the scene's mesh, if it was made, and the final number of samples."""
+        repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
+        return [*repairs, *final_note(self.renderer)]
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior of the dataset, loaded or trained at its first use: not every task needs one."""
+        with torch.random.fork_rng():  # training a prior must not change later random draws
+            return self.make_prior()
+
+    def fitted(self) -> Prior:
+        """The prior with the code of the scene's shape alone.
+
+        Raises:
+            ValueError: where the prior was not trained on that shape.
+        """
+        if self.trained is None:
+            raise ValueError("task renders a network at a shape it was fitted to: add +experiment=fitted")
+        return Prior(self.prior.decoder, self.prior.codes[self.trained : self.trained + 1])
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """A run in progress: its inputs, its folder, its record, which is filled as it goes, and its progress report."""
+
+    inputs: RunInputs
+    folder: Path
+    record: Record
+    progress: Report
+
+
+def set_up(config: DictConfig, progress: Report) -> RunInputs:
+    """Builds everything that a configuration names, and checks all of it before the first slow step.
+
+    Raises:
+        ValueError: for anything invalid in it.
+    """
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    device = pick_device(config.device)
+    views = build(config.view, "view", target="datasets.views.ViewSampler")
+    renderer, notes = _renderer(config, config.renderer, views)
+    dataset = cast(Dataset, build(config.dataset, "dataset", list(config.packages)))
+    evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
+    settings = prior_settings(config)
+    cache = Path(config.priors_dir)
+    torch.manual_seed(config.seed)
+    trained = config.index if config.split == Split.TRAIN and config.index < settings.shapes else None
+
+    def shape_and_view() -> Scene:
+        return make_scene(dataset, views, split=Split(config.split), index=config.index)
+
+    def make_prior() -> Prior:
+        return prior_for(dataset, settings, cache, device, progress)
+
+    return RunInputs(
+        renderer=renderer,
+        views=views,
+        scene_name=scene_name(dataset, Split(config.split), config.index),
+        make_pixel_precise=lambda: _renderer(config, at_pixel_precision(config.renderer), views),
+        make_scene=shape_and_view,
+        make_prior=make_prior,
+        evaluation=evaluation,
+        seed=config.seed,
+        device=device,
+        cache=cache,
+        notes=tuple(notes),
+        trained=trained,
+    )
+
+
+def _renderer(config: DictConfig, requested: DictConfig, views: ViewSampler) -> tuple[Renderer, list[str]]:
+    """A renderer from its node, with a number for each `auto`, and notes on these."""
+    auto = build(config.auto, "auto", target="bench.setup.auto.AutoSettings")
+    node, notes = resolved(requested, views, auto)
+    renderer = build(node, "renderer", list(config.packages))
+    if not isinstance(renderer, Renderer):
+        name = type(renderer).__name__
+        raise ValueError(f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py")
+    if requested.get("n_ray_samples") != AUTO:
+        return renderer, notes
+    if config.stress is not None:
+        raise ValueError(
+            "renderer.n_ray_samples=auto follows one optimisation, and a stress has many trials: give a number"
+        )
+    return follow(renderer), notes

@@ -1,0 +1,212 @@
+"""Shape priors: an auto-decoder (DeepSDF, Sec. 4) trained on the training split of a dataset."""
+
+from dataclasses import asdict, dataclass
+from math import cos, pi, sqrt
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bench.progress import Report
+from datasets.dataset import Dataset, Split
+from datasets.mesh import Mesh
+from datasets.truth import Truth, sample_surface
+from renderers.checks import check_at_least, check_positive
+from renderers.fields.mlp import Decoder
+
+NEAR, AROUND = 0.01, 0.08  # standard deviations, in scene units, of half and of a third of the samples
+RADIUS = 1.1  # scene units, of the sphere that the other samples fill: rays start on the unit sphere
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """The decoder's size; see `renderers.fields.mlp.Decoder`."""
+
+    layers: int
+    width: int
+    code_length: int
+    skip: int
+    narrow: bool
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """How a prior is trained.
+
+    Args:
+        network: the decoder's size.
+        shapes: number of training shapes.
+        samples: signed distances per shape.
+        steps: optimiser steps, each on `shapes_per_step` shapes and `points_per_step` points of each.
+        learning_rate: at the start; it falls to zero along a cosine.
+        beta2: of Adam.
+        code_sigma: standard deviation of the initial codes.
+        code_penalty: weight of the mean squared length of the codes.
+        surface_width: errors are weighted by w / (w + |distance|), which is largest at the surface; w in scene units.
+        seed: of samples, codes, weights and batches.
+    """
+
+    network: NetworkSettings
+    shapes: int
+    samples: int
+    steps: int
+    shapes_per_step: int
+    points_per_step: int
+    learning_rate: float
+    beta2: float
+    code_sigma: float
+    code_penalty: float
+    surface_width: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        for name in ("shapes", "samples", "steps", "shapes_per_step", "points_per_step"):
+            check_at_least(f"prior.{name}", getattr(self, name), 1, "conf/prior holds values that work")
+        check_positive("prior.learning_rate", self.learning_rate, "5e-3 works")
+        check_positive("prior.surface_width", self.surface_width, "0.05 works")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A decoder whose codes are shapes, and the codes of its training shapes. Code zero is the mean shape."""
+
+    decoder: Decoder
+    codes: Float[Tensor, "shapes code_length"]
+
+
+@dataclass(frozen=True)
+class DistanceSamples:
+    """Signed distances of some shapes."""
+
+    points: Float[Tensor, "shapes samples 3"]
+    distances: Float[Tensor, "shapes samples"]
+
+    def first(self, count: int) -> "DistanceSamples":
+        """The samples of the first shapes."""
+        return DistanceSamples(self.points[:count], self.distances[:count])
+
+    def to(self, device: torch.device) -> "DistanceSamples":
+        """The same samples on a device."""
+        return DistanceSamples(self.points.to(device), self.distances.to(device))
+
+
+def distance_samples(
+    dataset: Dataset, split: Split, settings: PriorSettings, shapes: int, progress: Report
+) -> DistanceSamples:
+    """Samples the signed distances of the first shapes of a split, mostly near their surfaces.
+
+    Distances are those of the mesh, not of a formula: smooth unions and sheared parts have none.
+    """
+    points, distances = [], []
+    for index in range(shapes):
+        where, distance = sample_distances(dataset.mesh(split, index), settings.samples, settings.seed + index)
+        points.append(where)
+        distances.append(distance)
+        progress(f"sampling {split} shapes", index + 1, shapes)
+    return DistanceSamples(torch.stack(points), torch.stack(distances))
+
+
+def sample_distances(mesh: Mesh, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, " count"]]:
+    """Points mostly near a mesh's surface, and their signed distances, in scene units."""
+    where = _sample_points(mesh, count, seed)
+    return torch.from_numpy(where.astype(np.float32)), torch.from_numpy(Truth(mesh).signed_distance(where))
+
+
+def near_surface_first(
+    error: Float[Tensor, "*batch"], distance: Float[Tensor, "*batch"], width: float
+) -> Float[Tensor, "*batch"]:
+    """Errors weighted by width / (width + |distance|), which is largest at the surface."""
+    return error * width / (width + distance.abs())
+
+
+def train(samples: DistanceSamples, settings: PriorSettings, device: torch.device, progress: Report) -> Prior:
+    """Fits the decoder and a code for each shape together (DeepSDF, Sec. 4.2, without its clamp)."""
+    torch.manual_seed(settings.seed)
+    decoder = Decoder(**asdict(settings.network))
+    initialise_to_sphere(decoder, radius=0.5)
+    codes = settings.code_sigma * torch.randn(len(samples.points), settings.network.code_length)
+    decoder, codes, samples = decoder.to(device), nn.Parameter(codes.to(device)), samples.to(device)
+    optimiser = torch.optim.Adam(
+        [*decoder.parameters(), codes], lr=settings.learning_rate, betas=(0.9, settings.beta2), fused=True
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimiser, lambda step: 0.5 * (1 + cos(pi * min(step / settings.steps, 1.0)))
+    )
+    shapes, count = samples.distances.shape
+    rows = min(settings.shapes_per_step, shapes)
+    for step in range(settings.steps):
+        chosen = torch.randperm(shapes, device=device)[:rows]
+        picked = torch.randint(count, (rows, settings.points_per_step), device=device)
+        points, distances = samples.points[chosen[:, None], picked], samples.distances[chosen[:, None], picked]
+        error = (decoder.at(codes[chosen])(points) - distances).abs()
+        weighted = near_surface_first(error, distances, settings.surface_width)
+        loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if step % 50 == 0 or step + 1 == settings.steps:
+            progress("training the prior", step + 1, settings.steps, loss.item())
+    return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
+
+
+def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 400, near: float = 0.02) -> float:
+    """Mean error of the distance within `near` of the surface, with codes fitted to the samples from zero.
+
+    Args:
+        decoder: not changed.
+        samples: of any shapes, in training or not.
+        steps: of Adam; 0 evaluates the mean shape.
+        near: in scene units, as the result.
+    """
+    shapes, count = samples.distances.shape
+    codes = torch.zeros(shapes, decoder.code_length, requires_grad=True)
+    optimiser = torch.optim.Adam([codes], lr=1e-2)
+    rows = torch.arange(shapes)[:, None]
+    for _ in range(steps):
+        picked = torch.randint(count, (shapes, min(count, 2000)))
+        error = (decoder.at(codes)(samples.points[rows, picked]) - samples.distances[rows, picked]).abs()
+        optimiser.zero_grad()
+        error.mean().backward()
+        optimiser.step()
+    return surface_error(decoder, codes, samples, near=near)
+
+
+@torch.no_grad()
+def surface_error(
+    decoder: Decoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples, *, near: float = 0.02
+) -> float:
+    """Mean error of the distance within `near` of the surface, in scene units, at the codes of the samples' shapes."""
+    errors = []
+    for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
+        close = distances.abs() < near
+        errors.append((decoder.at(code)(points[close]) - distances[close]).abs())
+    return torch.cat(errors).mean().item()
+
+
+@torch.no_grad()
+def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
+    """Sets the weights so that the field begins near the distance of a sphere (SAL, Atzmon and Lipman 2020)."""
+    for index, layer in enumerate(decoder.hidden):
+        assert isinstance(layer, nn.Linear)
+        nn.init.normal_(layer.weight, 0.0, sqrt(2.0 / layer.out_features))
+        nn.init.zeros_(layer.bias)
+        if index == 0:
+            nn.init.normal_(layer.weight[:, :-3], 0.0, 1.0 / sqrt(layer.out_features))
+        elif index == decoder.skip:
+            layer.weight[:, -3:] = 0.0
+    nn.init.normal_(decoder.last.weight, sqrt(pi / decoder.width), 1e-4)
+    nn.init.constant_(decoder.last.bias, -radius)
+
+
+def _sample_points(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
+    """Half of the points close to the surface, a third farther from it, the rest anywhere in a sphere."""
+    generator = np.random.default_rng(seed)
+    near, around = count // 2, count // 3
+    surface, _ = sample_surface(mesh, near + around, seed)
+    sigma = np.repeat([NEAR, AROUND], [near, around])[:, None]
+    around_surface = surface + sigma * generator.standard_normal(surface.shape)
+    free = generator.standard_normal((count - near - around, 3))
+    free *= RADIUS * generator.random((len(free), 1)) ** (1 / 3) / np.linalg.norm(free, axis=1, keepdims=True)
+    return np.concatenate([around_surface, free])

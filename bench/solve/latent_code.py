@@ -1,0 +1,170 @@
+"""An inverse problem whose unknown is a prior's code, with any loss."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
+from bench.evaluate.metrics import DEFINITIONS
+from bench.pictures.run_figures import Given
+from bench.pictures.views import draw_run
+from bench.setup.inputs import RunInputs
+from bench.shape_prior.autodecoder import Prior
+from bench.solve.problem import NotReached
+from bench.solve.starts import Starts, StartSettings
+from renderers.checks import check_at_least, check_choice
+from renderers.field import Counts, Field, Meter
+from renderers.fields.mlp import Decoder
+from renderers.fields.moved import Moved
+
+Terms = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class CodePenalty:
+    """The penalty of a code (DeepSDF, Eq. 10; DIST, B.4).
+
+    Args:
+        weight: of the squared entries.
+        average: "sum" of the squares, or "mean".
+    """
+
+    weight: float
+    average: str
+
+    def __post_init__(self) -> None:
+        check_at_least("task.code.weight", self.weight, 0, "0 switches the term off")
+        check_choice("task.code.average", self.average, ("sum", "mean"))
+
+    def __call__(self, code: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+        """The weighted penalty."""
+        squares = code.square()
+        return self.weight * (squares.sum() if self.average == "sum" else squares.mean())
+
+
+@dataclass
+class CodeProblem:
+    """The problem of finding a code, and a similarity where one is given. The loss is `compare` plus the penalty."""
+
+    decoder: Decoder
+    penalty: CodePenalty
+    compare: Callable[[Field, int], Terms]  # of the counted field and the iteration, to weighted terms
+    observed: Bool[Tensor, "height width"]
+    rays_per_iteration: int
+    codes: list[Float[Tensor, " code_length"]]  # one per start
+    similarities: list[Float[Tensor, "7"]]  # one per start, or none: see `renderers.fields.moved.Moved`
+    starts: Starts
+    photographs: Float[np.ndarray, "views height width 3"] | None = None  # the given ones, for pictures
+    judged_at: int | None = None  # iteration at which the first and the last loss are evaluated; None: each at its own
+    counts: Counts = field(default_factory=Counts)
+
+    definitions: ClassVar[dict[str, str]] = DEFINITIONS
+    tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The codes and similarities that the optimiser changes."""
+        return [*self.codes, *self.similarities]
+
+    @property
+    def code(self) -> Float[Tensor, " code_length"]:
+        """The current code."""
+        return self.codes[self.starts.best()]
+
+    @property
+    def similarity(self) -> Float[Tensor, "7"] | None:
+        """The current similarity, where it is optimised."""
+        return self.similarities[self.starts.best()].detach() if self.similarities else None
+
+    def field(self) -> Field:
+        """The current shape."""
+        shape = self.decoder.at(self.code.detach())
+        return shape if self.similarity is None else Moved(shape, self.similarity)
+
+    def frame(self) -> tuple[Field, None]:
+        """The current shape, seen by the scene's camera."""
+        return self.field(), None
+
+    def evaluate(self, inputs: RunInputs) -> Evaluation:
+        """The current shape against the truth."""
+        return evaluate(self.field(), inputs)
+
+    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+        """The Chamfer distance of the current shape."""
+        return chamfer_only(self.field(), inputs)
+
+    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+        """Writes the pictures of the run; see `bench.solve.problem.Problem`."""
+        given = Given(inputs.scene.view, self.observed.cpu().numpy(), self.photographs)
+        draw_run(folder, inputs, (first, self.field()), given, curve, title)
+
+    def loss(self, iteration: int) -> Terms:
+        """The terms and their sum."""
+        start, step = self.starts.turn(iteration)
+        penalty = {"code": self.penalty(self.codes[start])}
+        try:
+            terms = self.compare(Meter(self._shape(start), self.counts), step) | penalty
+        except NotReached:
+            if not self.starts.give_up(start, step):
+                raise
+            return {"total": penalty["code"], **penalty}
+        total = torch.stack(list(terms.values())).sum()
+        self.starts.note(start, step, total)
+        return {"total": total, **terms}
+
+    @torch.no_grad()
+    def objective(self) -> float | None:
+        """The current loss, at iteration `judged_at`, not counted; None where that is not set."""
+        if self.judged_at is None:
+            return None
+        best = self.starts.best()
+        terms = self.compare(self._shape(best), self.judged_at)
+        return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
+
+    def _shape(self, start: int) -> Field:
+        shape: Field = self.decoder.at(self.codes[start])
+        return Moved(shape, self.similarities[start]) if self.similarities else shape
+
+
+def code_problem(
+    prior: Prior,
+    penalty: CodePenalty,
+    compare: Callable[[Field, int], Terms],
+    *,
+    observed: Bool[Tensor, "height width"],
+    rays: int,
+    device: torch.device,
+    codes: Float[Tensor, "starts code_length"] | None = None,
+    similarities: Float[Tensor, "starts 7"] | None = None,
+    trial: int = 1,
+) -> CodeProblem:
+    """The problem of finding a prior's code.
+
+    Args:
+        rays: number in an iteration.
+        codes: initial ones; None is code zero, the mean shape.
+        similarities: initial ones; None keeps the shape in place.
+        trial: see `bench.solve.starts.StartSettings`.
+    """
+    decoder = prior.decoder.to(device).requires_grad_(False)
+    first = torch.zeros(1, decoder.code_length) if codes is None else codes
+    return CodeProblem(
+        decoder,
+        penalty,
+        compare,
+        observed.to(device),
+        rays,
+        _free(first, device),
+        [] if similarities is None else _free(similarities, device),
+        Starts(StartSettings(len(first), trial)),
+    )
+
+
+def _free(rows: Float[Tensor, "starts n"], device: torch.device) -> list[Float[Tensor, " n"]]:
+    return [row.clone().to(device).requires_grad_() for row in rows]

@@ -1,0 +1,77 @@
+"""The observations of a view or of some rays, depths and a mask, and the loss that compares a field with them."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bench.solve.latent_code import Terms
+from datasets.scene import View
+from renderers.boundary import rendered, silhouette_loss
+from renderers.camera import Rays
+from renderers.field import Field
+from renderers.rendering import Renderer, at_iteration
+
+
+@runtime_checkable
+class Weights(Protocol):
+    """The weights of the terms of a view's loss."""
+
+    @property
+    def depth_weight(self) -> float: ...
+
+    @property
+    def silhouette_weight(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class GivenView:
+    """The observations of a view, or of rays of any leading shape; `compare` renders a field and compares it."""
+
+    settings: Weights
+    renderer: Renderer
+    rays: Rays
+    depth: Float[Tensor, "*rays"]
+    depth_of_distance: Float[Tensor, "*rays"]  # depth at distance 1, the cosine of DIST, Eq. 2
+    observed: Bool[Tensor, "*rays"]
+    mask: Bool[Tensor, "*rays"] | None
+
+    @staticmethod
+    def of(
+        view: View,
+        settings: Weights,
+        renderer: Renderer,
+        *,
+        observed: Bool[Tensor, "height width"],
+        mask: Bool[Tensor, "height width"] | None,
+        device: torch.device,
+    ) -> "GivenView":
+        """The observations that `observed` and `mask` select from a view, on a device."""
+        return GivenView(
+            settings=settings,
+            renderer=renderer,
+            rays=view.camera.rays().to(device),
+            depth=view.depth.to(device),
+            depth_of_distance=view.camera.depth(torch.ones(view.depth.shape)).to(device),
+            observed=observed.to(device),
+            mask=None if mask is None else mask.to(device),
+        )
+
+    def some(self, rays: Int[Tensor, " n"]) -> "GivenView":
+        """The observations of some rays of one row."""
+        parts = {name: getattr(self, name)[rays] for name in ("rays", "depth", "depth_of_distance", "observed")}
+        return replace(self, **parts, mask=None if self.mask is None else self.mask[rays])
+
+    def compare(self, field: Field, iteration: int) -> Terms:
+        """The weighted terms of DIST, Eq. 5, with the weights of B.4."""
+        renderer = at_iteration(self.renderer, iteration)
+        rendering = rendered(renderer, field, self.rays)
+        compared = self.observed & rendering.hit
+        error = (rendering.distance * self.depth_of_distance - self.depth).abs()
+        terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
+        if self.mask is not None:
+            silhouette = silhouette_loss(renderer, field, self.rays, rendering, self.mask)
+            terms["silhouette"] = self.settings.silhouette_weight * silhouette
+        return terms

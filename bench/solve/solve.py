@@ -1,0 +1,177 @@
+"""Solves an inverse problem: evaluates, optimises, evaluates again, and draws."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from bench.evaluate.evaluate import Evaluation
+from bench.evaluate.metrics import DEFINITIONS
+from bench.pictures.filmstrip import Filmstrip
+from bench.records.files import curve_file
+from bench.records.record import Record, RunStatus
+from bench.setup.inputs import RunContext
+from bench.solve.optimise import History, optimise
+from bench.solve.problem import InverseTask, NotReached, OptimiserSettings, Problem, check_kind
+
+COSTS = {
+    "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
+    "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
+    "evaluations.observed": "pixels whose depth was given",
+    "evaluations.per_ray": "value evaluations divided by rays times iterations",
+    "seconds.warmup": "one step's forward and backward pass before the clock starts; its evaluations are not counted",
+    "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
+    "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
+    "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
+    "seconds.total": "the whole run, including making or loading shapes and prior",
+    "peak_memory_bytes": "highest rise, during the loop, of the process's resident memory (CPU) or PyTorch's (GPU)",
+    "flops": "evaluations times the field's operations per evaluation",
+    "gemm_fraction": "flops over the loop's seconds, divided by the machine's best float32 matrix product rate",
+}
+
+
+def solve(problem: Problem, settings: OptimiserSettings, run: RunContext) -> None:
+    """Solves a problem, and fills the run's record and folder.
+
+    Raises:
+        Unsupported: where the renderer cannot do what the problem's field needs.
+    """
+    inputs, record = run.inputs, run.record
+    record.definitions = problem.definitions | COSTS
+    first = problem.field()
+    check_kind(inputs.renderer, first)
+    clock = time.perf_counter()
+    before = problem.evaluate(inputs)
+    record.metrics_start, record.seconds["evaluation"] = before.metrics, time.perf_counter() - clock
+    filmstrip = Filmstrip(inputs)
+
+    def errors_at(iteration: int) -> dict[str, float]:
+        filmstrip.add(iteration, *problem.frame())
+        return problem.checkpoint(inputs) if iteration else {name: before.metrics[name] for name in problem.tracked}
+
+    history = descend(problem, settings, run, errors_at)
+    clock = time.perf_counter()
+    after = problem.evaluate(inputs)
+    note_result(run, replace(after, failure=failure_of(history, after)))
+    filmstrip.add(len(history.curve), *problem.frame())
+    draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
+    record.seconds["evaluation"] += time.perf_counter() - clock
+
+
+def solve_task(task: InverseTask, run: RunContext) -> Problem:
+    """Solves a task's inverse problem, and gives it in its final state."""
+    inputs = run.inputs
+    run.record.definitions = DEFINITIONS | COSTS  # also of a run that ends before it has a problem
+    problem = task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
+    solve(problem, task.optimiser, run)
+    return problem
+
+
+def note_result(run: RunContext, after: Evaluation) -> None:
+    """Notes the result in the record, and writes its mesh."""
+    record = run.record
+    record.metrics = after.metrics
+    record.status, record.reason = after.failure or (RunStatus.OK, "")
+    record.notes = [*record.notes, *after.notes]
+    if after.mesh is not None:
+        after.mesh.save(run.folder / "mesh.ply")
+
+
+def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Filmstrip) -> None:
+    """Writes pictures and filmstrip of a run whose result is noted.
+
+    Args:
+        run: its folder is filled.
+        draw_pictures: writes the pictures under a title; not called where pictures are off.
+        filmstrip: with all frames.
+    """
+    record = run.record
+    title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
+    if run.inputs.evaluation.picture is not None:
+        draw_pictures(title)
+    filmstrip.save(run.folder, title)
+
+
+def descend(
+    problem: Problem, settings: OptimiserSettings, run: RunContext, errors_at: Callable[[int], dict[str, float]]
+) -> History:
+    """Runs the optimisation loop; writes its curve line by line, and its costs to the record, also if it is stopped.
+
+    Args:
+        problem: that is solved.
+        settings: iterations and learning rate.
+        run: its record is filled.
+        errors_at: gives the errors of the current state before an iteration, outside the timed part. A line has the
+            loss before its step; its errors are of the same parameters.
+    """
+    history = History()
+    checkpoints = run.inputs.evaluation.checkpoints(settings.iterations)
+    known: dict[int, dict[str, float]] = {}
+    run.record.seconds.setdefault("evaluation", 0.0)
+
+    def check(iteration: int) -> None:
+        clock = time.perf_counter()
+        known[iteration] = errors_at(iteration)
+        run.record.seconds["evaluation"] += time.perf_counter() - clock
+
+    def note_objective() -> None:
+        if (value := problem.objective()) is not None:
+            history.objectives.append(value)
+
+    with curve_file(run.folder) as write_line:
+
+        def on_step(line: dict[str, Any]) -> None:
+            line |= known.get(line["iteration"], {})
+            write_line(line)
+            if history.status is RunStatus.OK and line["iteration"] + 1 in checkpoints:
+                check(line["iteration"] + 1)
+            run.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
+
+        if checkpoints:
+            check(0)
+        try:
+            note_objective()
+            optimise(problem, settings, run.inputs.device, history=history, on_step=on_step)
+            note_objective()
+        except NotReached as error:
+            history.status, history.reason = RunStatus.NOT_REACHED, str(error)
+        finally:
+            _note_history(run.record, problem, history)
+    return history
+
+
+def note_costs(record: Record, *, seconds: dict[str, float], flops: int | None, evaluations: dict[str, float]) -> None:
+    """Notes a loop's costs in the record; `seconds` has "forward" and "backward"."""
+    record.seconds |= seconds
+    record.flops, record.evaluations = flops, evaluations
+    loop = seconds["forward"] + seconds["backward"]
+    if flops is not None and loop > 0:
+        record.gemm_fraction = flops / loop / record.environment["gemm_peak_flops"]
+
+
+def _note_history(record: Record, problem: Problem, history: History) -> None:
+    """Notes the costs of a loop, also of one that was stopped."""
+    iterations = max(len(history.curve), 1)
+    evaluations = {
+        "value": history.counts.value,
+        "gradient": history.counts.gradient,
+        "per_ray": history.counts.value / problem.rays_per_iteration / iterations,
+        "rays_per_iteration": problem.rays_per_iteration,
+        "observed": int(problem.observed.sum()),
+        "iterations": len(history.curve),
+    }
+    record.peak_memory_bytes = history.peak_memory_bytes
+    flops = history.counts.flops(problem.field())
+    note_costs(record, seconds=history.seconds, flops=flops, evaluations=evaluations)
+
+
+def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | None:
+    """Why a run failed, or None: decided by its loss or a field without a surface, never by the truth."""
+    if history.status is not RunStatus.OK:
+        return history.status, history.reason
+    if after.failure is not None:
+        return after.failure
+    first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
+    if last >= first and len(history.curve) > 1:
+        return RunStatus.NOT_REACHED, f"the loss did not fall: {first:.4g} at the start, {last:.4g} at the end"
+    return None

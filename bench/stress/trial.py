@@ -1,0 +1,113 @@
+"""Trials of a stress test: their conditions, the criteria of success, and their outcomes."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import torch
+
+from bench.machine.limits import Limits
+from bench.solve.problem import OptimiserSettings
+from renderers.checks import check_at_least, check_positive, check_share
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """The criteria of success.
+
+    Args:
+        hits: least share of the true hits that must be found within the pixel's footprint.
+        false_hits: largest number of spurious hits over true ones; over all rays where there are no true ones.
+        cosine: least cosine between the gradient and the true one.
+        scale: largest relative error of its length.
+        surface_error: largest mean distance from the true surface to the fitted one, in scene units.
+    """
+
+    hits: float
+    false_hits: float
+    cosine: float
+    scale: float
+    surface_error: float
+
+    def __post_init__(self) -> None:
+        for name in ("hits", "cosine"):
+            check_share(f"task.criteria.{name}", getattr(self, name), "0.99 is strict")
+        for name in ("false_hits", "scale", "surface_error"):
+            check_positive(f"task.criteria.{name}", getattr(self, name), "0.01 is strict")
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The fit of a stress test with measure=fit.
+
+    Args:
+        resolution: height and width of its image, in pixels.
+        iterations, learning_rate: of Adam; the rate falls to zero along half a cosine.
+        depth_weight, silhouette_weight: as in completion.
+        offset: of the sphere's centre at the start, in scene units.
+    """
+
+    resolution: int
+    iterations: int
+    learning_rate: float
+    depth_weight: float
+    silhouette_weight: float
+    offset: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.fit.resolution", self.resolution, 4, "32 suits a sphere")
+        check_positive("task.fit.offset", self.offset, "0.1 is an easy start")
+        OptimiserSettings(self.iterations, self.learning_rate, "cosine")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The conditions of all trials: W of a W x W rendering, the fit, criteria of success, limits, and the device."""
+
+    resolution: int
+    fit: FitSettings
+    criteria: Criteria
+    limits: Limits
+    device: torch.device
+
+
+class Failure(StrEnum):
+    """How a trial failed; NONE for a success."""
+
+    NONE = ""
+    LOST = "lost"
+    FALSE = "false"
+    WRONG = "wrong surface"
+    NAN = "nan"
+    SIGN = "gradient sign"
+    DIRECTION = "gradient direction"
+    SCALE = "gradient scale"
+    DIVERGED = "diverged"
+    NOT_REACHED = "not reached"
+    TIMEOUT = "timeout"
+    OOM = "out of memory"
+    CRASHED = "crashed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a trial: its failure, numbers, images [height, width] of rendering and truth, an error message."""
+
+    failure: Failure
+    numbers: dict[str, float] = field(default_factory=dict)
+    images: dict[str, np.ndarray] = field(default_factory=dict)
+    message: str = ""
+
+    @property
+    def success(self) -> bool:
+        """Whether the trial succeeded."""
+        return self.failure is Failure.NONE
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial of a search: its level from 0 to 1, its severity, and its outcome."""
+
+    level: float
+    severity: float
+    outcome: Outcome

@@ -1,0 +1,433 @@
+"""Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import trimesh
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, load, register, renamed
+from bench.records.rows import register_rows
+from bench.tasks.task import Task
+from datasets.dataset import Dataset
+from renderers import DIST, DVR, Naive
+from renderers.rendering import Renderer
+
+IDR_ARGUMENTS = {
+    "steps": 7,
+    "epsilon": 1e-4,
+    "least_slope": 1e-3,
+    "mask_sharpness": 50.0,
+    "mask_weight": 100.0,
+    "sphere_radius": 1.0,
+}
+YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
+GROUPS = [(group, name) for group, name in YAMLS if group != "experiment"]
+EXPERIMENTS = [name for group, name in YAMLS if group == "experiment" and not name.startswith("_")]
+SINGLE = {"completion_paper", "fitted"}  # of one run, and without a table or figure of their own
+# The table or figure of an experiment, where it has another name: one that joins several experiments.
+JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
+SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
+COMPARING = {"table1": 12, "fig4": 6, "fig5": 7, "stability": 12, "gradients": 4, "speed_accuracy": 20}  # renderers
+KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset}
+TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
+PARTS = ("task", "renderer", "dataset", "prior")
+# What a choice needs on the command line.
+NEEDS = {
+    "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
+    "stability": ("stress=wires",),
+}
+
+
+def composed_with_hydra(*overrides: str) -> DictConfig:
+    """The configuration with Hydra's own node, which says what an experiment sweeps over."""
+    register()
+    register_rows()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+@cache
+def composed_alone(override: str) -> DictConfig:
+    """The default configuration with one choice, without Hydra's own node: only to be read."""
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=[override])
+
+
+def swept(name: str) -> dict[str, str]:
+    """What an experiment sweeps over at desk scale."""
+    params = composed_with_hydra(f"+experiment={name}").hydra.sweeper.get("params") or {}
+    return {key: str(values) for key, values in params.items()}
+
+
+def values_of(key: str, values: str) -> list[str]:
+    """The values of a swept key, in its own words or by a glob over its group."""
+    if not values.startswith("glob(*"):
+        return values.split(",")
+    return sorted(n for group, n in YAMLS if group == key.removeprefix("+") and f"exclude={n}" not in values)
+
+
+SWEEPS = [
+    (name, f"{key}={value}")
+    for name in EXPERIMENTS
+    for key, values in swept(name).items()
+    for value in values_of(key, values)
+]
+
+
+@pytest.fixture
+def mesh_path(tmp_path) -> str:
+    path = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    return str(path)
+
+
+def build_part(config: DictConfig, part: str):
+    return build(config[part], part, list(config.packages), TARGETS.get(part, ""))
+
+
+def test_no_yaml_lies_where_it_is_not_looked_for():
+    assert {path.relative_to(CONF) for path in CONF.rglob("*.yaml")} == {
+        path.relative_to(CONF)
+        for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"), *CONF.glob("hydra/launcher/*.yaml"))
+    }
+    assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
+    chosen = {"task", "renderer", "dataset", "prior", "scale", "stress", "tracker"}
+    assert {group for group, _ in YAMLS} == {*chosen, "experiment", "method"}
+
+
+def test_the_default_configuration_builds(compose_config):
+    config = compose_config()
+    for part in PARTS:
+        build_part(config, part)
+    build(config.view, "view", target="datasets.views.ViewSampler")
+    build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
+
+
+@pytest.mark.parametrize(("group", "name"), GROUPS)
+def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
+    extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
+    new = "+" if group == "method" else ""  # none is chosen by default
+    config = compose_config(f"{new}{group}={name}", *extra)
+    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    for part in PARTS:  # a scale is read by the others
+        build_part(config, part)
+    build(config.view, "view", target="datasets.views.ViewSampler")
+    if group in KINDS:
+        assert isinstance(build_part(config, group), KINDS[group])
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
+    for extra in ([], ["scale=paper", "dataset=mesh", f"dataset.path={mesh_path}"]):
+        config = compose_config(f"+experiment={name}", *extra)
+        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        for part in PARTS:
+            build_part(config, part)
+        assert config.experiment == (None if name in SINGLE else JOINED.get(name, name))
+
+
+@pytest.mark.parametrize(("name", "swept"), SWEEPS)
+def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
+    rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
+    method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
+    config = compose_config(*method, swept, f"+experiment={name}")
+    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    for part in PARTS:
+        build_part(config, part)
+    assert config.experiment == JOINED.get(name, name)
+    key, _, value = swept.removeprefix("+").partition("=")
+    if key == "dataset":
+        assert config.dataset.name == value
+    elif key == "stress":
+        assert build_part(config, "task").stress.scene == OmegaConf.load(CONF / f"stress/{value}.yaml").scene
+    elif key in ("renderer", "method"):
+        alone = composed_alone(swept)
+        config = compose_config(*method, swept, f"+experiment={name}")  # a sweep has them so
+        assert config.label == alone.label
+        assert build_part(config, "renderer") == build_part(alone, "renderer")
+        if key == "method":
+            assert config.task._target_ == alone.task._target_
+            own = OmegaConf.load(CONF / f"method/{value}.yaml").get("view")
+            assert own is None or config.view.resolution == alone.view.resolution
+    else:
+        found = OmegaConf.select(config, key)
+        assert found == type(found)(value)
+
+
+def test_every_sweep_is_of_more_than_one_cell_and_repeats_none():
+    assert {name for name, _ in SWEEPS} == {*EXPERIMENTS} - SINGLE
+    assert len(set(SWEEPS)) == len(SWEEPS)
+
+
+PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2) and nothing of ours
+    steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=True,
+    careful_split=False,
+    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=False,
+    silhouette_average="all",
+)  # fmt: skip
+FIRST = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
+    steps=50, epsilon=5e-5, gradient="unrolled", n_gradient_samples=None, serial=True, sphere_radius=1.0,
+    silhouette_signed=False, silhouette_average="all",
+)  # fmt: skip
+TABLE1 = {  # each row of the paper adds one thing to the row before
+    "naive_serial": ("Naive sphere tracing", FIRST),
+    "naive_practical": ("+ practical grad.", replace(FIRST, gradient="practical", n_gradient_samples=1)),
+    "naive_practical_parallel": (
+        "+ parallel",
+        replace(FIRST, gradient="practical", n_gradient_samples=1, serial=False),
+    ),
+    "dist_dynamic": ("+ dynamic", replace(PAPER, alpha=1.0, coarse_to_fine=False)),
+    "dist_aggressive": ("+ aggressive", replace(PAPER, coarse_to_fine=False)),
+    "dist_coarse_to_fine": ("+ coarse-to-fine", PAPER),
+    "dist_coarse_to_fine_100": ("+ coarse-to-fine, 100 steps", replace(PAPER, steps=100)),
+}
+
+
+@pytest.mark.parametrize("name", TABLE1)
+def test_a_row_of_table_1_is_that_of_the_paper(compose_config, name):
+    config = compose_config(f"renderer={name}")
+    assert (config.renderer._label_, build_part(config, "renderer")) == TABLE1[name]
+
+
+def test_table_1_begins_with_the_rows_of_the_paper():
+    assert [swept for name, swept in SWEEPS if name == "table1"][:7] == [f"renderer={name}" for name in TABLE1]
+
+
+def test_variants_of_our_own_are_what_they_are_called(compose_config):
+    def variant(name):
+        config = compose_config(f"renderer={name}")
+        return config.renderer._label_, build_part(config, "renderer")
+
+    dist, dvr = variant("dist")[1], variant("dvr")[1]
+    assert isinstance(dist, DIST) and isinstance(dvr, DVR)
+    early, aggressive = replace(dvr, early_stop=True), replace(PAPER, coarse_to_fine=False)
+    assert variant("naive_parallel") == ("Naive, all rays at once", replace(FIRST, serial=False))
+    assert variant("dist_official_clamp") == ("DIST, official clamp", replace(PAPER, step_clamp=0.1))
+    assert variant("dist_capped") == ("+ aggressive, capped", replace(aggressive, extra_step_cap=0.01))
+    assert variant("dist_paper") == ("DIST, paper's", replace(PAPER, steps=100, n_gradient_samples=3))
+    assert variant("dvr_64") == ("DVR, n = 64", replace(dvr, n_ray_samples=64, doublings=(10, 30)))
+    assert variant("dvr_official_slope") == ("DVR, official slope", replace(dvr, keep_slope_sign=False))
+    assert variant("dvr_early_stop") == ("DVR, early stop", early)
+    assert variant("dvr_fixed_16") == ("DVR, n = 16 fixed", replace(early, n_ray_samples=16, doublings=()))
+    assert variant("dist_k_3") == ("DIST, K 3", replace(dist, n_gradient_samples=3))
+
+
+def own_yamls() -> dict[str, DictConfig]:
+    """What each renderer's own file holds, without what it builds on."""
+    files = {name: OmegaConf.load(CONF / f"renderer/{name}.yaml") for group, name in YAMLS if group == "renderer"}
+    return {name: file for name, file in files.items() if isinstance(file, DictConfig)}
+
+
+def test_every_renderer_has_a_label_of_its_own_and_says_where_it_has_a_row():
+    files = own_yamls()
+    del files["custom"]
+    labels = [file._label_ for file in files.values()]
+    assert len(set(labels)) == len(labels) >= 30
+    assert all("_rows_" in file for file in files.values())
+    places = [(experiment, place) for file in files.values() for experiment, place in file._rows_.items()]
+    assert len(set(places)) == len(places)
+    assert {experiment for experiment, _ in places} == set(COMPARING)
+
+
+@pytest.mark.parametrize("name", COMPARING)
+def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_places(name):
+    files = own_yamls()
+    named = {file: node._rows_[name] for file, node in files.items() if name in node.get("_rows_", {})}
+    experiment = SHARED_ROWS.get(name, name)
+    params = composed_with_hydra(f"+experiment={experiment}").hydra.sweeper.params
+    assert params.renderer.split(",") == sorted(named, key=lambda file: named[file])
+    assert len(named) == COMPARING[name]
+
+
+def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():
+    params = composed_with_hydra("+experiment=speed_completion", "+method=dist_half").hydra.sweeper.params
+    assert params.renderer == "dist"
+
+
+def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_to(compose_config):
+    for name in ("table1", "fig4", "fig7", "gradients"):
+        for scale, size in (("smoke", 64), ("desk", 256), ("paper", 512)):
+            config = compose_config(f"+experiment={name}", f"scale={scale}")
+            prior = build_part(config, "prior")
+            assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
+            network = prior.network
+            assert (network.layers, network.width, network.code_length, network.skip) == (8, 512, 256, 4)  # DIST, B.1
+
+
+def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
+    config = compose_config("+experiment=fig7", "renderer.epsilon=5e-3")
+    assert build_part(config, "renderer") == replace(PAPER, epsilon=5e-3)
+    assert config.label == "epsilon 0.005"
+
+
+def test_figure_5_looks_at_the_chamfer_distance_on_the_way(compose_config):
+    config = compose_config("+experiment=fig5", "renderer=idr")
+    assert (config.evaluation.every, config.task.points) == (20, "dense")
+    assert compose_config().evaluation.every == "doubling"
+
+
+def test_a_label_may_be_given(compose_config):
+    assert compose_config("label=my row").label == "my row"
+    assert (compose_config().label, compose_config().experiment) == (None, None)
+
+
+def test_the_paper_experiment_has_the_papers_settings(compose_config):
+    # DIST: 50 to 100 steps, alpha 1.5 without a cap, epsilon 5e-5 (Secs. 3.2, A.1); Eq. 11 has no sign, over all rays.
+    renderer = build_part(compose_config("+experiment=completion_paper"), "renderer")
+    assert renderer == DIST(
+        steps=100, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True,
+        coarse_to_fine=True, careful_split=False,
+    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=3, sphere_radius=1.0, silhouette_signed=False,
+        silhouette_average="all",
+    )  # fmt: skip
+
+
+def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_config):
+    practical = ("renderer=naive", "renderer.gradient=practical")
+    with pytest.raises(
+        ValueError, match="n_gradient_samples must be given for gradient=practical: n_gradient_samples=1"
+    ):
+        build_part(compose_config(*practical), "renderer")
+    assert build_part(compose_config(*practical, "renderer.n_gradient_samples=2"), "renderer").n_gradient_samples == 2
+
+
+@pytest.mark.parametrize("name", [name for group, name in GROUPS if group == "renderer"])
+def test_a_renderer_loads_as_a_library_with_its_arguments_changed(compose_config, name):
+    number = "n_ray_samples" if name.startswith("dvr") else "steps"
+    given = {"_target_": "renderers.IDR", **IDR_ARGUMENTS} if name == "custom" else {number: 7}
+    extra = NEEDS.get(name, [f"renderer.{number}=7"])
+    found = load("renderer", name, **given)
+    assert found == build_part(compose_config(f"renderer={name}", *extra), "renderer")
+    assert getattr(found, number) == 7
+
+
+def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, monkeypatch):
+    (tmp_path / "mypkg_of_mine.py").write_text(
+        "class Mine:\n    def __init__(self, size=1):\n        self.size = size\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"renderer\._target_ must be given: set renderer\._target_=PACKAGE\.CLASS"):
+        build_part(compose_config("renderer=custom"), "renderer")
+    with pytest.raises(ValueError, match=r"renderer\._target_ must be given"):
+        load("renderer", "custom")
+    with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
+        build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
+    config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
+    made, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
+    assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
+    with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': add its package"):
+        other = compose_config(  # leave for the renderer is not leave for all
+            "renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "dataset._target_=mypkg_of_mine.Mine"
+        )
+        build_part(other, "dataset")
+
+
+def test_the_old_name_of_a_choice_or_a_key_is_told_the_new_one():
+    for old, new in RENAMED.items():
+        assert renamed(old) == f": it was renamed, write {new}"
+        for group, name in re.findall(r"(?<![\w.])(\w+)=(\w+)", new):  # what is to be typed exists
+            assert name == "NAME" or (CONF / group / f"{name}.yaml").is_file()
+    assert renamed("condition/focal_050") == ": it was renamed, write task.focal=0.5"
+    assert renamed("scale.table2.shapes") == renamed("scale.table2")  # with all that lay under it
+    assert renamed("strategy/of_ones_own") == renamed("strategy")
+    assert [renamed(name) for name in ("renderer.steps", "scale.grid", "task", "experiment/table1")] == [""] * 4
+    assert (len(STRATEGIES), len(SETTINGS)) == (18, 15)
+
+
+def test_a_variant_loads_as_a_library_with_what_it_builds_on():
+    assert load("renderer", "dist_coarse_to_fine") == PAPER
+    assert load("renderer", "naive_practical_parallel", steps=7) == replace(
+        FIRST, gradient="practical", n_gradient_samples=1, serial=False, steps=7)  # fmt: skip
+    with pytest.raises(ValueError, match=r"renderer has no key 'samples': it was renamed, write renderer\.n_gradient"):
+        load("renderer", "dist_aggressive", samples=3)
+
+
+def test_loading_tells_of_mistakes():
+    with pytest.raises(ValueError, match="unknown renderer 'dits': did you mean dist"):
+        load("renderer", "dits")
+    with pytest.raises(ValueError, match="renderer has no key 'step': did you mean steps"):
+        load("renderer", "dist", step=7)
+
+
+def test_a_dataset_of_meshes_asks_for_its_path(compose_config):
+    with pytest.raises(ValueError, match=r"dataset\.path must be given: set dataset\.path="):
+        build_part(compose_config("dataset=mesh"), "dataset")
+
+
+@pytest.mark.parametrize(
+    ("part", "override", "message"),
+    [
+        ("renderer", "+renderer.stepz=3", r"renderer has no key 'stepz': did you mean steps"),
+        ("renderer", "+renderer.epsilom=1", r"renderer has no key 'epsilom': did you mean epsilon"),
+        ("task", "+task.silhouete_weight=1", r"task has no key 'silhouete_weight': did you mean silhouette_weight"),
+        ("dataset", "+dataset.resolutions=1", r"dataset has no key 'resolutions': did you mean resolution"),
+        ("prior", "+scale.network.widht=1", r"prior\.network has no key 'widht': did you mean width"),
+        ("renderer", "+renderer.xyzzy=1", r"renderer has no key 'xyzzy': it has active_only, alpha, .*steps"),
+    ],
+)
+def test_an_unknown_key_is_told_with_the_nearest(compose_config, part, override, message):
+    with pytest.raises(ValueError, match=message):
+        build_part(compose_config(override), part)
+
+
+@pytest.mark.parametrize(
+    ("part", "override", "message"),
+    [
+        ("renderer", "renderer.steps=many", r"renderer\.steps: .*'many'.*expected int"),
+        ("renderer", "renderer.steps=1.5", r"renderer\.steps: .*expected int"),
+        ("renderer", "renderer.alpha=[1]", r"renderer\.alpha: .*expected float"),
+        ("renderer", "renderer.epsilon=null", r"renderer\.epsilon: .*expected float"),
+        ("renderer", "renderer.active_only=perhaps", r"renderer\.active_only: .*expected bool"),
+        ("renderer", "renderer.extra_step_cap=wide", r"renderer\.extra_step_cap: .*expected float \| None"),
+        ("dataset", "dataset.ranges=7", r"dataset\.ranges: .*expected dict"),
+        ("prior", "scale.network.width=wide", r"prior\.network\.width: .*expected int"),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_told_with_its_key(compose_config, part, override, message):
+    with pytest.raises(ValueError, match=message):
+        build_part(compose_config(override), part)
+
+
+@pytest.mark.parametrize(
+    ("part", "override", "message"),
+    [
+        ("renderer", "renderer.steps=0", "steps must be at least 1, not 0"),
+        ("renderer", "renderer.alpha=0.5", "alpha must be at least 1, not 0.5"),
+        ("renderer", "renderer.epsilon=0", "epsilon must be positive, not 0"),
+        ("renderer", "renderer.epsilon=nan", "epsilon must be positive, not nan"),
+        ("renderer", "renderer.n_gradient_samples=0", "n_gradient_samples must be at least 1, not 0"),
+        ("renderer", "renderer.step_clamp=-1", "step_clamp must be positive, not -1.0: step_clamp=null"),
+        ("renderer", "renderer.sphere_radius=-1", "sphere_radius must be positive"),
+        ("renderer", "renderer.silhouette_average=some", "silhouette_average must be one of all, violating"),
+        ("task", "task.code.average=median", "task.code.average must be one of sum, mean, not 'median'"),
+        ("dataset", "dataset.resolution=1", "resolution must be at least 16, not 1"),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_told_with_the_remedy(compose_config, part, override, message):
+    with pytest.raises(ValueError, match=message):
+        build_part(compose_config(override), part)
+
+
+def test_a_setting_within_another_says_where_it_stands(compose_config):
+    with pytest.raises(ValueError, match=r"^task\.images: noise must be at least 0, not -1"):
+        build_part(compose_config("task=multiview", "task.images.noise=-1"), "task")
+
+
+def test_naive_checks_its_numbers_as_dist_does(compose_config):
+    for override in ("steps=0", "epsilon=0", "sphere_radius=0", "silhouette_average=some"):
+        with pytest.raises(ValueError, match=override.split("=")[0]):
+            build_part(compose_config("renderer=naive", f"renderer.{override}"), "renderer")
+
+
+def test_a_target_outside_our_packages_needs_leave(compose_config):
+    config = compose_config("renderer._target_=os.system")
+    with pytest.raises(ValueError, match=r"renderer\._target_ names 'os\.system': add its package by packages=\[os\]"):
+        build_part(config, "renderer")
+    for target in ("renderers.DISTT", "renderers.nowhere.DIST"):
+        with pytest.raises(ValueError, match=rf"renderer\._target_ names '{target}', which cannot be imported"):
+            build_part(compose_config(f"renderer._target_={target}"), "renderer")

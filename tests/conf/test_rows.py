@@ -1,0 +1,161 @@
+"""A renderer is one file and one YAML: every experiment that compares renderers then has a row for it."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from bench.config import build
+from bench.records.files import to_json, write_text
+from bench.records.read import read_records
+from bench.records.record import Record, row_name
+from bench.run import sweep
+from bench.run.command import command_line
+
+CLASS = "class Mine:\n    def __init__(self, size):\n        self.size = size\n"
+YAMLS = {
+    "mine": "_target_: {package}.Mine\nsize: 3\n",
+    "mine_first": "defaults: [mine, _self_]\n_label_: Mine, first\n_rows_: {{table1: 0}}\nsize: 4\n",
+    "mine_nowhere": "defaults: [mine, _self_]\n_rows_: {{}}\n",
+    "mine_on_dist": "defaults: [dist, _self_]\nsteps: 7\n",
+}
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch) -> str:
+    """A user's package, with YAMLs in a folder of the user's: `--config-dir`."""
+    name = f"user_package_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(CLASS)
+    (tmp_path / "conf/renderer").mkdir(parents=True)
+    for yaml, text in YAMLS.items():
+        (tmp_path / f"conf/renderer/{yaml}.yaml").write_text(text.format(package=name))
+    monkeypatch.syspath_prepend(tmp_path)
+    return name
+
+
+class Planned(ValueError):
+    """Ends a command line behind its plan, before Hydra runs the cells."""
+
+
+@pytest.fixture
+def swept(monkeypatch, tmp_path):
+    """Plans a sweep with a folder of a user's YAMLs, or runs it with a job that does nothing: plan, configurations."""
+
+    def run(*arguments: str, folder: Path | None = None, launch: bool = False) -> tuple[sweep.Plan, list[DictConfig]]:
+        plans, ran = [], []
+
+        def start(plan: sweep.Plan) -> None:
+            plans.append(plan)
+            if not launch:
+                raise Planned("planned")
+
+        monkeypatch.setattr(sweep.Sweep, "start", start)
+        GlobalHydra.instance().clear()
+        options = [] if folder is None else ["--config-dir", str(folder)]
+        overrides = [*arguments, "hydra/launcher=basic", "scale=smoke", f"results_dir={tmp_path}/r"]
+        monkeypatch.setattr(sys, "argv", ["bench", "-m", *options, *overrides])
+        assert command_line(ran.append) == (0 if launch else 2)
+        return plans[0], ran
+
+    return run
+
+
+def rows(plan: sweep.Plan) -> list[str]:
+    """The renderers of a plan, each once, in order."""
+    return list(dict.fromkeys(cell.renderer for cell in plan.cells))
+
+
+@pytest.mark.parametrize(
+    ("experiment", "ours"), [("table1", 12), ("stability", 12), ("speed_completion", 20), ("speed_rendering", 20)]
+)
+def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_renderers(
+    swept, tmp_path, package, experiment, ours
+):
+    few = ["stress=thin_plate"] if experiment == "stability" else []
+    plan, _ = swept(f"+experiment={experiment}", *few, f"packages=[{package}]", folder=tmp_path / "conf")
+    first = ["mine_first"] if experiment == "table1" else []
+    found = rows(plan)
+    assert found[: len(first)] == first
+    assert found[-2:] == ["mine", "mine_on_dist"]  # they say nothing of rows
+    assert len(found) == len(plan.cells) == len(first) + ours + 2
+    assert "custom" not in found and "mine_nowhere" not in found
+    cells = {cell.renderer: cell for cell in plan.cells}
+    assert row_name(cells["mine"].config, "mine") == "mine"
+    assert row_name(cells["mine_on_dist"].config, "mine_on_dist") == "mine_on_dist"  # not the label of dist
+    assert row_name(cells["dist"].config, "dist") == "DIST, our default"
+    made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
+    assert (type(made).__name__, made.size) == ("Mine", 3)
+    if experiment != "table1":
+        return
+    assert row_name(cells["mine_first"].config, "mine_first") == "Mine, first"
+    assert row_name(cells["dist_aggressive"].config, "dist_aggressive") == "+ aggressive"
+    assert cells["mine_first"].config["renderer"]["size"] == 4
+
+
+def test_places_are_no_part_of_a_run(swept, tmp_path, package):
+    fig4, own = ("+experiment=fig4", f"packages=[{package}]"), tmp_path / "conf/renderer/mine.yaml"
+    plan, _ = swept(*fig4, folder=tmp_path / "conf")
+    assert not any("_rows_" in cell.config["renderer"] for cell in plan.cells)
+    before = {cell.renderer: cell.id for cell in plan.cells}
+    own.write_text(f"{own.read_text()}_rows_: {{fig4: 3.5}}\n")
+    plan, _ = swept(*fig4, folder=tmp_path / "conf")
+    assert {cell.renderer: cell.id for cell in plan.cells} == before
+    assert rows(plan)[2:5] == ["dist_aggressive", "mine", "dist_coarse_to_fine"]
+
+
+def test_the_command_line_narrows_and_replaces_the_rows(swept):
+    plan, _ = swept("+experiment=table1", "renderer=dvr,dist")
+    assert rows(plan) == ["dvr", "dist"]
+    own = ("renderer=custom", "renderer._target_=renderers.IDR")
+    plan, _ = swept("+experiment=table1", *own)
+    assert [(cell.renderer, row_name(cell.config, cell.renderer)) for cell in plan.cells] == [("custom", "IDR")]
+
+
+def test_a_method_is_a_part_of_what_a_run_is_called(swept):
+    plan, _ = swept("+experiment=table3", "index=0", "dataset=car")
+    methods = [cell.method for cell in plan.cells]
+    assert methods == [f"multiview_{name}" for name in ("paper", "dist", "restarts", "idr", "dvr", "naive")]
+    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == [
+        "multiview-dist_paper-car-multiview_paper",
+        "multiview-dist-car-multiview_dist",
+    ]
+    plan, _ = swept("seed=0,1")
+    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == ["completion-dist-sofa"] * 2
+    assert [cell.method for cell in plan.cells] == ["", ""]
+
+
+def test_combinations_are_those_that_hydra_runs(swept):
+    # Of two values of one key the later counts, at the place of the first.
+    plan, ran = swept("seed=0,1", "dataset=glob(c*,exclude=car)", "index=3", "seed=range(5,7)", launch=True)
+    planned = [{key: value for key, value in cell.config.items() if key != "renderer"} for cell in plan.cells]
+    for config in ran:
+        del config.renderer
+    assert planned == [OmegaConf.to_container(config, resolve=True) for config in ran]
+    assert [(one["dataset"]["name"], one["index"], one["seed"]) for one in planned] == [
+        (name, 3, seed) for seed in (5, 6) for name in ("capsule", "cylinder")
+    ]
+
+
+def test_a_renderer_file_that_is_no_mapping_is_named(swept, tmp_path, capsys):
+    (tmp_path / "conf/renderer").mkdir(parents=True)
+    (tmp_path / "conf/renderer/list.yaml").write_text("- 1\n")
+    with pytest.raises(IndexError):  # there is no plan
+        swept("+experiment=table1", folder=tmp_path / "conf")
+    assert "renderer/list.yaml must hold keys and values" in capsys.readouterr().err
+
+
+def test_records_and_plans_without_a_method_are_read(tmp_path):
+    (tmp_path / "runs").mkdir()
+    folder = tmp_path / "sweeps/old"
+    folder.mkdir(parents=True)
+    cell = {"id": "a", "overrides": [], "task": "pose", "renderer": "dist", "dataset": "car", "seed": 0, "config": {}}
+    write_text(folder / "plan.json", to_json({"schema": 1, "name": "old", "asked": "2026-01-01", "cells": [cell]}))
+    planned, problems = read_records(tmp_path)
+    assert ([one["method"] for one in planned], problems) == ([""], [])
+    record = Record("a", "pose", "dist", "car", 0, {"renderer": {"_label_": "DIST"}}, method="pose_dist")
+    assert record.name == "DIST"
+    old = {key: value for key, value in record.__dict__.items() if key != "method"}
+    assert Record.of(old).method == ""
+    assert OmegaConf.create(record.config).renderer._label_ == "DIST"

@@ -1,0 +1,90 @@
+"""Deformations: seeded, the identity at strength 0, smooth and never folding."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.deform import STRETCH, TAPER, TWIST, Deformation, deform
+from datasets.mesh import Mesh
+
+
+def ball() -> Mesh:
+    made = trimesh.creation.icosphere(2)
+    return Mesh(np.array(made.vertices), np.array(made.faces), repairs=("1 hole closed",))
+
+
+def jacobians(deformation: Deformation, points: np.ndarray) -> np.ndarray:
+    step = 1e-5
+    moves = step * np.eye(3)
+    columns = [(deformation.apply(points + move) - deformation.apply(points - move)) / (2 * step) for move in moves]
+    return np.stack(columns, axis=-1)
+
+
+def test_the_seed_alone_decides():
+    assert Deformation.draw(3) == Deformation.draw(3)
+    assert Deformation.draw(3) != Deformation.draw(4)
+    assert np.array_equal(deform(ball(), 3).vertices, deform(ball(), 3).vertices)
+
+
+def test_strength_zero_is_the_identity_and_strength_scales_the_same_kind():
+    assert np.array_equal(deform(ball(), 5, strength=0.0).vertices, ball().vertices)
+    weak, strong = Deformation.draw(5, 0.5), Deformation.draw(5, 1.0)
+    assert weak.twist == pytest.approx(strong.twist / 2)
+    assert weak.twist_axis == strong.twist_axis
+
+
+def test_topology_and_repairs_stay_and_the_shape_changes():
+    deformed = deform(ball(), 1)
+    assert np.array_equal(deformed.faces, ball().faces)
+    assert deformed.repairs == ("1 hole closed",)
+    assert deformed.watertight
+    assert 0.05 < np.abs(deformed.vertices - ball().vertices).max() < 1
+
+
+def test_the_parameters_fill_their_ranges():
+    drawn = [Deformation.draw(seed) for seed in range(200)]
+    for values, limit in [
+        ([one.stretch for one in drawn], STRETCH),
+        ([one.taper for one in drawn], TAPER),
+        ([one.twist for one in drawn], TWIST),
+    ]:
+        assert 0.95 * limit < np.max(values) <= limit
+        assert -limit <= np.min(values) < -0.95 * limit
+    assert {one.twist_axis for one in drawn} == {0, 1, 2}
+
+
+def test_orientation_is_kept_in_the_unit_sphere():
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points /= np.maximum(1, np.linalg.norm(points, axis=1, keepdims=True))
+    determinants = [np.linalg.det(jacobians(Deformation.draw(seed), points)) for seed in range(100)]
+    assert np.min(determinants) > 0.1
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_taper_scales_cross_sections_and_stretch_scales_axes(axis):
+    point = np.full(3, 0.4)
+    tapered = Deformation(taper=0.25, taper_axis=axis).apply(point)
+    assert tapered == pytest.approx(np.where(np.arange(3) == axis, 0.4, 0.44))
+    stretch = tuple(0.2 * np.eye(3)[axis])
+    assert Deformation(stretch=stretch).apply(point) == pytest.approx(0.4 * np.exp(stretch))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_twist_keeps_volume_and_bend_turns_the_axis_into_an_arc(axis):
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 3))
+    assert np.linalg.det(jacobians(Deformation(twist=0.4, twist_axis=axis), points)) == pytest.approx(1)
+    along = np.zeros((50, 3))
+    along[:, axis] = np.linspace(-1, 1, 50)
+    arc = Deformation(bend=0.25, bend_axis=axis).apply(along)
+    centre = 4 * np.eye(3)[(axis + 1) % 3]
+    assert np.linalg.norm(arc - centre, axis=1) == pytest.approx(4)
+    lengths = np.linalg.norm(np.diff(arc, axis=0), axis=1)
+    assert lengths.sum() == pytest.approx(2, rel=1e-3)
+
+
+def test_wrong_strength_and_a_mesh_that_is_too_large_are_refused():
+    for strength in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="strength: must be from 0 to 1"):
+            deform(ball(), 0, strength)
+    with pytest.raises(ValueError, match="found a vertex at 2; normalise it first"):
+        deform(Mesh(2 * ball().vertices, ball().faces), 0)

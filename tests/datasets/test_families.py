@@ -1,0 +1,157 @@
+"""The procedural families as they are shipped in conf/dataset."""
+
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from bench.config import CONF, build
+from bench.records.files import digest
+from datasets.dataset import SPLIT_STRIDE, Split, seed_of
+from datasets.families import BUILDERS, FAMILIES, HALF_GRID, Family
+
+NAMES = sorted(
+    path.stem for path in (CONF / "dataset").glob("*.yaml") if OmegaConf.load(path)._target_.endswith("Family")
+)
+
+
+@pytest.fixture(params=NAMES)
+def family(request) -> Family:
+    return build(OmegaConf.load(CONF / "dataset" / f"{request.param}.yaml"), "dataset")
+
+
+@pytest.fixture
+def sofa() -> Family:
+    return build(OmegaConf.load(CONF / "dataset" / "sofa.yaml"), "dataset")
+
+
+def inside(family: Family, parameters: dict[str, float], points: torch.Tensor) -> torch.Tensor:
+    """Which points are inside the shape, before it is scaled."""
+    return BUILDERS[family.name](SimpleNamespace(**parameters))(points) < 0
+
+
+def test_every_builder_is_configured_under_its_own_name():
+    assert sorted(BUILDERS) == NAMES
+
+
+def test_a_family_has_8_to_15_parameters_with_room(family):
+    assert len(family.ranges) in (range(8, 16) if family.name in FAMILIES else range(1, 8))
+    assert all(low < high for low, high in family.ranges.values())
+
+
+def test_a_shape_as_shipped_is_a_closed_solid_that_touches_its_sphere(family):
+    mesh = family.mesh(Split.TEST, 0)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert mesh.watertight
+    assert mesh.volume > 0.02
+    assert radii.max() == pytest.approx(family.radius, abs=1e-9)
+    assert family.radius < 1
+    assert (mesh.vertices.max(0) + mesh.vertices.min(0)) == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize("split", Split)
+def test_shapes_of_every_part_are_closed_solids(family, split):
+    coarse = replace(family, resolution=48)
+    volumes = set()
+    for index in range(5):
+        mesh = coarse.mesh(split, index)
+        assert mesh.watertight
+        assert mesh.volume > 0.02
+        assert np.linalg.norm(mesh.vertices, axis=1).max() <= family.radius + 1e-9
+        volumes.add(round(mesh.volume, 9))
+    assert len(volumes) == 5
+
+
+def test_a_shape_is_always_the_same(family):
+    coarse, again = replace(family, resolution=40), replace(family, resolution=40)
+    assert np.array_equal(coarse.mesh(Split.TEST, 2).vertices, again.mesh(Split.TEST, 2).vertices)
+    assert family.draw(Split.TEST, 2) == again.draw(Split.TEST, 2)
+
+
+def test_draws_fill_their_ranges_and_no_two_are_alike(family):
+    drawn = [family.draw(split, index) for split in Split for index in range(100)]
+    for name, (low, high) in family.ranges.items():
+        values = np.array([one[name] for one in drawn])
+        assert low <= values.min() < low + 0.05 * (high - low)
+        assert high >= values.max() > high - 0.05 * (high - low)
+        assert len(np.unique(values)) == len(drawn)
+
+
+def test_each_parameter_changes_the_shape(family):
+    points = torch.empty(200_000, 3).uniform_(-1.2, 1.2, generator=torch.Generator().manual_seed(0))
+    middle = {name: (low + high) / 2 for name, (low, high) in family.ranges.items()}
+    for name, (low, high) in family.ranges.items():
+        least, most = (inside(family, middle | {name: value}, points) for value in (low, high))
+        assert (least != most).sum() > 20, f"{name} of {family.name} does nothing"
+
+
+def test_shapes_stay_clear_of_the_sampled_cube(family):
+    faces = torch.empty(20_000, 3).uniform_(-HALF_GRID, HALF_GRID, generator=torch.Generator().manual_seed(0))
+    rows = torch.arange(len(faces))
+    faces[rows, rows % 3] = HALF_GRID * faces[rows, rows % 3].sign()
+    widest = {name: high for name, (_, high) in family.ranges.items()}
+    for parameters in (widest, *(family.draw(Split.TRAIN, index) for index in range(20))):
+        assert not inside(family, parameters, faces).any()
+
+
+def test_parts_share_no_seed():
+    first_and_last = [seed_of(split, index) for split in Split for index in (0, 1, SPLIT_STRIDE - 1)]
+    assert len(set(first_and_last)) == len(first_and_last)
+    ordered = sorted(first_and_last)
+    for split in Split:
+        low, high = seed_of(split, 0), seed_of(split, SPLIT_STRIDE - 1)
+        assert ordered.index(high) - ordered.index(low) == 2  # no seed of another part lies between
+
+
+@pytest.mark.parametrize("index", [-1, SPLIT_STRIDE])
+def test_an_index_beyond_the_part_is_refused(index):
+    with pytest.raises(ValueError, match=f"index must lie between 0 and {SPLIT_STRIDE - 1}, not {index}"):
+        seed_of(Split.TEST, index)
+
+
+def test_identity_is_plain_and_changes_with_all_that_decides_the_shapes(family):
+    def key(**changed):
+        return digest(replace(family, **changed).identity())
+
+    name = next(iter(family.ranges))
+    low, high = family.ranges[name]
+    others = [
+        key(ranges=family.ranges | {name: [low, high + 0.01]}),
+        key(ranges=family.ranges | {name: [low - 0.01, high]}),
+        key(resolution=family.resolution + 1),
+        key(radius=0.9),
+        key(name=next(other for other in NAMES if other != family.name)),
+    ]
+    assert key() == digest(Family(**asdict(family)).identity())
+    assert len({key(), *others}) == 6
+
+
+def test_an_invalid_family_is_an_error(sofa):
+    with pytest.raises(ValueError, match=r"name must be one of .*sofa.*, not 'lamp'"):
+        replace(sofa, name="lamp")
+    with pytest.raises(ValueError, match="resolution must be at least 16, not 8: 128 keeps legs and wings"):
+        replace(sofa, resolution=8)
+    with pytest.raises(ValueError, match="radius must be above 0 and at most 1, not 0"):
+        replace(sofa, radius=0.0)
+
+
+def test_shapes_that_leave_the_unit_sphere_are_refused(sofa):
+    with pytest.raises(
+        ValueError, match=r"radius must be above 0 and at most 1, not 1.5: rays start on the unit sphere"
+    ):
+        replace(sofa, radius=1.5)
+
+
+def test_a_range_may_be_given_in_whole_numbers():
+    node = OmegaConf.merge(OmegaConf.load(CONF / "dataset" / "sofa.yaml"), {"ranges": {"width": [1, 2]}})
+    assert build(node, "dataset").ranges["width"] == [1.0, 2.0]
+
+
+def test_a_shape_that_fills_the_cube_is_refused(sofa):
+    huge = sofa.ranges | {name: [9.0, 9.0] for name in ("width", "depth", "seat_height", "back_height")}
+    huge |= {"leg_height": [-4.0, -4.0]}
+    with pytest.raises(ValueError, match=r"sofa test 0 has no surface: check dataset.ranges"):
+        replace(sofa, ranges=huge, resolution=16).mesh(Split.TEST, 0)

@@ -1,0 +1,137 @@
+"""Local mesh files as a dataset."""
+
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.dataset import Split
+from datasets.local import LocalMeshes
+
+ODD_NAME = "two words ünïcode 50% #1?"
+
+
+def write_box(path, sides=(1.0, 0.6, 0.4)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.creation.box(sides).export(path)
+    return path
+
+
+def local(path, *, strength=1.0) -> LocalMeshes:
+    return LocalMeshes(str(path), radius=0.97, strength=strength)
+
+
+def proportions(mesh) -> tuple[float, ...]:
+    """Area and volume in scene units: what tells these shapes apart."""
+    return round(mesh.area, 6), round(mesh.volume, 6)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for index in range(6):
+        write_box(
+            tmp_path / ODD_NAME / f"Möbel {index}.{'OBJ' if index == 0 else 'ply'}", (1.0, 0.3 + 0.1 * index, 0.4)
+        )
+    (tmp_path / ODD_NAME / "notes.txt").write_text("not a mesh")
+    return tmp_path / ODD_NAME
+
+
+def test_the_first_training_shape_of_one_file_is_the_mesh_itself(tmp_path):
+    dataset = local(write_box(tmp_path / "box.ply"))
+    mesh = dataset.mesh(Split.TRAIN, 0)
+    sides = np.array([1.0, 0.6, 0.4])
+    sides *= 2 * 0.97 / np.linalg.norm(sides)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(sides, rel=1e-6)
+    assert mesh.volume == pytest.approx(sides.prod(), rel=1e-6)
+    assert dataset.name == "box"
+
+
+def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_path):
+    dataset = local(write_box(tmp_path / "box.ply"))
+    shapes = [dataset.mesh(split, index) for split in Split for index in range(4)]
+    assert len({proportions(mesh) for mesh in shapes}) == 12
+    for mesh in shapes:
+        assert mesh.watertight
+        assert mesh.volume > 0
+        assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.97, abs=1e-9)
+
+
+def test_shapes_are_always_the_same_wherever_the_file_lies(tmp_path):
+    first = local(write_box(tmp_path / "box.ply"))
+    second = local(shutil.copy(tmp_path / "box.ply", tmp_path / "elsewhere.ply"))
+    for split, index in ((Split.TRAIN, 0), (Split.TRAIN, 3), (Split.TEST, 0)):
+        assert np.array_equal(first.mesh(split, index).vertices, second.mesh(split, index).vertices)
+
+
+def test_a_folder_is_dealt_out_whole_and_no_part_shares_a_file(folder):
+    dataset = local(folder)
+    parts = {split: dataset.files(split) for split in Split}
+    dealt = [file for files in parts.values() for file in files]
+    assert sorted(dealt) == sorted(file for file in folder.iterdir() if file.suffix != ".txt")
+    assert len(dealt) == len(set(dealt)) == 6
+    assert min(len(files) for files in parts.values()) >= 1
+    assert len(parts[Split.TRAIN]) == 4
+    assert parts == {split: local(folder).files(split) for split in Split}
+
+
+def test_a_folder_gives_its_meshes_as_they_are_and_then_deforms_them(folder):
+    dataset = local(folder)
+    plain = {proportions(local(file).mesh(Split.TRAIN, 0)) for file in folder.iterdir() if file.suffix != ".txt"}
+    as_they_are = [dataset.mesh(split, index) for split in Split for index in range(len(dataset.files(split)))]
+    assert {proportions(mesh) for mesh in as_they_are} == plain
+    beyond = [proportions(dataset.mesh(split, len(dataset.files(split)))) for split in Split]
+    assert not plain & set(beyond)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_files_are_enough(tmp_path, count):
+    for index in range(count):
+        write_box(tmp_path / f"{index}.ply", (1.0, 0.3 + 0.2 * index, 0.4))
+    dataset = local(tmp_path)
+    test, train = dataset.mesh(Split.TEST, 0), dataset.mesh(Split.TRAIN, 0)
+    assert proportions(test) != proportions(train)
+    if count > 1:
+        assert not set(dataset.files(Split.TEST)) & set(dataset.files(Split.TRAIN))
+
+
+def test_paths_with_spaces_and_other_letters_work_and_name_the_dataset(tmp_path):
+    path = write_box(tmp_path / ODD_NAME / "Stuhl für Ümit.ply")
+    assert local(path).name == "Stuhl für Ümit"
+    assert local(path).mesh(Split.TEST, 0).watertight
+    assert local(path.parent).mesh(Split.TEST, 0).watertight
+
+
+def test_contents_decide_identity_not_the_path(tmp_path):
+    path = write_box(tmp_path / "box.ply")
+    moved = shutil.copy(path, tmp_path / ODD_NAME.replace("?", ".ply"))
+    other = write_box(tmp_path / "other" / "box.ply", (1.0, 0.6, 0.5))
+    assert local(path).identity() == local(moved).identity()
+    assert local(path).identity() != local(other).identity()
+    assert local(path).identity() != local(path, strength=0.5).identity()
+    assert local(path).identity() != LocalMeshes(str(path), radius=0.9, strength=1.0).identity()
+
+
+def test_identity_sees_a_file_that_is_added_to_the_folder(folder):
+    before = local(folder).identity()
+    write_box(folder / "one more.stl")
+    assert local(folder).identity() != before
+
+
+def test_no_strength_leaves_the_mesh_as_it_is(tmp_path):
+    dataset = local(write_box(tmp_path / "box.ply"), strength=0.0)
+    shapes = [dataset.mesh(split, index) for split in Split for index in (0, 1)]
+    assert len({proportions(mesh) for mesh in shapes}) == 1
+
+
+def test_invalid_settings_are_errors_at_once(tmp_path):
+    path = write_box(tmp_path / "box.ply")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"found nothing at .*boks.ply'; did you mean .*box.ply"):
+        local(tmp_path / "boks.ply")
+    with pytest.raises(ValueError, match="a folder must hold mesh files"):
+        local(tmp_path / "empty")
+    with pytest.raises(ValueError, match=r"dataset.strength must be at least 0, not -1"):
+        local(path, strength=-1.0)
+    with pytest.raises(ValueError, match=r"dataset.radius must be above 0 and at most 1, not 0"):
+        LocalMeshes(str(path), radius=0.0, strength=1.0)

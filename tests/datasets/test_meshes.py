@@ -1,0 +1,296 @@
+"""Local mesh files: what is found, read, refused and repaired."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.mesh import Mesh
+from datasets.meshes import find_meshes, load_mesh, repair
+from datasets.truth import Truth, sample_surface
+
+SHARED = Path(__file__).parents[3] / "shared" / "meshes"
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+def box(at=(0.0, 0.0, 0.0), size=1.0, inverted=False) -> trimesh.Trimesh:
+    made = trimesh.creation.box((size, size, size))
+    made.apply_translation(at)
+    if inverted:
+        made.invert()
+    return made
+
+
+def joined(*parts: trimesh.Trimesh) -> Mesh:
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
+    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+
+def sheet(height) -> Mesh:
+    """A grid of 2 x 12 x 12 triangles over the unit square."""
+    x, y = np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, 1, 13), indexing="ij")
+    corner = (13 * np.arange(12)[:, None] + np.arange(12)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 13, corner + 14], 1), np.stack([corner, corner + 14, corner + 1], 1)]
+    )
+    return Mesh(np.stack([x, y, height(x)], axis=-1).reshape(-1, 3), faces)
+
+
+# finding
+
+
+def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path):
+    for name in ("b.OBJ", "a ü.ply", "notes.txt"):
+        (tmp_path / name).write_text("x")
+    (tmp_path / "folder.stl").mkdir()
+    assert [path.name for path in find_meshes(tmp_path)] == ["a ü.ply", "b.OBJ"]
+    assert find_meshes(str(tmp_path / "b.OBJ")) == [tmp_path / "b.OBJ"]
+
+
+def test_paths_that_hold_no_mesh_are_refused_with_a_remedy(tmp_path):
+    (tmp_path / "teapot.obj").write_text("x")
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"found nothing at .*teapt.obj'; did you mean '.*teapot\.obj'\?"):
+        find_meshes(tmp_path / "teapt.obj")
+    with pytest.raises(ValueError, match="check the spelling and the current folder"):
+        find_meshes(tmp_path / "nowhere" / "zebra.obj")
+    with pytest.raises(ValueError, match="found none directly in"):
+        find_meshes(tmp_path / "empty")
+    with pytest.raises(ValueError, match=r"must end in one of \.obj .* \.glb, found 'notes\.txt'"):
+        find_meshes(tmp_path / "notes.txt")
+    with pytest.raises(ValueError, match="must be one mesh file, found the folder"):
+        load_mesh(tmp_path)
+
+
+# reading
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.stl", "a.off", "a.glb", "with space ü 網.obj"])
+def test_a_closed_mesh_keeps_its_surface_in_every_format(name, tmp_path):
+    box(at=(3, 0, 0)).export(tmp_path / name)
+    mesh = load_mesh(tmp_path / name)
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(1)
+    assert (len(mesh.vertices), len(mesh.faces), mesh.repairs) == (8, 12, ())
+    assert mesh.vertices.mean(axis=0) == pytest.approx([3, 0, 0])
+
+
+def test_texture_seams_are_welded(tmp_path):
+    corners = box().triangles.reshape(-1, 3)  # each face has its own three vertices, as at seams
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"vt 0.{i:02d} 0.5" for i in range(36)]
+    lines += [f"f {i}/{i} {i + 1}/{i + 1} {i + 2}/{i + 2}" for i in range(1, 37, 3)]
+    (tmp_path / "seams.obj").write_text("\n".join(lines))
+    mesh = load_mesh(tmp_path / "seams.obj")
+    assert (len(mesh.vertices), mesh.watertight, mesh.repairs) == (8, True, ())
+
+
+def test_a_scene_is_placed_by_its_transforms_and_its_lines_ignored(tmp_path):
+    scene = trimesh.Scene()
+    mirror = np.diag([-2.0, 2, 2, 1])
+    mirror[:3, 3] = [5, 0, 0]
+    scene.add_geometry(box(), node_name="one")
+    scene.add_geometry(box(), node_name="two", transform=mirror)
+    scene.add_geometry(trimesh.load_path([[[0, 0, 0], [99, 0, 0]]]))
+    scene.export(tmp_path / "scene.glb")
+    mesh = load_mesh(tmp_path / "scene.glb")
+    assert mesh.volume == pytest.approx(1 + 8)
+    assert mesh.part_volumes.min() > 0
+    assert mesh.vertices[:, 0].max() == pytest.approx(6)
+
+
+BROKEN = {
+    "empty.obj": (b"", "found 0 bytes"),
+    "garbage.obj": (b"this is\nno mesh\n", "must have faces, found none"),
+    "points.obj": (TRIANGLE.encode(), "must have faces, found none"),
+    "range.obj": ((TRIANGLE + "f 1 2 9\n").encode(), "export or copy it again"),
+    "nan.obj": ((TRIANGLE + "v nan 0 0\nf 1 2 4\n").encode(), "NaN"),
+    "inf.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "infinite"),
+    "range.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "face index outside the range"),
+    "line.obj": (b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must have an area, found 0"),
+    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "must have an area, found 0"),
+    "words.ply": (b"this is\nno mesh\n", "reading failed"),
+    "words.stl": (b"this is\nno mesh\n", "."),
+    "words.glb": (b"this is\nno mesh\n", "reading failed"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_is_one_clear_error(name, tmp_path):
+    content, message = BROKEN[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_mesh(tmp_path / name)
+    assert str(caught.value).startswith(f"mesh file '{tmp_path / name}': ")
+    assert "; " in str(caught.value)  # the remedy
+    assert caught.value.__cause__ is None and caught.value.__suppress_context__  # no traceback of a library
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.97])
+def test_a_truncated_binary_file_is_refused(suffix, share, tmp_path):
+    whole = trimesh.creation.icosphere(1).export(file_type=suffix)
+    path = tmp_path / f"cut.{suffix}"
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"export (or copy )?it"):
+        load_mesh(path)
+
+
+# repairing
+
+
+def test_an_inverted_or_jumbled_winding_is_turned_outward():
+    inverted = repair(joined(box(inverted=True)))
+    assert inverted.volume == pytest.approx(1)
+    assert inverted.repairs == ("1 part turned outward",)
+    faces = box().faces.copy()
+    faces[::3] = faces[::3, ::-1]
+    jumbled = repair(Mesh(box().vertices, faces))
+    assert jumbled.volume == pytest.approx(1)
+    assert jumbled.repairs[0] == "faces wound consistently"
+
+
+def test_an_open_box_is_closed_with_a_note():
+    mesh = repair(Mesh(box().vertices, box().faces[2:]))
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(1)
+    assert mesh.repairs == ("1 hole closed",)
+
+
+def test_doubled_faces_are_dropped():
+    both_sides = np.concatenate([box().faces, box().faces[:, ::-1]])
+    mesh = repair(Mesh(box().vertices, both_sides))
+    assert (len(mesh.faces), mesh.volume) == (12, pytest.approx(1))
+    assert mesh.repairs == ("12 doubled faces dropped",)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_overlapping_boxes_are_inside_where_either_is(inverted):
+    mesh = repair(joined(box(), box(at=(0.5, 0.1, 0.2), inverted=inverted)))
+    assert mesh.volume == pytest.approx(2 - 0.5 * 0.9 * 0.8)
+    assert mesh.repairs[-1] == "2 overlapping parts merged into 1"
+    points = np.random.default_rng(0).uniform(-0.8, 1.3, (2000, 3))
+    in_first = (np.abs(points) < 0.5).all(axis=1)
+    in_second = (np.abs(points - [0.5, 0.1, 0.2]) < 0.5).all(axis=1)
+    assert np.array_equal(Truth(mesh).signed_distance(points) < 0, in_first | in_second)
+
+
+def test_a_nested_part_is_swallowed_but_a_cavity_stays():
+    assert repair(joined(box(), box(size=0.4))).volume == pytest.approx(1)
+    hollow = repair(joined(box(), box(size=0.4, inverted=True)))
+    assert (hollow.volume, hollow.repairs) == (pytest.approx(1 - 0.064), ())
+    inside_out = repair(joined(box(inverted=True), box(size=0.4)))
+    assert inside_out.volume == pytest.approx(1 - 0.064)
+
+
+def test_parts_apart_stay_as_they_are():
+    mesh = repair(joined(box(), box(at=(2, 0, 0))))
+    assert (len(mesh.faces), mesh.repairs) == (24, ())
+
+
+@pytest.mark.parametrize(("height", "reason"), [(lambda x: 0.1 * np.sin(9 * x), "cut away")])
+def test_a_sheet_is_wrapped_closely_with_a_note(height, reason):
+    thin = sheet(height)
+    mesh = repair(thin)
+    assert mesh.watertight
+    assert 0 < mesh.volume < 0.01
+    assert mesh.repairs[-1].startswith("wrapped: ") and reason in mesh.repairs[-1]
+    points, _ = sample_surface(thin, 500, seed=0)
+    assert np.abs(Truth(mesh).signed_distance(points)).max() < 0.005
+
+
+def walls() -> Mesh:
+    """Six sides of a box that do not touch."""
+    sides = box().triangles + 0.02 * box().face_normals[:, None]
+    return Mesh(sides.reshape(-1, 3), np.arange(36).reshape(-1, 3))
+
+
+def test_a_mesh_without_volume_is_an_error():
+    with pytest.raises(ValueError, match=r"must enclose a volume, found a single triangle; .* give the sheet a thick"):
+        repair(Mesh(np.eye(3), np.array([[0, 1, 2]])))
+    with pytest.raises(ValueError, match=r"found 288 faces in flat sheets; .*export a closed surface"):
+        repair(sheet(lambda x: 0 * x))
+    flat = sheet(lambda x: 0 * x)
+    twice = Mesh(flat.vertices, np.concatenate([flat.faces, flat.faces[:, ::-1]]))
+    with pytest.raises(ValueError, match=r"found 288 faces in flat sheets \(after 288 doubled faces dropped\)"):
+        repair(twice)
+
+
+def test_walls_around_a_room_have_a_volume():
+    mesh = repair(walls())
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(1.04**3, rel=0.05)
+    assert mesh.repairs[-1].startswith("wrapped: ")
+
+
+def warnings_of(mesh: Mesh) -> list[str]:
+    return [told for told in mesh.repairs if told.startswith("warning: repair changed the ")]
+
+
+def test_a_repair_that_changes_area_or_volume_much_says_by_how_much():
+    ball = trimesh.creation.icosphere(3)
+    half = Mesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > 0])
+    (warning,) = warnings_of(repair(half))
+    area, volume = (r"from ([\d.]+) to ([\d.]+) \(([+-]\d+)%\)",) * 2
+    found = re.fullmatch(
+        f"warning: repair changed the area {area} and volume {volume}, in the file's units: .*", warning
+    )
+    numbers = [float(number) for number in found.groups()]
+    assert numbers[0] == pytest.approx(half.area, rel=1e-3)
+    assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the disc that closes it
+    assert numbers[2] == pytest.approx(100 * (numbers[1] / numbers[0] - 1), abs=1)
+    assert numbers[4] == pytest.approx(2 / 3 * np.pi, rel=0.03)
+    sheet_like = repair(sheet(lambda x: 0.1 * np.sin(9 * x)))  # wrapped on both sides: its area doubles
+    assert len(warnings_of(sheet_like)) == 1 and sheet_like.repairs[0] == warnings_of(sheet_like)[0]
+
+
+def test_ordinary_repairs_come_without_a_warning():
+    jumbled = box().faces.copy()
+    jumbled[::3] = jumbled[::3, ::-1]
+    ball = trimesh.creation.icosphere(3)
+    for mesh in (
+        Mesh(box().vertices, box().faces[2:]),  # one side of six is open
+        Mesh(box().vertices, jumbled),
+        Mesh(ball.vertices, ball.faces[30:]),
+        joined(box(inverted=True)),
+        joined(box(), box(at=(0.1, 0.1, 0.1))),  # parts that overlap counted twice
+        joined(box(), box(at=(0.01, 0.0, 0.0)), box(at=(0.0, 0.01, 0.0))),
+    ):
+        mended = repair(mesh)
+        assert mended.repairs and not warnings_of(mended)
+
+
+def test_a_torn_sphere_is_wrapped_full_not_hollow():
+    ball = trimesh.creation.icosphere(2)
+    kept = np.random.default_rng(0).random(len(ball.faces)) < 0.7
+    mesh = repair(Mesh(ball.vertices, ball.faces[kept]))
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(ball.volume, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "volume", "repaired"),
+    [
+        ("spot", 0.718, ""),
+        ("fandisk", 20.24, ""),
+        ("rocker-arm", 0.0425, ""),
+        ("suzanne", 2.168, "4 holes closed"),
+        ("teapot", 25.85, "4 overlapping parts merged into 1"),
+        ("beetle", 0.0557, "holes closed"),
+    ],
+)
+def test_real_meshes_become_solids_that_cover_their_surface(name, volume, repaired):
+    path = SHARED / f"{name}.obj"
+    if not path.exists():
+        pytest.skip("the shared test meshes are not beside this checkout")
+    mesh = load_mesh(path)
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(volume, rel=0.01)
+    assert repaired in "; ".join(mesh.repairs) if repaired else mesh.repairs == ()
+    assert len(warnings_of(mesh)) == (name == "beetle")  # whose body is an open shell
+    made = trimesh.load_mesh(path, process=False)
+    points, _ = sample_surface(Mesh(made.vertices, made.faces), 2000, seed=0)
+    assert Truth(mesh).signed_distance(points).max() < 0.01 * mesh.diagonal

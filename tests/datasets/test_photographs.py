@@ -1,0 +1,146 @@
+"""Textures and photographs of a ball: a point has one colour from everywhere, and what cannot work is told."""
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.tasks.photographs import sample
+from datasets.mesh import Mesh
+from datasets.photographs import Photograph, Photography, turned
+from datasets.textures import PHOTOGRAPHS, TEXTURES, make_texture
+from datasets.truth import Truth
+from tests.tiny import camera_of
+
+PLAINLY = Photography(
+    views=8, texture="noise", texture_size=0.5, shading="unlit", background="grey", noise=0.0, blur=0.0, exposure=0.0
+)
+CAMERA = camera_of(32, angles=(0.0, 20.0))
+
+
+@pytest.fixture(scope="module")
+def ball() -> Truth:
+    made = trimesh.creation.icosphere(subdivisions=4, radius=0.7)
+    return Truth(Mesh(np.array(made.vertices), np.array(made.faces)))
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (300, 3))
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    texture = make_texture(name, 0.5, seed=3)
+    colours = texture(points, normals)
+    assert colours.shape == (300, 3)
+    assert colours.min() >= 0 and colours.max() <= 1
+    assert np.array_equal(colours, make_texture(name, 0.5, seed=3)(points, normals))
+    nearby = texture(points + 1e-5, normals)
+    assert np.abs(nearby - colours).max() < 0.02  # no jump
+    assert (colours.std() > 0.05) == (name != "plain")
+
+
+def test_noise_has_another_colour_for_each_seed():
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    first, second = (make_texture("noise", 0.3, seed)(points, points) for seed in (0, 1))
+    assert np.abs(first - second).mean() > 0.1
+
+
+def test_each_axis_sees_its_own_projection():
+    texture = make_texture(PHOTOGRAPHS[0], 1.0, seed=0)
+    along = np.array([[0.9, 0.2, 0.3], [0.1, 0.2, 0.3]])  # the same place but for x, seen along x
+    same = texture(along, np.array([[1.0, 0, 0], [1, 0, 0]]))
+    assert same[0] == pytest.approx(same[1])
+    assert np.abs(texture(along[:1], np.array([[0, 1.0, 0]])) - same[0]).max() > 0.01
+
+
+def test_cameras_stand_on_a_circle_and_look_at_the_origin():
+    quarter = turned(CAMERA, pi / 2)
+    assert quarter.center.norm().item() == pytest.approx(2.5, rel=1e-5)
+    assert quarter.center[1].item() == pytest.approx(CAMERA.center[1].item(), abs=1e-5)
+    assert (quarter.center @ CAMERA.center - CAMERA.center[1] ** 2).item() == pytest.approx(0.0, abs=1e-4)
+    pixels, _ = quarter.project(torch.zeros(1, 3))
+    assert pixels[0].tolist() == pytest.approx([16.0, 16.0], abs=1e-3)
+    four = turned(turned(turned(quarter, pi / 2), pi / 2), pi / 2)
+    assert torch.allclose(four.world_to_camera, CAMERA.world_to_camera, atol=1e-5)
+
+
+@pytest.mark.parametrize("texture", ["noise", "astronaut"])
+def test_a_point_that_two_views_see_has_one_colour(ball, texture):
+    size = 1.0 if texture == "noise" else 4.0
+    first, second, *_ = replace(PLAINLY, texture=texture, texture_size=size).take(ball, CAMERA, seed=0)
+    view = first.view
+    points = view.camera.rays().at(view.depth / view.camera.depth(torch.ones(32, 32)))
+    pixels, depth = second.view.camera.project(points)
+    there, _ = sample(second.view.depth[..., None], pixels)
+    both = view.mask & ((there[..., 0] - depth).abs() < 0.01)
+    colours, _ = sample(second.colours, pixels)
+    right = (colours - first.colours)[both].abs().mean()
+    wrong = (second.colours - first.colours)[both].abs().mean()
+    assert both.sum() > 100
+    assert right < 0.4 * wrong
+
+
+def test_the_background_is_grey_or_differs_from_view_to_view(ball):
+    first, second, *_ = PLAINLY.take(ball, CAMERA, seed=0)
+    outside = ~(first.view.mask | second.view.mask)
+    outside[1:-1, 1:-1] &= False  # the frame: no pixel there has a part of the ball
+    assert (first.colours[outside] == 0.5).all()
+    first, second, *_ = replace(PLAINLY, background="noise").take(ball, CAMERA, seed=0)
+    assert (first.colours - second.colours)[outside].abs().mean() > 0.1
+
+
+def test_noise_blur_and_exposure_change_colours_by_their_amounts(ball):
+    plain = PLAINLY.take(ball, CAMERA, seed=0)
+    noisy = replace(PLAINLY, noise=0.03).take(ball, CAMERA, seed=0)
+    background = ~plain[0].view.mask
+    assert (noisy[0].colours - plain[0].colours)[background].std().item() == pytest.approx(0.03, rel=0.2)
+    exposed = replace(PLAINLY, exposure=0.2).take(ball, CAMERA, seed=0)
+    ratios = [(a.colours[0, 0, 0] / b.colours[0, 0, 0]).log().item() for a, b in zip(exposed, plain, strict=True)]
+    assert 0.05 < np.std(ratios) < 0.5
+    soft = replace(PLAINLY, blur=2.0).take(ball, CAMERA, seed=0)
+    assert soft[0].colours.diff(dim=0).abs().mean() < 0.7 * plain[0].colours.diff(dim=0).abs().mean()
+
+
+def test_lambertian_light_is_fixed(ball):
+    lit = replace(PLAINLY, texture="plain", shading="lambertian").take(ball, CAMERA, seed=0)
+    bright = [photograph.colours[photograph.view.mask].mean().item() for photograph in lit]
+    assert max(bright) > 1.2 * min(bright)  # the ball has a dark side, which some cameras see
+
+
+def test_a_surface_of_one_colour_is_refused(ball):
+    with pytest.raises(ValueError, match=r"has nothing to compare: set shading=lambertian"):
+        replace(PLAINLY, texture="plain")
+    with pytest.raises(ValueError, match=r"one colour in all images: choose another texture"):
+        replace(PLAINLY, texture_size=1e9).take(ball, CAMERA, seed=0)
+
+
+def test_a_camera_that_sees_nothing_is_refused(ball):
+    away = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ CAMERA.world_to_camera)
+    with pytest.raises(ValueError, match="camera 0 sees nothing of the shape"):
+        PLAINLY.take(ball, away, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"views": 1}, "views must be at least 2"),
+        ({"texture": "wood"}, "texture must be one of noise, plain"),
+        ({"texture_size": 0.0}, "texture_size must be positive"),
+        ({"shading": "pbr"}, "shading must be one of"),
+        ({"background": "sky"}, "background must be one of"),
+        ({"noise": -0.1}, "noise must be at least 0"),
+        ({"blur": float("nan")}, "blur must be at least 0"),
+    ],
+)
+def test_invalid_settings_are_errors(changed, message):
+    with pytest.raises(ValueError, match=message):
+        replace(PLAINLY, **changed)
+
+
+def test_images_have_the_size_of_their_camera(ball):
+    first = PLAINLY.take(ball, CAMERA, seed=0)[0]
+    with pytest.raises(ValueError, match=r"colours must have the camera's size, \(32, 32, 3\), not \(16, 32, 3\)"):
+        Photograph(first.view, first.colours[:16])

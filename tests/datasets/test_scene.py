@@ -1,0 +1,101 @@
+"""What a camera sees of a mesh, against closed forms; and scenes that belong to their shape."""
+
+from dataclasses import dataclass, replace
+from math import radians, tan
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from datasets.dataset import Split
+from datasets.mesh import Mesh
+from datasets.scene import make_scene, see
+from datasets.truth import Truth
+from datasets.views import ViewSampler, look_at
+from renderers.camera import Camera
+
+VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=40)
+
+
+def from_trimesh(made: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.array(made.vertices), np.array(made.faces))
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes of different lengths, moved upward."""
+
+    moved: float = 0.0
+    name: str = "box"
+    repairs: tuple[str, ...] = ()
+
+    def mesh(self, split, index):
+        made = trimesh.creation.box((0.4 + 0.05 * index, 0.3, 0.3))
+        return replace(from_trimesh(made.apply_translation((0, self.moved, 0))), repairs=self.repairs)
+
+    def identity(self):
+        return {"moved": self.moved}
+
+
+def bearings(height, width, focal):
+    """Camera coordinates, on the plane z = 1, of the pixel centres, worked out apart from Camera."""
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    return np.stack([(columns - width / 2) / focal, (rows - height / 2) / focal, np.ones((height, width))], axis=-1)
+
+
+def test_a_cube_seen_square_on_has_the_depth_of_its_face():
+    view = see(Truth(from_trimesh(trimesh.creation.box((1, 1, 1)))), VIEWS.camera(0.0, 0.0))
+    focal = 20 / tan(radians(25))
+    on_face = np.abs(bearings(40, 40, focal)[..., :2] * 2.0).max(-1) < 0.5  # the face lies at z = 2 in the camera
+    assert np.array_equal(view.mask.numpy(), on_face)
+    assert 0 < on_face.sum() < on_face.size
+    assert view.depth.numpy() == pytest.approx(np.where(on_face, 2.0, 0.0), abs=1e-6)
+    assert view.normals.numpy() == pytest.approx(np.where(on_face[..., None], [0.0, 0, 1], 0.0), abs=1e-6)
+    assert (view.depth.dtype, view.normals.dtype, view.mask.dtype) == (torch.float32, torch.float32, torch.bool)
+
+
+def test_a_sphere_beside_the_axis_in_an_oblong_image_has_the_depth_of_its_closed_form():
+    radius, centre = 0.6, np.array([0.3, 0.2, -0.1])
+    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=5, radius=radius).apply_translation(centre))
+    motion = look_at(torch.tensor([1.0, 1.5, 2.0]), torch.zeros(3))
+    camera = Camera(torch.tensor([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]]), motion, height=24, width=40)
+    view = see(Truth(mesh), camera)
+
+    along = bearings(24, 40, 30.0)
+    middle = motion.numpy().astype(float)[:3, :3] @ centre + motion.numpy()[:3, 3]
+    half, square = along @ middle, (along**2).sum(-1)
+    chord = half**2 - square * (middle @ middle - radius**2)
+    sure = np.abs(chord) > 0.02  # the polyhedron's outline lies a little inside the sphere's
+    hit = chord > 0
+    depth = (half - np.sqrt(np.where(hit, chord, 0))) / square  # along the bearing, whose z is 1
+    assert view.mask.shape == (24, 40)
+    assert np.array_equal(view.mask.numpy()[sure], hit[sure])
+    both = sure & hit
+    assert both.sum() > 100
+    assert view.depth.numpy()[both] == pytest.approx(depth[both], abs=2e-3)
+    outward = (depth[..., None] * along - middle) @ motion.numpy()[:3, :3] / radius  # back to world axes
+    assert (view.normals.numpy()[both] * outward[both]).sum(-1).min() > 0.995
+    background = ~view.mask
+    assert view.depth[background].abs().sum() == 0
+    assert view.normals[background].abs().sum() == 0
+
+
+def test_a_scene_is_always_the_same_and_its_camera_belongs_to_the_shape():
+    scene = make_scene(Boxes(), VIEWS, split=Split.TEST, index=3)
+    again = make_scene(Boxes(), VIEWS, split=Split.TEST, index=3)
+    assert scene.name == "box test 3"
+    assert torch.equal(scene.view.depth, again.view.depth)
+    assert np.array_equal(scene.mesh.vertices, again.mesh.vertices)
+    others = [(Split.TEST, 4), (Split.TRAIN, 3), (Split.VALIDATION, 3)]
+    for split, index in others:
+        other = make_scene(Boxes(), VIEWS, split=split, index=index).view.camera
+        assert not torch.allclose(other.world_to_camera, scene.view.camera.world_to_camera)
+
+
+def test_a_camera_that_sees_nothing_is_refused():
+    narrow = replace(VIEWS, field_of_view=5.0)
+    with pytest.raises(ValueError, match=r"sees nothing of box 0 \(repaired: 1 hole closed\): widen view"):
+        make_scene(Boxes(moved=0.8, repairs=("1 hole closed",)), narrow, split=Split.TEST, index=0)
+    with pytest.raises(ValueError, match=r"the camera sees nothing of box 0: widen view.field_of_view or distance"):
+        make_scene(Boxes(moved=0.8), narrow, split=Split.TEST, index=0)

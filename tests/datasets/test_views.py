@@ -1,0 +1,117 @@
+"""Where cameras stand and what they have up, against a worked example."""
+
+from dataclasses import replace
+from math import atan2, cos, pi, radians, sin, tan
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.views import ViewSampler, look_at
+
+VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=33)
+
+
+def project(camera, point):
+    """Column and row of a world point, in pixels."""
+    inside = camera.world_to_camera @ torch.tensor([*point, 1.0])
+    pixel = camera.intrinsics @ inside[:3]
+    return (pixel[:2] / pixel[2]).tolist()
+
+
+def test_the_camera_at_no_angles_is_the_one_worked_out_by_hand():
+    camera = VIEWS.camera(0.0, 0.0)  # on +z, looking along -z: x right stays x, y down is -y, z forward is -z
+    expected = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]])
+    assert torch.allclose(camera.world_to_camera, expected, atol=1e-6)
+    focal = 16.5 / tan(radians(25))
+    assert torch.allclose(camera.intrinsics, torch.tensor([[focal, 0, 16.5], [0, focal, 16.5], [0, 0, 1]]))
+    assert (camera.height, camera.width) == (33, 33)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(90.0, 0.0), (0.0, 30.0), (200.0, -40.0), (355.0, 89.0)])
+def test_angles_place_the_camera(azimuth, elevation):
+    across, up = radians(azimuth), radians(elevation)
+    eye = [2.5 * cos(up) * sin(across), 2.5 * sin(up), 2.5 * cos(up) * cos(across)]
+    assert VIEWS.camera(azimuth, elevation).center.tolist() == pytest.approx(eye, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_image_has_the_origin_in_its_middle_and_world_y_up(seed):
+    camera = VIEWS.draw(seed)
+    assert project(camera, (0, 0, 0)) == pytest.approx([16.5, 16.5], abs=1e-4)
+    column, row = project(camera, (0, 0.5, 0))
+    assert column == pytest.approx(16.5, abs=1e-4)
+    assert row < 16.5 - 3  # rows grow downward
+    middle = camera.rays().directions[16, 16]
+    assert torch.allclose(middle, -camera.center / 2.5, atol=1e-5)
+
+
+def test_x_is_to_the_right_from_the_front_and_to_the_left_from_behind():
+    assert project(VIEWS.camera(0.0, 0.0), (0.5, 0, 0))[0] > 16.5 + 3
+    assert project(VIEWS.camera(180.0, 0.0), (0.5, 0, 0))[0] < 16.5 - 3
+
+
+def test_the_unit_sphere_is_seen_whole():
+    rays = VIEWS.camera(37.0, 20.0).rays()
+    least = torch.linalg.cross(rays.origins, rays.directions).norm(dim=-1)
+    border = torch.cat([least[0], least[-1], least[:, 0], least[:, -1]])
+    assert border.min() > 1.0
+
+
+def test_draws_follow_the_seed_and_stay_in_range():
+    def angles(camera):
+        x, y, z = (camera.center / 2.5).double()
+        return float(torch.rad2deg(torch.atan2(x, z)) % 360), float(torch.rad2deg(torch.asin(y)))
+
+    assert torch.equal(VIEWS.draw(5).world_to_camera, VIEWS.draw(5).world_to_camera)
+    narrow = replace(VIEWS, azimuth=(100.0, 140.0), elevation=(-20.0, 10.0))
+    drawn = torch.tensor([angles(narrow.draw(seed)) for seed in range(200)])
+    for values, low, high in ((drawn[:, 0], 100, 140), (drawn[:, 1], -20, 10)):
+        assert low - 0.01 <= values.min() < low + 0.1 * (high - low)
+        assert high + 0.01 >= values.max() > high - 0.1 * (high - low)
+    assert len(drawn.unique(dim=0)) == 200
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"distance": 0.0}, "distance must be positive, not 0.0"),
+        ({"distance": float("nan")}, "distance must be positive, not nan"),
+        ({"resolution": 3}, "resolution must be at least 4, not 3: set"),
+        ({"resolution": -3}, "resolution must be at least 4, not -3: set"),
+        ({"field_of_view": 0.0}, "field_of_view must lie between 0 and 180 degrees, not 0.0"),
+        ({"field_of_view": 180.0}, "field_of_view must lie between 0 and 180 degrees, not 180.0"),
+        ({"elevation": (-90.0, 0.0)}, "elevation must rise within -90 to 90 degrees"),
+        ({"elevation": (0.0, 90.0)}, "elevation must rise within -90 to 90 degrees"),
+        ({"elevation": (35.0, 15.0)}, "elevation must rise within -90 to 90 degrees"),
+    ],
+)
+def test_invalid_views_are_errors(changed, message):
+    with pytest.raises(ValueError, match=message):
+        replace(VIEWS, **changed)
+
+
+@pytest.mark.parametrize("eye", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_camera_above_or_at_its_target_is_an_error(eye):
+    with pytest.raises(ValueError, match=r"eye must not lie on, above or below target.*lower the elevation"):
+        look_at(torch.tensor(eye), torch.zeros(3))
+
+
+def test_look_at_keeps_its_target_ahead():
+    eye, target = torch.tensor([0.3, -0.7, 1.2]), torch.tensor([-0.4, 0.2, -0.5])
+    motion = look_at(eye, target)
+    assert torch.allclose(motion @ torch.cat([eye, torch.ones(1)]), torch.tensor([0.0, 0, 0, 1]), atol=1e-6)
+    seen = motion @ torch.cat([target, torch.ones(1)])
+    assert seen[:2].abs().max() < 1e-6
+    assert seen[2].item() == pytest.approx((target - eye).norm().item(), rel=1e-6)
+
+
+def test_the_view_of_a_shape_is_not_drawn_as_the_shape_is():
+    # Shapes draw their parameters from the same number; drawn alike, narrow ones would all be seen from one side.
+    views = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 8)
+    shares = []
+    for seed in range(40):
+        x, _, z = views.draw(seed).center.tolist()
+        shares.append((atan2(x, z) / (2 * pi)) % 1)
+    shapes = [np.random.default_rng(seed).random() for seed in range(40)]
+    assert abs(np.corrcoef(shares, shapes)[0, 1]) < 0.5

@@ -1,0 +1,183 @@
+"""The judge of gradients against closed forms: planes, whose derivatives are known, and an edge that moves."""
+
+from math import sqrt
+
+import pytest
+import torch
+
+from bench.evaluate.finite_differences import _clear, differences, image_differences, subrays
+from renderers.camera import Camera, Rays
+from renderers.fields.analytic import Shape
+from renderers.fields.mlp import Decoder
+from tests.tiny import camera_of, plane_decoder
+
+CODE_WEIGHTS = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+CODE = torch.tensor([0.1, 0.2, -0.1], dtype=torch.float64)
+OFFSET = -0.06  # so that the plane goes through the origin
+NORMALS = {"frontal": (0.0, 0.0, 1.0), "oblique": (0.6, 0.0, 0.8), "grazing": (sqrt(1 - 0.1**2), 0.0, 0.1)}
+
+
+def camera() -> Camera:
+    return camera_of(6, field_of_view=2.0).double()
+
+
+def plane(normal: tuple[float, float, float], scale: float = 1.0) -> Decoder:
+    """scale * (normal . x + CODE_WEIGHTS . code - OFFSET)."""
+    return plane_decoder([scale * x for x in normal], scale * CODE_WEIGHTS, scale * OFFSET)
+
+
+def distance_to_plane(normal: torch.Tensor, rays: Rays, code: torch.Tensor) -> torch.Tensor:
+    level = OFFSET - CODE_WEIGHTS @ code
+    return (level - rays.origins @ normal) / (rays.directions @ normal)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.4, 3.0])
+@pytest.mark.parametrize("angle", NORMALS)
+def test_differences_are_the_derivatives_of_a_plane(angle, scale):
+    normal, pixels = torch.tensor(NORMALS[angle], dtype=torch.float64), torch.tensor([0, 7, 20, 35])
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    distance = distance_to_plane(normal, camera().moved(twist).rays().flat()[pixels], CODE)
+    by_camera = torch.stack([torch.autograd.grad(one, twist, retain_graph=True)[0] for one in distance])
+    slope = camera().rays().flat()[pixels].directions @ normal
+    directions = torch.linalg.qr(torch.randn(3, 2, generator=torch.Generator().manual_seed(0)).double()).Q
+
+    found = differences(
+        plane(NORMALS[angle], scale), CODE, directions, camera=camera(), pixels=pixels, distance=distance.detach()
+    )
+    assert found.valid.all()
+    assert torch.allclose(found.code, -(CODE_WEIGHTS @ directions) / slope[:, None], rtol=1e-7, atol=1e-8)
+    assert torch.allclose(found.camera, by_camera, rtol=1e-7, atol=1e-7)
+
+
+def test_the_camera_is_moved_in_its_own_axes():
+    """Forwards by one unit, the plane that faces the camera is nearer by one over the cosine; sideways it is not."""
+    middle = torch.tensor([14])
+    rays = camera().rays().flat()[middle]
+    distance = distance_to_plane(torch.tensor([0.0, 0, 1.0]).double(), rays, CODE)
+    found = differences(
+        plane((0, 0, 1)), CODE, torch.eye(3).double(), camera=camera(), pixels=middle, distance=distance
+    )
+    across, down, forward = found.camera[0, :3].tolist()
+    assert forward == pytest.approx(1 / -rays.directions[0, 2].item(), rel=1e-7)  # world points go further off
+    assert (across, down) == pytest.approx((0.0, 0.0), abs=1e-8)
+
+
+def test_where_there_is_no_root_a_pixel_does_not_count_and_the_others_do():
+    pixels = torch.tensor([0, 14, 35])
+    rays = camera().rays().flat()[pixels]
+    distance = distance_to_plane(torch.tensor(NORMALS["oblique"]).double(), rays, CODE)
+    found = differences(
+        plane(NORMALS["oblique"]), CODE, torch.eye(3).double(), camera=camera(), pixels=pixels,
+        distance=distance + torch.tensor([0.0, 0.01, 0.0]).double(),
+    )  # fmt: skip
+    assert found.valid.tolist() == [True, False, True]
+
+
+def union_decoder(one: tuple[torch.Tensor, float], other: tuple[torch.Tensor, float]) -> Decoder:
+    """The lesser of two planes' fields, normal . x - offset, with a code of one number added to the first."""
+    (a, a_offset), (b, b_offset) = one, other
+    towards_code = torch.tensor([1.0], dtype=torch.float64)
+    rows = [torch.cat([towards_code, a]), -torch.cat([towards_code, a]), torch.cat([towards_code, a - b])]
+    decoder = Decoder(layers=1, width=3, code_length=1, skip=0, narrow=False).double().requires_grad_(False)
+    decoder.hidden[0].weight.copy_(torch.stack(rows))
+    decoder.hidden[0].bias.copy_(torch.tensor([-a_offset, a_offset, b_offset - a_offset], dtype=torch.float64))
+    decoder.last.weight.copy_(torch.tensor([[1.0, -1.0, -1.0]]))
+    decoder.last.bias.zero_()
+    return decoder
+
+
+def test_a_pixel_near_grazing_does_not_cost_the_others():
+    """Its distance moves 20,000 times as far as the field, which says nothing about what others see."""
+    pixels, slope = torch.tensor([15, 17]), 5e-5
+    rays = camera().rays().flat()[pixels]
+    other, flat = rays.directions
+    aside = torch.nn.functional.normalize(other - (other @ flat) * flat, dim=0)
+    grazed = aside - slope * flat  # rises along the one ray, and falls slowly along the other
+    point = rays.origins[1] + 2.0 * flat
+    front = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    decoder = union_decoder((front, 0.0), (grazed, (grazed @ point).item()))
+    decoder.hidden[0].weight[2, 0] = 0.0  # the code moves both planes
+    distance = torch.stack([-rays.origins[0, 2] / other[2], torch.tensor(2.0, dtype=torch.float64)])
+    code, directions = torch.zeros(1).double(), torch.ones(1, 1).double()
+    assert torch.allclose(decoder.at(code)(rays.at(distance)), torch.zeros(2).double(), atol=1e-12)
+    found = differences(decoder, code, directions, camera=camera(), pixels=pixels, distance=distance)
+    assert found.code[1, 0].item() == pytest.approx(1 / slope, rel=0.01)
+    assert found.code[0, 0].item() == pytest.approx(-1 / other[2].item(), rel=1e-7)
+    assert found.valid[0]
+
+
+def passing_decoder(at: float, height: float) -> Decoder:
+    """The lesser of 20 z and 0.1 |z - at| + height, in float64: a wall at 0, and something beside the way to it."""
+    decoder = Decoder(layers=2, width=4, code_length=0, skip=0, narrow=False).double().requires_grad_(False)
+    decoder.hidden[0].weight.copy_(torch.tensor([0.1, -0.1, 20, -20])[:, None] * torch.tensor([0.0, 0, 1]))
+    decoder.hidden[0].bias.copy_(torch.tensor([-0.1 * at, 0.1 * at, 0.0, 0.0]))
+    decoder.hidden[1].weight.copy_(torch.tensor([[-1.0, -1, 1, -1], [0, 0, 1, -1], [0, 0, -1, 1], [0, 0, 0, 0]]))
+    decoder.hidden[1].bias.copy_(torch.tensor([-height, 0.0, 0.0, 0.0]))
+    decoder.last.weight.copy_(torch.tensor([[-1.0, 1.0, -1.0, 0.0]]))
+    decoder.last.bias.zero_()
+    return decoder
+
+
+@pytest.mark.parametrize(
+    ("at", "height", "clear"), [(0.5, 0.004, False), (0.5, 0.02, True), (0.9, 0.004, False), (-0.5, 0.004, True)]
+)
+def test_a_ray_that_passes_close_by_something_before_its_hit_is_not_clear(at, height, clear):
+    field = passing_decoder(at, height).at(torch.zeros(0).double())
+    z = torch.linspace(-0.9, 0.9, 19, dtype=torch.float64)
+    points = torch.stack([torch.zeros(19), torch.zeros(19), z], dim=1)
+    assert torch.allclose(field(points), torch.minimum(20 * z, 0.1 * (z - at).abs() + height), atol=1e-12)
+    rays = Rays(torch.tensor([[0.0, 0, 2.5]]).double(), torch.tensor([[0.0, 0, -1]]).double())
+    found = _clear(field, rays, torch.tensor([2.5]).double(), margin=torch.tensor(0.01).double())
+    assert found.tolist() == [clear]
+
+
+def edge(at: torch.Tensor | float) -> Shape:
+    """A wall z <= 0 that ends at x = `at`; its end recedes from there, so that a camera in front sees none of it."""
+    return Shape(lambda points: torch.maximum(points[..., 2], points[..., 0] - 0.2 * points[..., 2] - at))
+
+
+def test_the_differences_of_an_image_see_what_comes_into_view():
+    """An edge moves by so many columns of rays: each swaps the background's distance for that of the wall."""
+    view, count = camera_of(8, field_of_view=2.0).double(), 6
+    directions, pixels = torch.eye(2).double(), torch.tensor([8 * 3 + 3, 8 * 3 + 4, 8 * 3 + 6])
+    column = 2.5 / view.intrinsics[0, 0].item() / count  # width of a column of rays, where the wall is
+    middle = 2 * column  # between the second and the third column of the pixel beside the axis
+    found = image_differences(
+        lambda shift: edge(middle + shift[0]), directions,
+        camera=view, pixels=pixels, step=2 * column, supersampling=count, lipschitz=1.1,
+    )  # fmt: skip
+    columns = subrays(view, pixels[1:2], count).directions[0].view(count, count, 3)
+    swapped = columns[:, :4]  # the edge moves over them, from two before the middle to two behind it
+    wall = -2.5 / swapped[..., 2]
+    sine = (1 - swapped[..., 2].square()).sqrt()
+    background = 2.5 * -swapped[..., 2] + (1 - (2.5 * sine).square()).sqrt()
+    rate = (wall - background).sum() / count**2 / (4 * column)
+    assert found[1, 0].item() == pytest.approx(rate.item(), rel=1e-6)
+    assert found[1, 0] < -1 / (8 * column)  # more than one unit of distance, times its share of the pixel
+    assert torch.equal(found[:, 1], torch.zeros(3).double())  # the other direction moves nothing
+    assert found[[0, 2], 0].abs().max() < 1e-9
+
+
+def test_the_differences_of_an_image_are_those_of_the_surface_where_no_edge_moves():
+    view, pixels = camera(), torch.tensor([0, 14])
+    found = image_differences(
+        lambda shift: plane((0, 0, 1)).at(CODE + shift), torch.eye(3).double(),
+        camera=view, pixels=pixels, step=1e-3, supersampling=3, lipschitz=1.2,
+    )  # fmt: skip
+    slope = subrays(view, pixels, 3).directions[..., 2]
+    assert torch.allclose(found, -CODE_WEIGHTS * (1 / slope).mean(dim=1, keepdim=True), rtol=1e-6)
+
+
+def test_rays_within_pixels_lie_on_a_regular_grid_about_the_pixels_own():
+    view, pixels = Camera(camera_of(4).intrinsics, camera_of(4).world_to_camera, 4, 4).double(), torch.tensor([5, 12])
+    rays = subrays(view, pixels, 3)
+    assert rays.shape == (2, 9)
+    assert torch.allclose(rays.directions[:, 4], view.rays().flat()[pixels].directions)  # the middle one of nine
+    in_camera = rays.directions @ view.world_to_camera[:3, :3].T
+    image = (in_camera / in_camera[..., 2:]) @ view.intrinsics.T
+    inner = (torch.arange(3) + 0.5) / 3
+    columns = torch.stack([1 + inner.repeat(3), 0 + inner.repeat(3)]).double()  # pixel 5 is in row 1, column 1
+    rows = torch.stack([1 + inner.repeat_interleave(3), 3 + inner.repeat_interleave(3)]).double()
+    assert torch.allclose(image[..., 0], columns)
+    assert torch.allclose(image[..., 1], rows)
+    assert torch.allclose(rays.origins, view.center.expand(2, 9, 3))

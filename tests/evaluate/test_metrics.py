@@ -1,0 +1,164 @@
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+
+from bench.evaluate.metrics import DEFINITIONS, Surface, image_metrics, surface_metrics
+
+SURFACE = [
+    "chamfer_l2",
+    "chamfer_l1",
+    "chamfer_gt_to_pred",
+    "accuracy",
+    "completeness",
+    "fscore",
+    "normal_consistency",
+]
+IMAGE = ["depth_mae", "mask_iou"]
+
+
+def surface(points, normals) -> Surface:
+    return Surface(
+        np.array(points, dtype=np.float64).reshape(-1, 3), np.array(normals, dtype=np.float64).reshape(-1, 3)
+    )
+
+
+def random_surface(seed: int, count: int) -> Surface:
+    generator = np.random.default_rng(seed)
+    return Surface(generator.standard_normal((count, 3)), generator.standard_normal((count, 3)))
+
+
+def test_worked_example():
+    # Truth:      A (0,0,0) normal +z,   B (1,0,0) normal +z.
+    # Prediction: P (0,0,0.1) normal -z, Q (1,0,0.3) normal (0,3,4)/5, R (1,0.2,0) normal +x.
+    # Prediction -> truth: P-A 0.1, Q-B 0.3, R-B 0.2; cosines 1, 0.8, 0.
+    #   mean 0.6/3 = 0.2; mean square (0.01 + 0.09 + 0.04)/3 = 0.14/3; mean cosine 1.8/3 = 0.6.
+    # Truth -> prediction: A-P 0.1, B-R 0.2; cosines 1, 0.
+    #   mean 0.15; mean square (0.01 + 0.04)/2 = 0.025; mean cosine 0.5.
+    # Threshold 0.15: precision 1/3, recall 1/2, F = 2 * (1/6) / (5/6) = 0.4.
+    truth = surface([[0, 0, 0], [1, 0, 0]], [[0, 0, 1], [0, 0, 1]])
+    predicted = surface([[0, 0, 0.1], [1, 0, 0.3], [1, 0.2, 0]], [[0, 0, -1], [0, 0.6, 0.8], [1, 0, 0]])
+    assert surface_metrics(predicted, truth, threshold=0.15) == pytest.approx(
+        {
+            "chamfer_l2": 0.14 / 3 + 0.025,
+            "chamfer_l1": 0.175,
+            "chamfer_gt_to_pred": 0.025,
+            "accuracy": 0.2,
+            "completeness": 0.15,
+            "fscore": 0.4,
+            "normal_consistency": 0.55,
+        }
+    )
+
+
+def test_missing_part_shows_in_completeness_only():
+    # The prediction is exact but lacks B, two units away from A:
+    # accuracy 0; completeness (0 + 2)/2 = 1; mean square (0 + 4)/2 = 2; precision 1, recall 1/2, F = 2/3.
+    truth = surface([[0, 0, 0], [2, 0, 0]], [[0, 0, 1], [0, 0, 1]])
+    measured = surface_metrics(surface([[0, 0, 0]], [[0, 0, 1]]), truth, threshold=0.01)
+    assert (measured["accuracy"], measured["completeness"]) == (0, 1)
+    assert (measured["chamfer_l2"], measured["chamfer_gt_to_pred"], measured["chamfer_l1"]) == (2, 2, 0.5)
+    assert measured["fscore"] == pytest.approx(2 / 3)
+
+
+def test_identical_surfaces_are_perfect():
+    truth = random_surface(0, 50)
+    measured = surface_metrics(truth, truth, threshold=1e-9)
+    assert (measured.pop("fscore"), measured.pop("normal_consistency")) == (1, pytest.approx(1))
+    assert set(measured.values()) == {0}
+
+
+def test_a_distance_equal_to_the_threshold_does_not_count():
+    # Both ways the distances are 1/2 and 1/4; below 1/2 lies one of two, so precision, recall and F are 1/2.
+    truth = surface([[0, 0, 0], [4, 0, 0]], [[0, 0, 1], [0, 0, 1]])
+    predicted = surface([[0, 0, 0.5], [4, 0, 0.25]], [[0, 0, 1], [0, 0, 1]])
+    assert surface_metrics(predicted, truth, threshold=0.5)["fscore"] == 0.5
+    assert surface_metrics(predicted, truth, threshold=0.5001)["fscore"] == 1
+
+
+def test_swapping_the_surfaces():
+    first, second = random_surface(1, 40), random_surface(2, 70)
+    forth = surface_metrics(first, second, threshold=0.5)
+    back = surface_metrics(second, first, threshold=0.5)
+    for name in ("chamfer_l2", "chamfer_l1", "fscore", "normal_consistency"):
+        assert forth[name] == pytest.approx(back[name])
+    assert forth["accuracy"] == back["completeness"] != forth["completeness"]
+
+
+def test_length_and_sign_of_normals_do_not_count_and_zero_scores_zero():
+    truth = surface([[0, 0, 0]], [[0, 0, 1]])
+    for normal, expected in (([0, 0, -7], 1), ([0, 3, 4], 0.8), ([0, 0, 0], 0)):
+        measured = surface_metrics(surface([[0, 0, 0]], [normal]), truth, threshold=0.01)
+        assert measured["normal_consistency"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("predicted", [None, surface([], [])])
+def test_no_prediction_scores_worst(predicted):
+    measured = surface_metrics(predicted, random_surface(0, 5), threshold=0.01)
+    assert measured.pop("fscore") == measured.pop("normal_consistency") == 0
+    assert set(measured.values()) == {np.inf}
+    assert sorted([*measured, "fscore", "normal_consistency"]) == sorted(SURFACE)
+
+
+# Powers of two scale floating-point numbers exactly, so even the threshold comparison may not change.
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**16), exponent=st.integers(-12, 12), count=st.integers(1, 20))
+def test_scaling_the_scene_scales_the_distances(seed, exponent, count):
+    first, second, scale = random_surface(seed, count), random_surface(seed + 1, 9), 2.0**exponent
+    plain = surface_metrics(first, second, threshold=0.5)
+    scaled = surface_metrics(
+        Surface(first.points * scale, first.normals),
+        Surface(second.points * scale, second.normals),
+        threshold=0.5 * scale,
+    )
+    power = {"chamfer_l2": 2, "chamfer_gt_to_pred": 2, "fscore": 0, "normal_consistency": 0}
+    assert scaled == pytest.approx({name: plain[name] * scale ** power.get(name, 1) for name in plain})
+
+
+def test_image_worked_example():
+    # Foreground in both: two pixels, with errors 0.5 and 0.25; in at least one: three.
+    predicted_depth = np.array([[1.5, 2.0], [9.0, np.inf]], dtype=np.float32)
+    truth_depth = np.array([[1.0, 2.25], [np.nan, 0.0]], dtype=np.float32)
+    predicted_mask, truth_mask = np.array([[True, True], [True, False]]), np.array([[True, True], [False, False]])
+    measured = image_metrics(predicted_depth, predicted_mask, truth_depth, truth_mask)
+    assert measured == pytest.approx({"depth_mae": 0.375, "mask_iou": 2 / 3})
+
+
+def test_image_edges():
+    depth, none, every = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
+    assert image_metrics(depth, every, depth, every) == {"depth_mae": 0, "mask_iou": 1}
+    assert image_metrics(depth, none, depth, every) == {"depth_mae": np.inf, "mask_iou": 0}
+    assert image_metrics(depth, none, depth, none) == {"depth_mae": np.inf, "mask_iou": 1}
+    assert image_metrics(depth * np.nan, every, depth, every) == {"depth_mae": np.inf, "mask_iou": 1}
+
+
+def test_every_metric_has_one_sentence():
+    assert sorted(DEFINITIONS) == sorted(SURFACE + IMAGE)
+    for sentence in DEFINITIONS.values():
+        assert re.fullmatch(r"[A-Z][^\n]*\.", sentence)
+        assert re.search(r"scene units|from 0 to 1", sentence)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda: Surface(np.zeros((4, 2)), np.zeros((4, 3))), r"points must have shape \[n, 3\], found \[4, 2\]"),
+        (lambda: Surface(np.zeros((4, 3)), np.zeros((5, 3))), "normals must be one per point, found 5 for 4"),
+        (lambda: surface([[0, 0, np.nan]], [[0, 0, 1]]), "points must be finite, found 1 row"),
+        (lambda: surface_metrics(None, surface([], []), threshold=0.1), "truth must have points, found 0"),
+        (lambda: surface_metrics(None, random_surface(0, 2), threshold=0.0), "threshold must be positive"),
+    ],
+)
+def test_wrong_input_is_refused(broken, message):
+    # Where shapes are checked at the signature, that check speaks first.
+    with pytest.raises((ValueError, TypeCheckError), match=f"{message}|Type-check error"):
+        broken()
+
+
+def test_true_depth_must_be_finite_on_the_foreground():
+    every = np.ones((2, 2), dtype=bool)
+    with pytest.raises(ValueError, match="truth_depth must be finite"):
+        image_metrics(np.ones((2, 2)), every, np.full((2, 2), np.inf), every)

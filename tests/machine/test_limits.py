@@ -1,0 +1,147 @@
+"""Limits on time and memory: reached, told with their kind and number, and no hindrance below."""
+
+import ctypes
+
+import pytest
+import torch
+
+from bench.machine import limits
+from bench.machine.environment import MemoryPeak
+from bench.machine.limits import LimitReached, Limits
+from bench.records.record import RunStatus
+from renderers.field import Flops, Kind
+from renderers.fields.analytic import Shape, sphere
+
+CPU = torch.device("cpu")
+POINTS = torch.zeros(5, 3)
+FIELD = sphere(1.0)
+MIB = 2**20
+
+
+def test_below_the_limits_values_are_unchanged():
+    points = torch.rand(7, 3, requires_grad=True)
+    values = Limits(seconds=60, memory=8).watch(FIELD, CPU)(points)
+    assert torch.equal(values, FIELD(points))
+    (gradient,) = torch.autograd.grad(values.sum(), points)
+    (expected,) = torch.autograd.grad(FIELD(points).sum(), points)
+    assert torch.equal(gradient, expected)
+
+
+def test_properties_of_the_field_pass_through():
+    field = Shape(FIELD.function, Kind.LEVEL, lipschitz=3.0, flops=Flops(11, 13))
+    watched = Limits(seconds=60, memory=8).watch(field, CPU)
+    assert (watched.kind, watched.lipschitz, watched.flops) == (Kind.LEVEL, 3.0, Flops(11, 13))
+
+
+def test_time_is_limited_from_when_the_watch_begins(clock):
+    limit = Limits(seconds=0.2, memory=8)
+    clock.sleep(0.25)
+    watched = limit.watch(FIELD, CPU)
+    clock.sleep(0.19)
+    watched(POINTS)
+    clock.sleep(0.02)
+    with pytest.raises(LimitReached) as caught:
+        watched(POINTS)
+    assert caught.value.status is RunStatus.TIMEOUT
+    assert str(caught.value) == "more than 0.2 s"
+
+
+def test_time_is_limited_on_the_way_back_too(clock):
+    points = POINTS.clone().requires_grad_(True)
+    watched = Limits(seconds=0.2, memory=8).watch(FIELD, CPU)
+    values = watched(points + 1)
+    clock.sleep(0.25)
+    with pytest.raises(LimitReached, match=r"more than 0\.2 s") as caught:
+        values.sum().backward()
+    assert caught.value.status is RunStatus.TIMEOUT
+    assert points.grad is None
+
+
+def test_memory_is_limited(clock):
+    limit = Limits(seconds=60, memory=0.125)
+    watched, held = limit.watch(FIELD, CPU), []
+    if watched.memory.growth() is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    watched(POINTS)
+    with pytest.raises(LimitReached, match=r"more than 0\.125 GiB of memory") as caught:
+        for _ in range(100):
+            held.append(torch.ones(32 * MIB // 4))
+            clock.sleep(1.1 * limits.MEMORY_INTERVAL)
+            watched(POINTS)
+    assert caught.value.status is RunStatus.OOM
+    assert 3 <= len(held) <= 6  # of 32 MiB each
+
+
+def test_memory_is_limited_on_the_way_back_too(monkeypatch):
+    watched = Limits(seconds=60, memory=1).watch(FIELD, CPU)
+    values = watched(POINTS.clone().requires_grad_(True) + 1)
+    monkeypatch.setattr(watched, "memory_checked", 0.0)
+    monkeypatch.setattr(watched.memory, "growth", lambda: 2**30 + 1)
+    with pytest.raises(LimitReached, match="more than 1 GiB of memory"):
+        values.sum().backward()
+
+
+def test_where_memory_cannot_be_measured_time_is_still_limited(clock, monkeypatch):
+    monkeypatch.setattr(MemoryPeak, "growth", lambda self: None)
+    watched = Limits(seconds=60, memory=1e-6).watch(FIELD, CPU)
+    watched(POINTS)
+    clock.sleep(61)
+    with pytest.raises(LimitReached) as caught:
+        watched(POINTS)
+    assert caught.value.status is RunStatus.TIMEOUT
+
+
+def test_the_memory_is_not_checked_in_every_evaluation(clock, monkeypatch):
+    looks = []
+    monkeypatch.setattr(MemoryPeak, "growth", lambda self: looks.append(1) or 0)
+    watched = Limits(seconds=60, memory=1).watch(FIELD, CPU)
+    for number in (1, 2):
+        for _ in range(100):
+            watched(POINTS)
+        assert len(looks) == number
+        clock.sleep(1.1 * limits.MEMORY_INTERVAL)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["seconds", "memory"])
+def test_invalid_limits_are_errors(name, wrong):
+    with pytest.raises(ValueError, match=rf"limits\.{name} must be positive, not {wrong}"):
+        Limits(**({"seconds": 1.0, "memory": 1.0} | {name: wrong}))
+
+
+def held_but_free(mib: int) -> torch.Tensor:
+    """Leaves memory in the process that it does not use: many blocks too small to be mapped, freed behind a last one.
+
+    Returns:
+        the last block, to be kept while the memory is to stay.
+    """
+    blocks = [torch.ones(16 * 1024) for _ in range(16 * mib)]  # of 64 KiB
+    return blocks[-1]
+
+
+def test_a_rise_shows_in_memory_that_the_process_still_holds():
+    if not hasattr(ctypes.CDLL(None), "malloc_trim"):
+        pytest.skip("this C library keeps its free memory to itself")
+    last = held_but_free(128)
+    memory = MemoryPeak(CPU)
+    blocks = [torch.ones(16 * 1024) for _ in range(16 * 64)]
+    growth = memory.growth()
+    if growth is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    assert 0.9 * 64 * MIB < growth < 1.3 * 64 * MIB
+    assert len(blocks) + last.numel() > 0
+
+
+def test_memory_within_a_pause_does_not_count():
+    memory = MemoryPeak(CPU)
+    if memory.growth() is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    first = torch.ones(16 * MIB // 4)
+    del first
+    with memory.pause():
+        paused = torch.ones(96 * MIB // 4)
+        del paused
+    assert 14 * MIB < memory.growth() < 40 * MIB
+    again = torch.ones(48 * MIB // 4)
+    assert 44 * MIB < memory.growth() < 80 * MIB
+    assert again.numel()

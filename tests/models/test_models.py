@@ -1,0 +1,427 @@
+"""Fields of the ladder: their formulas, their held-out error, what is chosen by it, and how they grow."""
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from bench.config import load
+from bench.models import analytic
+from bench.models.candidates import PAPERS, FitSettings, GrowthSettings, ModelSettings, ViewSettings, candidate
+from bench.models.choice import Evidence, choose
+from bench.models.fit import Fitter
+from bench.models.growth import cost, grow
+from bench.models.held_out import MISSED, HeldOut, HeldOutError
+from bench.models.learned import REACH
+from bench.models.model import Model, Seen
+from bench.models.observations import Holdout, hold_out, together
+from bench.models.views import Views
+from bench.records.record import RunStatus
+from bench.setup.auto import AutoSettings, epsilon, rays_share
+from bench.solve.observed_view import GivenView
+from datasets.extract import extract
+from datasets.scene import see
+from datasets.truth import Truth
+from datasets.views import ViewSampler
+from renderers import Capabilities, Kind
+from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
+from tests.tiny import CPU
+
+DIST = load("renderer", "dist", n_gradient_samples=1)
+FIT = FitSettings(iterations=30, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
+SAMPLER = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 24)
+WEIGHTS = SimpleNamespace(depth_weight=10.0, silhouette_weight=10.0)
+VIEWS = ViewSettings(fitted=6, held_out=4, share=0.1, elevation=60.0, rays=256)
+SIZES = {
+    "sphere": 4,
+    "ellipsoid": 9,
+    "box": 9,
+    "rounded_box": 10,
+    "superquadric": 11,
+    "union_3": 30,
+    "network_1x16": 81,
+}
+GROWTH = GrowthSettings(trial=0.2, patience=5, budget=2.0)
+
+
+@cache
+def shape_of(name: str) -> Truth:
+    shapes = {
+        "ball": sphere(0.6, (0.1, 0.0, -0.1)),
+        "box": box((0.5, 0.3, 0.4)),
+        "capsule": capsule((0.0, -0.4, 0.0), (0.0, 0.4, 0.0), 0.3),
+    }
+    mesh = extract(shapes[name], grid=64, reach=1.0)
+    assert mesh is not None
+    return Truth(mesh)
+
+
+def views_of(name: str, renderer=DIST) -> Views:
+    return Views(shape_of(name), SAMPLER, VIEWS, WEIGHTS, renderer, CPU)
+
+
+def fitter_of(name: str, renderer=DIST, seed: int = 0, **changed) -> Fitter:
+    observations = views_of(name, renderer).observations(seed)
+    return Fitter(observations, replace(FIT, **changed), seed, CPU, lambda name, line: None)
+
+
+def points(count: int = 4000) -> torch.Tensor:
+    return 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
+
+
+def an_error(mean: float, spread: float = 0.0) -> HeldOutError:
+    """Four groups of ten hits, whose errors are spread evenly about the mean."""
+    means = mean + spread * np.array([-1.5, -0.5, 0.5, 1.5])
+    return HeldOutError(np.stack([10 * means, [10.0] * 4, [0.0] * 4, [10.0] * 4], axis=1), 0.1)
+
+
+def evidence_of(name: str, parameters: int, error: HeldOutError | None) -> Evidence:
+    status = RunStatus.OK if error else RunStatus.DIVERGED
+    return Evidence(name, parameters, 4 * parameters, 10, error, status, "" if error else "it rose")
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
+    ball = Model("sphere", [torch.zeros(1, requires_grad=True)], lambda free: sphere(0.5), 0.1, metric=True)
+    seen = Seen(points(500).float(), ball, 0, CPU)
+    for model in candidate(name).starts(seen):
+        assert model.size == SIZES[name]
+        assert model.bytes == 4 * SIZES[name]
+        assert model.field().flops.value == candidate(name).flops
+        values = model.field()(points(50).float())
+        values.sum().backward()
+        assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters)
+
+
+def test_the_papers_network_has_1_8_million():
+    assert PAPERS.size == 1_839_614
+    assert PAPERS.flops == pytest.approx(2 * PAPERS.size, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("unoin_3", "did you mean union_3"), ("union_1", "union_2 is the smallest"), ("network_4", "unknown field"),
+     ("network_4x2", "width must be at least 4"), ("grid_x", "unknown field"), ("grid_4", "between 8 and 256")],
+)  # fmt: skip
+def test_an_unknown_candidate_is_an_error(name, message):
+    with pytest.raises(ValueError, match=message):
+        ModelSettings((name,), FIT, GROWTH, VIEWS)
+
+
+def test_a_rounded_box_can_be_a_box_and_a_capsule():
+    logs = [*np.log([0.2, 0.5, 0.2]), 40.0]
+    numbers = torch.tensor([0.0] * 6 + logs, dtype=torch.float64)
+    as_capsule = capsule((0.0, -0.3, 0.0), (0.0, 0.3, 0.0), 0.2)
+    assert torch.allclose(analytic.rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
+    numbers[9] = -40.0
+    assert torch.allclose(analytic.rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
+
+
+def test_parts_are_turned_and_moved_and_united():
+    first = torch.tensor([0.3, 0.1, -0.2, 0.0, 0.0, torch.pi / 2, *np.log([0.1, 0.4, 0.2]), -40.0], dtype=torch.float64)
+    second = torch.tensor([-0.4, 0.0, 0.0, 0.0, 0.0, 0.0, *np.log([0.2, 0.2, 0.2]), 40.0], dtype=torch.float64)
+    turned = box((0.4, 0.1, 0.2)).translate((0.3, 0.1, -0.2))  # by a right angle about z
+    whole = turned | sphere(0.2, (-0.4, 0.0, 0.0))
+    assert torch.allclose(analytic.union(torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
+    assert torch.allclose(analytic.box(first[:9])(points()), turned(points()), atol=1e-6)
+
+
+@pytest.mark.parametrize("powers", [(1.0, 1.0), (1.0, 4.0), (2.0, 2.0), (3.0, 1.5), (20.0, 20.0)])
+def test_a_superquadric_is_a_bound(powers):
+    shape = superquadric((0.6, 0.3, 0.4), powers)
+    where = points()[:1000].requires_grad_()
+    (slopes,) = torch.autograd.grad(shape(where).sum(), where)
+    assert torch.linalg.vector_norm(slopes, dim=-1).max() <= 1 + 1e-6
+    close = shape(where.detach() + 1e-9)
+    assert bool(close.isfinite().all())
+
+
+def test_superquadrics_reach_from_octahedra_over_ellipsoids_to_boxes():
+    where = points()
+    octahedron = (where.abs() / torch.tensor([0.6, 0.3, 0.4])).sum(-1) < 1
+    assert torch.equal(superquadric((0.6, 0.3, 0.4), (1.0, 1.0))(where) < 0, octahedron)
+    ellipsoid = sphere(1.0).stretch((0.6, 0.3, 0.4))
+    assert torch.allclose(superquadric((0.6, 0.3, 0.4), (2.0, 2.0))(where), ellipsoid(where), atol=1e-9)
+    almost = superquadric((0.6, 0.3, 0.4), (60.0, 60.0))(where) < 0
+    assert (almost != (box((0.6, 0.3, 0.4))(where) < 0)).double().mean() < 0.01
+    exponents = torch.tensor([2.0, 3.0], dtype=torch.float64, requires_grad=True)
+    superquadric((0.6, 0.3, 0.4), exponents)(torch.zeros(1, 3, dtype=torch.float64)).sum().backward()
+    assert bool(exponents.grad.isfinite().all())
+
+
+def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
+    ball = Model("sphere", [torch.zeros(1)], lambda free: sphere(0.5), 0.1, metric=True)
+    (model,) = candidate("grid_24").starts(Seen(torch.tensor([[0.9, 0.9, 0.9]]), ball, 0, CPU))
+    cell = 2 * REACH / 23
+    shell = 4 * np.pi * 0.5**2 * 4 * cell / cell**3  # two cells to both sides
+    assert model.size == pytest.approx(shell + 4**3, rel=0.15)
+    assert model.bytes == 4 * 24**3
+    where = 0.5 * points(200).float()
+    assert (model.field()(where) - sphere(0.5)(where)).abs().max() < 0.5 * cell
+    model.parameters[0].data.fill_(1.0)
+    assert model.frozen()(torch.zeros(1, 3)).item() == pytest.approx(-0.5, abs=cell)
+    assert model.frozen()(torch.tensor([[0.9, 0.9, 0.9]])).item() == 1.0
+
+
+def test_a_union_keeps_the_parts_of_a_smaller_one():
+    old = torch.tensor([[0.0] * 6 + [-1.0] * 3 + [0.0], [0.5] + [0.0] * 5 + [-2.0] * 3 + [0.0]], requires_grad=True)
+    smaller = Model("union_2", [old], lambda free: analytic.union(free[0]), 0.1, metric=True)
+    *_, kept = candidate("union_3").starts(Seen(points(400).float(), smaller, 0, CPU))
+    assert torch.equal(kept.parameters[0][:2], old)
+    assert len(candidate("union_3").starts(Seen(points(400).float(), None, 0, CPU))) == candidate("union_3").tries - 1
+
+
+def test_the_error_is_the_surface_offset_along_its_normal():
+    observations = views_of("ball").observations(0)
+    footprint = observations.footprint
+    found = observations.error(sphere(0.6 + 0.3 * footprint, (0.1, 0.0, -0.1)))
+    off, hits, alone, either = found.sums.sum(0)
+    assert off / hits == pytest.approx(0.3 * footprint, rel=0.1)
+    radius = 0.6 / (2 * footprint) * 1.5 / 2.5  # of the outline, in pixels: it moves by 0.15 of one, about
+    assert alone / either == pytest.approx(2 * 0.15 / radius, rel=0.5)
+    exact = observations.error(sphere(0.6, (0.1, 0.0, -0.1)))
+    assert exact.mean < 0.2 * footprint
+    nothing = observations.error(sphere(0.01, (0.0, 0.0, 0.9)))
+    assert nothing.mean == pytest.approx(MISSED * footprint, rel=1e-3)
+
+
+def test_groups_give_the_standard_error_of_a_mean():
+    found = an_error(0.01, 0.002)
+    assert found.mean == pytest.approx(0.01)
+    assert found.standard_error == pytest.approx(np.std([-0.003, -0.001, 0.001, 0.003], ddof=1) / 2)
+    shifted = HeldOutError(found.sums + np.array([0.05, 0, 0, 0]), 0.1)
+    assert shifted.mean == pytest.approx(0.015)
+    assert shifted.noise_of_difference(found) == pytest.approx(0, abs=1e-12)
+    lost = HeldOutError(np.array([[0.0, 0, 5, 10], [0.05, 5, 5, 10]]), 0.1)
+    assert lost.mean == pytest.approx(0.5 * 0.01 + 0.5 * 0.1)
+    assert lost.some(np.array([1])).mean == pytest.approx(0.5 * 0.01 + 0.5 * 0.1)
+
+
+def test_held_out_rays_are_not_given():
+    views = [see(shape_of("box"), SAMPLER.camera(angle, 20.0)) for angle in (0.0, 90.0, 180.0)]
+    given = [GivenView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
+    group = torch.arange(3).repeat_interleave(24 * 24)
+    found = hold_out(together(given), group, Holdout(0.25, (2,), 0.02, 0), rays=64)
+    pixels = 24 * 24
+    assert len(found.held_out.distance) == pytest.approx(pixels + 0.25 * 2 * pixels, abs=2)
+    everything = torch.cat([found.given.rays.directions, found.held_out.rays.directions])
+    assert len(everything) == 3 * pixels == len(everything.unique(dim=0))
+    assert found.held_out.group.bincount().tolist()[2] == pixels
+    observed = torch.cat([v.mask.flatten() for v in views[:2]])
+    assert found.given.observed.sum() == pytest.approx(0.75 * observed.sum(), abs=1)
+    assert box((0.5, 0.3, 0.4))(found.points).abs().max() < 0.01
+    assert (box((0.5, 0.3, 0.4))(found.free) > -0.01).all()
+    first, again, other = (found.terms(sphere(0.4), iteration, 1.0) for iteration in (0, 0, 1))
+    assert first == again != other
+
+
+def test_without_a_mask_only_known_depths_are_held_out():
+    view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
+    some = view.mask & (torch.arange(24) % 2 == 0)
+    given = GivenView.of(view, WEIGHTS, DIST, observed=some, mask=None, device=CPU)
+    found = hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.5, (), 0.02, 0), rays=64)
+    assert len(found.held_out.distance) == pytest.approx(0.5 * some.sum(), abs=1)
+    assert bool(found.held_out.mask.all())
+
+
+CASES = {
+    "the smallest within one standard error": ([(4, 0.030), (9, 0.0105), (10, 0.010)], 0.001, 9, True, False),
+    "not one that is just above": ([(4, 0.030), (9, 0.0125), (10, 0.010)], 0.001, 10, True, False),
+    "or under the footprint": ([(4, 0.019), (9, 0.0125), (10, 0.010)], 0.02, 4, False, True),
+    "whatever the order": ([(50, 0.010), (4, 0.0101)], 0.001, 4, True, False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_choice_is(case):
+    candidates, footprint, chosen, within, enough = CASES[case]
+    ladder = [evidence_of(str(size), size, an_error(mean, 0.0015)) for size, mean in candidates]  # s.e. about 0.00097
+    choice = choose([evidence_of("failed", 1, None), *ladder], footprint)
+    assert (choice.chosen.parameters, choice.within, choice.enough) == (chosen, within, enough)
+    assert choice.best.mean == pytest.approx(min(mean for _, mean in candidates))
+
+
+def test_a_choice_without_a_successful_fit_is_an_error():
+    with pytest.raises(ValueError, match="all fits failed; the last: it rose"):
+        choose([evidence_of("failed", 1, None)], 0.01)
+
+
+def test_a_warm_start_alone_finds_a_sphere_and_a_box():
+    ball = fitter_of("ball").begin(candidate("sphere"), None)
+    assert ball.model.parameters[0].tolist() == pytest.approx([0.1, 0.0, -0.1, np.log(0.6)], abs=0.02)
+    assert ball.evidence.evaluations == 2 * 60 * 128
+    crate = fitter_of("box").begin(candidate("box"), None)
+    assert crate.evidence.mean < views_of("box").footprint
+    assert crate.evidence.iterations == 0 < crate.evidence.seconds
+
+
+def test_a_fit_goes_on_from_a_warm_start_and_is_counted():
+    fitter = fitter_of("box", warm_iterations=5)
+    fitted = fitter.begin(candidate("rounded_box"), None)
+    before = fitted.evidence.mean, fitted.evidence.evaluations
+    fitter.fit(fitted, 30, checkpoints=True)
+    assert fitted.evidence.mean < before[0]
+    assert fitted.evidence.iterations == 30
+    assert fitted.evidence.evaluations > before[1] + 30 * 256
+    assert fitted.evidence.flops > 55 * fitted.evidence.evaluations
+    assert [checkpoint["evaluations"] for checkpoint in fitted.evidence.checkpoints] == sorted(
+        {checkpoint["evaluations"] for checkpoint in fitted.evidence.checkpoints}
+    )
+    assert len(fitted.evidence.checkpoints) == 4  # after the warm start, 4, 16 and 30 iterations
+
+
+def test_a_network_takes_over_the_field_before_it():
+    fitter = fitter_of("ball", warm_iterations=120, warm_points=256)
+    ball = fitter.begin(candidate("sphere"), None)
+    network = fitter.begin(candidate("network_2x32"), ball.model)
+    assert network.evidence.mean < 3 * views_of("ball").footprint
+    alone = fitter.begin(candidate("network_2x32"), None)
+    assert alone.evidence.evaluations > network.evidence.evaluations  # its own ball was fitted first
+
+
+def test_growth_ends_on_a_sufficient_candidate():
+    candidates = [candidate(name) for name in ("sphere", "box", "rounded_box", "network_1x16")]
+    found = grow(fitter_of("ball"), candidates, GROWTH)
+    assert list(found.fields) == ["sphere"]
+    assert len(found.tried) == 1
+    assert found.overhead == 1
+    boxed = grow(fitter_of("box"), candidates, GROWTH)
+    assert list(boxed.fields) == ["sphere", "box"]
+    assert boxed.fitted.evidence.mean < views_of("box").footprint
+    assert boxed.total("evaluations") > boxed.fitted.evidence.evaluations
+    assert boxed.summary("auto")[0].startswith("field=auto: sphere -> box, 9 parameters, held-out error 0.0")
+
+
+def test_growth_ends_with_patience_and_budget():
+    fitter = fitter_of("capsule", warm_iterations=20, iterations=10)
+    candidates = [candidate(name) for name in ("sphere", "box", "box", "box", "rounded_box")]
+    asked = replace(GROWTH, patience=9, budget=100.0)
+    patient = grow(fitter, candidates, replace(asked, patience=1))
+    assert [evidence.candidate for evidence in patient.tried] == ["sphere", "box", "box"]
+    assert grow(fitter, candidates, asked).fitted.evidence.candidate == "rounded_box"
+    two_more = 2.5 * cost(candidate("box"), 3, fitter) / cost(candidate("box"), 10, fitter)
+    tight = grow(fitter, candidates, replace(asked, budget=1 + two_more))
+    assert len(tight.tried) == 3
+
+
+def test_a_candidate_that_the_renderer_does_not_support_has_no_error():
+    strict = SimpleNamespace(
+        capabilities=Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True),
+        render=DIST.render,
+        silhouette_loss=DIST.silhouette_loss,
+    )
+    fitter = fitter_of("ball", strict, warm_iterations=5)
+    fitted = fitter.begin(candidate("superquadric"), None)
+    fitter.fit(fitted, 5, checkpoints=False)
+    assert (fitted.evidence.status, fitted.evidence.error, fitted.evidence.iterations) == ("unsupported", None, 0)
+    assert "needs a distance field" in fitted.evidence.reason
+    assert fitter.begin(candidate("sphere"), None).evidence.error is not None
+
+
+def test_rays_follow_the_error_that_is_left():
+    assert rays_share(0.1, 0.01, 0.02) == pytest.approx(0.25)
+    assert rays_share(0.1, 0.01, 0.5) == 0.1
+    assert rays_share(0.1, 0.01, 0.001) == 1.0
+    assert rays_share(0.1, 0.0, 0.5) == 1.0  # no footprint: no pixel is too fine
+    assert rays_share(0.1, 0.01, float("nan")) == 1.0
+    coarse, whole = fitter_of("capsule", warm_iterations=1, fewest_rays=0.1), fitter_of("capsule", warm_iterations=1)
+    spent = []
+    for fitter in (coarse, whole):
+        fitted = fitter.begin(candidate("sphere"), None)
+        fitter.fit(fitted, 10, checkpoints=False)
+        spent.append(fitted.evidence.evaluations)
+    assert spent[0] < 0.6 * spent[1]
+
+
+@pytest.mark.parametrize("name", ["dist", "idr", "dvr"])
+def test_the_error_that_is_left_is_that_of_the_depth_whatever_a_silhouette_costs(name):
+    """A cross-entropy has no length: a shape that is right asks for all rays, one that is missed for the fewest."""
+    observations = views_of("box", load("renderer", name)).observations(0)
+    right, small = (
+        observations.depth_error(observations.terms(shape, 0, 1.0)) for shape in (box((0.5, 0.3, 0.4)), sphere(0.2))
+    )
+    assert right < observations.footprint < small
+    nothing = Shape(lambda p: 1 + 0 * p[..., 0], Kind.DISTANCE)
+    assert observations.depth_error(observations.terms(nothing, 0, 1.0)) == np.inf
+
+
+def test_half_a_pixel_is_that_of_epsilon_auto():
+    assert views_of("ball").footprint == pytest.approx(epsilon(SAMPLER, OmegaConf.create({}), AutoSettings(10.0)))
+    with pytest.raises(ValueError, match="outside of the unit sphere"):
+        _ = replace(views_of("ball"), sampler=replace(SAMPLER, distance=0.5)).footprint
+
+
+def test_further_views_are_others():
+    views = views_of("ball")
+    first, further = views.observations(0).held_out, views.further(4, 0)
+    assert isinstance(further, HeldOut)
+    assert not torch.isin(further.rays.origins.unique(dim=0), first.rays.origins).all(-1).any()
+    again = views.further(4, 1)
+    assert not torch.equal(further.rays.origins, again.rays.origins)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [({"held_out": 1}, "at least 2"), ({"share": 1.0}, "between 0 and 1"), ({"elevation": 90.0}, "between 0 and 90")],
+)
+def test_invalid_view_settings_are_errors(changed, message):
+    with pytest.raises(ValueError, match=message):
+        replace(VIEWS, **changed)
+
+
+def test_a_renderers_random_draws_are_the_same_for_every_fit():
+    dvr = load("renderer", "dvr", n_ray_samples=16, doublings=[])
+    fitter, means = fitter_of("ball", dvr, warm_iterations=10), []
+    for _ in range(2):
+        fitted = fitter.begin(candidate("sphere"), None)
+        fitter.fit(fitted, 4, checkpoints=False)
+        means.append(fitted.model.parameters[0].tolist())
+        torch.rand(3)
+    assert means[0] == means[1]
+
+
+def test_too_few_depths_to_hold_some_out_are_an_error():
+    view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
+    few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
+    given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
+    with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
+        hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.2, (), 0.02, 0), rays=64)
+
+
+def test_a_field_that_hits_no_known_depth_has_the_largest_error():
+    nothing = HeldOutError(np.array([[0.0, 0, 2, 40]] * 3), 0.1)
+    assert nothing.mean == pytest.approx(0.1)
+    flat = Model("sphere", [torch.zeros(1)], lambda free: Shape(lambda p: 1e-6 + 0 * p[..., 0]), 0.1, metric=True)
+    assert views_of("ball").observations(0).error(flat.frozen()).mean > views_of("ball").footprint
+
+
+def test_a_warm_start_counts_evaluations_of_the_previous_field():
+    fitter = fitter_of("ball", warm_iterations=10)
+    ball = fitter.begin(candidate("sphere"), None)
+    grid = fitter.begin(candidate("grid_16"), ball.model)
+    asked = 12 * 128 + 16**3  # of the ball: in each iteration, the warm-up and the final loss, and on the grid
+    assert grid.evidence.evaluations == 10 * 128 + asked
+    network = fitter.begin(candidate("network_1x16"), ball.model)
+    assert network.evidence.evaluations == 10 * 128 + 12 * 128
+    assert network.evidence.flops > 10 * 128 * (10 + candidate("network_1x16").flops)
+
+
+def test_unions_without_points_have_distinct_parts():
+    nothing = torch.zeros(0, 3)
+    (model,) = candidate("union_3").starts(Seen(nothing, None, 0, CPU))
+    assert len(model.parameters[0].unique(dim=0)) == 3
+    (larger,) = candidate("union_5").starts(Seen(nothing, model, 0, CPU))
+    assert torch.equal(larger.parameters[0][:3], model.parameters[0])
+    two = torch.cat([torch.randn(30, 3) * 0.02 + 0.6, torch.tensor([[-0.7] * 3, [-0.72] * 3])])
+    for start in candidate("union_2").starts(Seen(two, None, 0, CPU)):
+        middles = start.parameters[0][:, :3].mean(1).sort().values
+        assert middles.tolist() == pytest.approx([-0.71, 0.6], abs=0.05)
+
+
+def test_a_repeated_candidate_is_an_error():
+    with pytest.raises(ValueError, match="name each candidate once"):
+        ModelSettings(("sphere", "box", "sphere"), FIT, GROWTH, VIEWS)

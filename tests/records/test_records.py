@@ -1,0 +1,115 @@
+"""Run folders are claimed once, and their record is whole whatever happens."""
+
+import errno
+import json
+import math
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from bench.records.files import digest, to_json, write_text
+from bench.records.read import read_records
+from bench.records.record import Record, RunStatus
+
+ODD_NAME = "two words ünïcode 50% #1?"
+
+
+def new_folder(results: Path) -> Path:
+    folder = results / "runs" / "run"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def make_record(name: str = "completion-dist-sofa", **changed) -> Record:
+    return Record(name, task="completion", renderer="dist", dataset="sofa", seed=0, config={"seed": 0}, **changed)
+
+
+def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
+    folder = new_folder(tmp_path)
+    record = make_record()
+    record.write(folder)
+    (read,), problems = read_records(tmp_path)
+    assert problems == []
+    assert (read["status"], read["folder"]) == ("killed", "run")
+    assert read["reason"]
+    record.status, record.reason = RunStatus.OK, ""
+    record.write(folder)
+    assert json.loads((folder / "record.json").read_text())["status"] == "ok"
+    assert [path.name for path in folder.iterdir()] == ["record.json"]
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_a_write_that_fails_leaves_the_old_record(tmp_path, monkeypatch, function):
+    folder = new_folder(tmp_path)
+    record = make_record()
+    record.write(folder)
+    before = (folder / "record.json").read_bytes()
+    record.status = RunStatus.OK
+
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(*((os, "fsync") if function == "fsync" else (Path, "replace")), fail)
+    with pytest.raises(OSError, match="No space left"):
+        record.write(folder)
+    monkeypatch.undo()
+    assert (folder / "record.json").read_bytes() == before
+    record.write(folder)
+    assert json.loads((folder / "record.json").read_text())["status"] == "ok"
+
+
+def test_a_reader_never_meets_half_of_a_record(tmp_path):
+    path = tmp_path / "record.json"
+    texts = [to_json({"number": number, "filler": "x" * 20_000 * number}) for number in (1, 2)]
+    write_text(path, texts[0])
+    with ThreadPoolExecutor(1) as pool:
+        writing = pool.submit(lambda: [write_text(path, texts[turn % 2]) for turn in range(60)])
+        seen = {path.read_text() for _ in iter(lambda: writing.done(), True)}
+        writing.result()
+    assert seen <= set(texts)
+
+
+def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
+    odd = {"chamfer_l2": math.inf, "depth_mae": math.nan, "accuracy": -math.inf, "fscore": 0.5}
+    record = make_record(metrics=odd, metrics_start=dict(odd), flops=None, gemm_fraction=math.nan)
+    record.seconds = {"total": 1.5}
+    folder = new_folder(tmp_path)
+    record.write(folder)
+    written = json.loads((folder / "record.json").read_text(), parse_constant=pytest.fail)
+    assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "accuracy": "-inf", "fscore": 0.5}
+    (read,), problems = read_records(tmp_path)
+    assert problems == []
+    for metrics in (read["metrics"], read["metrics_start"]):
+        assert metrics["chamfer_l2"] == math.inf
+        assert metrics["accuracy"] == -math.inf
+        assert math.isnan(metrics["depth_mae"])
+        assert metrics["fscore"] == 0.5
+    assert math.isnan(read["gemm_fraction"])
+    assert read["flops"] is None
+
+
+def test_odd_numbers_deep_inside_are_written_too():
+    text = to_json({"a": [1, (math.nan, {"b": math.inf})], 3: "ünïcode"})
+    assert json.loads(text, parse_constant=pytest.fail) == {"a": [1, ["nan", {"b": "inf"}]], "3": "ünïcode"}
+
+
+def test_files_are_utf_8_whatever_the_locale(tmp_path):
+    code = "import sys, pathlib; from bench.records.files import write_text; write_text(pathlib.Path(sys.argv[1]), 'ü')"
+    options = ["-X", "utf8=0", "-X", "warn_default_encoding", "-W", "error::EncodingWarning"]
+    command = [sys.executable, *options, "-c", code, str(tmp_path / "text")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2], check=False)
+    assert "EncodingWarning" not in done.stderr, "write_text takes the encoding of the locale"
+    assert (tmp_path / "text").read_bytes() == "ü".encode()
+
+
+def test_a_digest_knows_data_and_not_the_order_of_its_keys():
+    data = {"a": 1, "b": {"c": [1, 2.5, None], "d": "x"}}
+    shuffled = {"b": {"d": "x", "c": [1, 2.5, None]}, "a": 1}
+    assert digest(data) == digest(shuffled)
+    assert len(digest(data)) == 12
+    others = [{**data, "a": 2}, {**data, "b": {"c": [2.5, 1, None], "d": "x"}}, {**data, "e": 0}, {"a": 1}]
+    assert len({digest(data), *(digest(other) for other in others)}) == 5

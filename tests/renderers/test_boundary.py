@@ -1,0 +1,198 @@
+"""What a renderer returns is checked where it is taken: a broken part is one sentence, a sound one costs nothing."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+
+from bench.config import load
+from renderers.adaptive_samples import Following
+from renderers.boundary import BrokenContract, check_gradients, rendered, silhouette_loss
+from renderers.camera import Rays
+from renderers.field import Counts, Kind, Meter
+from renderers.fields.analytic import Shape, sphere
+from renderers.rendering import Capabilities, Rendering
+from tests.tiny import camera_of
+
+IDR = load("renderer", "idr")
+RAYS = camera_of(8).rays()
+MASK = torch.ones(RAYS.shape, dtype=torch.bool)
+BOTH = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
+NEITHER = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
+
+
+def changed(rendering: Rendering, **parts: Any) -> Rendering:
+    """A rendering with other parts, which do not pass through the checks of types that tests alone have."""
+    made = replace(rendering)
+    for name, value in parts.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def as_it_is(returned: Any) -> Any:
+    return returned
+
+
+@dataclass
+class Mine:
+    """IDR, but for what `change` makes of its rendering and `loss` of its loss."""
+
+    change: Any = as_it_is
+    loss: Any = as_it_is
+    capabilities: Capabilities = BOTH
+    sphere_radius: float = 1.0
+
+    def render(self, field, rays):
+        return self.change(IDR.render(field, rays))
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        return self.loss(IDR.silhouette_loss(field, rays, rendering, mask))
+
+    def with_samples(self, samples):
+        return self
+
+
+def ball(radius: float = 0.5, *, free: bool = False) -> Shape:
+    """A sphere whose radius may be a free parameter."""
+    return sphere(torch.tensor(radius, requires_grad=True) if free else radius)
+
+
+def detached(rendering: Rendering) -> Rendering:
+    return replace(rendering, distance=rendering.distance.detach())
+
+
+def free_rays() -> Rays:
+    return Rays(RAYS.origins.clone().requires_grad_(), RAYS.directions)
+
+
+BROKEN = {
+    "nothing": (lambda r: None, "Mine.render must return a Rendering, not None: see "),
+    "a tuple": (lambda r: (r.distance, r.status), "Mine.render must return a Rendering, not a tuple: see "),
+    "short": (
+        lambda r: changed(r, distance=r.distance[:-1]),
+        r"Mine.render: distance must have the shape \[8, 8\], not \[7, 8\]: return one answer per ray",
+    ),
+    "flat": (
+        lambda r: changed(r, status=r.status.flatten()),
+        r"status must have the shape \[8, 8\], not \[64\]",
+    ),
+    "flat points": (
+        lambda r: changed(r, points=r.points[..., :2]),
+        r"points must have the shape \[8, 8, 3\], not \[8, 8, 2\]: return points of shape \[\*rays, 3\]",
+    ),
+    "double": (
+        lambda r: changed(r, residual=r.residual.double()),
+        r"residual must be float32, as the rays are, not float64: convert it with .to\(torch.float32\)",
+    ),
+    "long status": (
+        lambda r: changed(r, status=r.status.long()),
+        r"status must be int8, a Status per ray, not int64: convert it with .to\(torch.int8\)",
+    ),
+    "no tensor": (lambda r: changed(r, closest=None), "closest must be a tensor, not a NoneType"),
+    "elsewhere": (
+        lambda r: changed(r, closest=r.closest.detach().to("meta")),
+        "closest must be on cpu, not on meta: create tensors with device=rays.origins.device",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_rendering_is_an_error_that_names_renderer_and_part(name):
+    change, message = BROKEN[name]
+    with pytest.raises(BrokenContract, match=message):
+        rendered(Mine(change), ball(), RAYS)
+
+
+def test_the_renderer_within_a_following_one_is_named():
+    following = Following(Mine(lambda r: None))
+    with pytest.raises(BrokenContract, match=r"Mine\.render must return a Rendering"):
+        rendered(following, ball(), RAYS)
+    with pytest.raises(BrokenContract, match=r"Mine\.silhouette_loss must return a tensor"):
+        silhouette_loss(Following(Mine(loss=lambda loss: None)), ball(), RAYS, IDR.render(ball(), RAYS), MASK)
+
+
+def test_values_are_data_not_a_number_among_them():
+    found = rendered(Mine(lambda r: changed(r, distance=r.distance * torch.nan)), ball(free=True), RAYS)
+    assert found.hit.any() and found.distance.isnan().all()
+
+
+def test_a_claimed_gradient_that_is_missing_is_an_error():
+    towards_field = r"Mine\.capabilities\.field_gradient is True, but the distances of its hits carry no gradient "
+    with pytest.raises(BrokenContract, match=towards_field + "towards the field's parameters: attach one .*=False"):
+        rendered(Mine(detached), ball(free=True), RAYS)
+    with pytest.raises(BrokenContract, match=r"ray_gradient is True, .* towards the rays"):
+        rendered(Mine(detached), ball(), free_rays())
+
+
+@pytest.mark.parametrize(
+    ("renderer", "field", "rays"),
+    [
+        (Mine(detached, capabilities=NEITHER), ball(free=True), RAYS),  # it claims none
+        (Mine(detached, capabilities=NEITHER), ball(), free_rays()),
+        (Mine(detached), ball(), RAYS),  # none is wanted
+        (Mine(detached), ball(0.001, free=True).translate((0.0, 0.9, 0.0)), RAYS),  # nothing is hit
+        (Mine(), ball(free=True), free_rays()),  # it is there
+    ],
+)
+def test_no_gradient_is_missed_where_there_need_be_none(renderer, field, rays):
+    rendered(renderer, field, rays)
+
+
+def test_without_gradients_none_is_missed():
+    with torch.no_grad():
+        assert rendered(Mine(detached), ball(free=True), RAYS).hit.any()
+
+
+LOSSES = {
+    "nothing": (lambda loss: None, r"Mine.silhouette_loss must return a tensor with one number, not None: return the"),
+    "a float": (lambda loss: 0.5, "not a float"),
+    "per ray": (lambda loss: loss.expand(64), r"of shape \[\], not float32 of shape \[64\]: take its mean"),
+    "integer": (lambda loss: loss.long(), r"not int64 of shape \[\]"),
+    "detached": (lambda loss: loss.detach() + 1, "but its silhouette loss carries no gradient towards the field's"),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_broken_silhouette_loss_is_an_error(name):
+    change, message = LOSSES[name]
+    field = ball(free=True)
+    with pytest.raises(BrokenContract, match=message):
+        silhouette_loss(Mine(loss=change), field, RAYS, IDR.render(field, RAYS), MASK)
+
+
+def test_a_silhouette_loss_of_zero_needs_no_gradient():
+    field = ball(free=True)
+    rendering = IDR.render(field, RAYS)
+    assert silhouette_loss(Mine(loss=lambda loss: torch.zeros(())), field, RAYS, rendering, MASK) == 0
+    with pytest.raises(BrokenContract, match="towards the rays"):
+        silhouette_loss(Mine(loss=lambda loss: torch.ones(())), ball(), free_rays(), rendering, MASK)
+
+
+def test_missing_gradients_of_a_hit_are_errors_where_they_are_claimed():
+    some = torch.ones(2)
+    check_gradients(Mine(), some, some)
+    check_gradients(Mine(capabilities=NEITHER), None, None)
+    with pytest.raises(BrokenContract, match="field_gradient is True"):
+        check_gradients(Mine(), None, some)
+    with pytest.raises(BrokenContract, match="ray_gradient is True"):
+        check_gradients(Mine(), some, None)
+
+
+@pytest.mark.parametrize("name", ["dist", "naive", "idr", "dvr"])
+@pytest.mark.parametrize("free", [True, False])
+def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
+    renderer, counts = load("renderer", name), (Counts(), Counts())
+    plain, checked = (Meter(ball(free=free), count) for count in counts)
+    torch.manual_seed(0)
+    expected = renderer.render(plain, RAYS)
+    expected_loss = renderer.silhouette_loss(plain, RAYS, expected, MASK)
+    torch.manual_seed(0)
+    found = rendered(renderer, checked, RAYS)
+    found_loss = silhouette_loss(renderer, checked, RAYS, found, MASK)
+    assert torch.equal(found.distance, expected.distance) and found_loss.item() == expected_loss.item()
+    if free:
+        (expected.distance.sum() + expected_loss).backward()
+        (found.distance.sum() + found_loss).backward()
+        assert counts[0].gradient > 0
+    assert counts[0] == counts[1] and counts[0].value > 0

@@ -1,0 +1,346 @@
+"""Cameras and rays: axes and pixel centres by worked examples, spans of the sphere by closed forms, coarser images."""
+
+from math import cos, pi, sin, sqrt
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+
+from renderers.camera import Camera, Rays, distance_to_origin, sphere_span
+from tests.renderers.analytic_cases import vector
+
+INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.float64)
+
+
+def motion(angle: float = 0.0, translation: tuple[float, ...] = (0, 0, 0)) -> torch.Tensor:
+    """A rigid motion: a turn about an oblique axis, then a translation."""
+    x, y, z = axis = torch.nn.functional.normalize(vector((1, 2, -2)), dim=0)
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] *= cos(angle)
+    matrix[:3, :3] += sin(angle) * cross + (1 - cos(angle)) * torch.outer(axis, axis)
+    matrix[:3, 3] = vector(translation)
+    return matrix
+
+
+def camera(world_to_camera: torch.Tensor | None = None, height: int = 40, width: int = 64) -> Camera:
+    return Camera(INTRINSICS, motion() if world_to_camera is None else world_to_camera, height, width)
+
+
+def test_axes_are_x_right_y_down_z_forward_with_pixel_centres_at_a_half():
+    # Column 56: (56.5 - 32) / 100 = 0.245 to the right; row 7: (7.5 - 20) / 50 = -0.25, above the middle.
+    rays = camera().rays()
+    assert rays.image
+    assert rays.shape == (40, 64)
+    assert rays.origins[7, 56].tolist() == [0, 0, 0]
+    length = sqrt(0.245**2 + 0.25**2 + 1)
+    assert rays.directions[7, 56].tolist() == pytest.approx([0.245 / length, -0.25 / length, 1 / length])
+    # The four pixels about the principal point lie evenly about the axis.
+    assert rays.directions[19:21, 31:33].sum((0, 1))[:2].tolist() == pytest.approx([0, 0])
+
+
+def test_the_camera_centre_follows_from_its_motion():
+    # The camera is 3 behind the origin on z and turned by half a turn about y: it looks along -z, its right is -x.
+    turned = torch.diag(vector((-1, 1, -1, 1)))
+    turned[:3, 3] = vector((0, 0, 3))
+    view = camera(turned)
+    assert view.center.tolist() == [0, 0, 3]
+    ray = view.rays().directions[19, 63]  # to the right of the middle
+    assert ray[0] < 0
+    assert ray[2] < 0
+    torch.testing.assert_close(view.camera_to_world @ turned, torch.eye(4, dtype=torch.float64))
+
+
+@settings(max_examples=20)
+@given(
+    angle=st.floats(-pi, pi),
+    translation=st.tuples(*[st.floats(-3, 3)] * 3),
+    seed=st.integers(0, 2**32),
+)
+def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_z(angle, translation, seed):
+    view = camera(motion(angle, translation))
+    distance = 0.5 + torch.rand(40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    rays = view.rays()
+    points = rays.at(distance) @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    torch.testing.assert_close(view.depth(distance), points[..., 2], rtol=0, atol=1e-12)  # Eq. 2
+    pixels = points @ INTRINSICS.T
+    rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    found = pixels[..., :2] / pixels[..., 2:]
+    torch.testing.assert_close(found, torch.stack([columns, rows], -1).double(), rtol=0, atol=1e-9)
+    assert torch.equal(rays.origins, view.center.expand(40, 64, 3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_comes_from_the_matrices(dtype):
+    view = Camera(INTRINSICS.to(dtype), motion(0.3, (0, 0, 2)).to(dtype), 3, 5)
+    rays = view.rays()
+    assert rays.origins.dtype == rays.directions.dtype == view.depth(torch.ones(3, 5, dtype=dtype)).dtype == dtype
+
+
+def test_gradients_reach_intrinsics_and_extrinsics():
+    def project(intrinsics: torch.Tensor, translation: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        # The motion is made from its translation and from its intrinsics, so that it stays rigid under gradcheck.
+        matrix = torch.cat([motion(0.7)[:3, :3], translation[:, None]], dim=1)
+        matrix = torch.cat([matrix, vector((0, 0, 0, 1))[None]])
+        view = Camera(intrinsics, matrix, 2, 3)
+        rays = view.rays()
+        return rays.origins, rays.directions, view.depth(torch.ones(2, 3, dtype=torch.float64))
+
+    intrinsics = INTRINSICS.clone().requires_grad_(True)
+    translation = vector((0.1, -0.2, 2)).requires_grad_(True)
+    assert torch.autograd.gradcheck(project, (intrinsics, translation))
+
+    angle = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[0, 0], turned[0, 2], turned[2, 0], turned[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    bearing = Camera(INTRINSICS, turned, 40, 64).rays().directions[20, 32]
+    heading = torch.atan2(bearing[0], bearing[2])  # turns with the camera, the other way round
+    assert torch.autograd.grad(heading, angle)[0].item() == pytest.approx(-1, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(0, 0, 0.0), (1, 1, 0.0), (1, 1, -50.0), (0, 0, float("nan")), (0, 2, float("inf"))]
+)
+def test_intrinsics_that_are_none_are_refused(row, column, value):
+    intrinsics = INTRINSICS.clone()
+    intrinsics[row, column] = value
+    with pytest.raises(ValueError, match="focal lengths must be positive and finite"):
+        Camera(intrinsics, motion(), 4, 4)
+
+
+@pytest.mark.parametrize(
+    "rotation",
+    [
+        2 * torch.eye(3),  # a scale
+        torch.diag(torch.tensor([1.0, 1, -1])),  # a mirror
+        torch.zeros(3, 3),
+        torch.eye(3) + 0.01 * torch.ones(3, 3),
+        torch.full((3, 3), float("nan")),
+    ],
+)
+def test_a_motion_that_is_not_rigid_is_refused(rotation):
+    matrix = motion()
+    matrix[:3, :3] = rotation
+    with pytest.raises(ValueError, match="world_to_camera must"):
+        camera(matrix)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_camera_that_is_nowhere_is_refused(value):
+    with pytest.raises(ValueError, match="world_to_camera must"):
+        camera(motion(0.0, (0, value, 0)))
+
+
+def test_a_camera_of_no_pixels_or_of_other_shapes_is_refused():
+    for size in ((0, 4), (4, 0), (-1, 4)):
+        with pytest.raises(ValueError, match="height and width must be at least 1 pixel"):
+            camera(None, *size)
+    for matrices in ((INTRINSICS[:2], motion()), (INTRINSICS, motion()[:3]), (motion(), motion())):
+        with pytest.raises((ValueError, TypeCheckError)):
+            Camera(*matrices, 4, 4)
+
+
+def test_rays_of_other_shapes_or_lengths_are_refused():
+    ahead = vector((0, 0, 1))
+    for origins, directions in ((torch.zeros(2, 3), torch.zeros(3, 3)), (torch.zeros(2), torch.zeros(2))):
+        with pytest.raises((ValueError, TypeCheckError)):
+            Rays(origins, directions)
+        with pytest.raises(ValueError, match=r"must both have shape \[\*rays, 3\]"):
+            Rays.__post_init__(SimpleNamespace(origins=origins, directions=directions))  # without the type checker
+    for scale in (2.0, 0.5, 0.0, float("nan")):
+        with pytest.raises(ValueError, match="directions must have unit length"):
+            Rays(torch.zeros(2, 3), torch.stack([ahead, scale * ahead]))
+    Rays(torch.zeros(0, 3), torch.zeros(0, 3))  # no rays are fine
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_rays_from_nowhere_are_refused(value):
+    with pytest.raises(ValueError, match="origins"):
+        Rays(vector((0, value, 0)), vector((0, 0, 1)))
+
+
+def test_parts_of_rays():
+    rays = camera(motion(0.4, (1, 2, 3)), 2, 3).rays()
+    flat = rays.flat()
+    assert flat.shape == (6,)
+    assert not flat.image
+    assert torch.equal(flat.directions[4], rays.directions[1, 1])
+    some = rays[torch.tensor([[True, False, False], [False, False, True]])]
+    assert torch.equal(some.directions, torch.stack([rays.directions[0, 0], rays.directions[1, 2]]))
+    assert not some.image
+    assert rays.to(torch.device("cpu")).image
+    torch.testing.assert_close(rays.at(torch.full((2, 3), 2.0))[1, 2], rays.origins[1, 2] + 2 * rays.directions[1, 2])
+
+
+def parallel(height: int, width: int) -> Rays:
+    """Rays along z, one through the centre of each unit square of a sheet."""
+    rows, columns = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5, indexing="ij"
+    )
+    origins = torch.stack([columns, rows, torch.zeros_like(rows)], -1)
+    return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
+
+
+def test_coarser_rays_run_through_the_middles_of_their_blocks():
+    coarse = parallel(8, 4).coarser(4)
+    assert coarse.image
+    assert coarse.origins[..., :2].tolist() == [[[2, 2]], [[2, 6]]]
+    assert coarse.directions.tolist() == [[[0, 0, 1]], [[0, 0, 1]]]
+
+
+def test_blocks_over_the_edge_repeat_the_edge():
+    # 5 columns in blocks of 4: columns 0 to 3, then 4 by itself. 3 rows: 0.5, 1.5, 2.5 and 2.5 again, mean 1.75.
+    assert parallel(3, 5).coarser(4).origins[..., :2].tolist() == [[[2, 1.75], [4.5, 1.75]]]
+    assert parallel(1, 1).coarser(4).origins[..., :2].tolist() == [[[0.5, 0.5]]]
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3), (0,)])
+def test_leading_dimensions_of_images_are_kept(shape):
+    sheet = parallel(6, 5)
+    many = Rays(*(part.expand(*shape, 6, 5, 3) for part in (sheet.origins, sheet.directions)), image=True)
+    coarse = many.coarser(2)
+    assert coarse.shape == (*shape, 3, 3)
+    assert torch.equal(coarse.origins, sheet.coarser(2).origins.expand(*shape, 3, 3, 3))
+
+
+def test_coarser_rays_of_a_pinhole_keep_its_centre_and_meet_the_middle_of_the_block():
+    view = Camera(INTRINSICS, motion(0.3, (0, 0, 2)), 8, 8)
+    coarse = view.rays().coarser(4)
+    torch.testing.assert_close(coarse.origins, view.center.expand(2, 2, 3), rtol=0, atol=1e-14)
+    half = Camera(torch.diag(vector((0.25, 0.25, 1))) @ INTRINSICS, motion(0.3, (0, 0, 2)), 2, 2).rays()
+    torch.testing.assert_close(coarse.directions, half.directions, rtol=0, atol=3e-4)  # a pixel is 1e-2 wide
+
+
+def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
+    return Rays(vector(origin), torch.nn.functional.normalize(vector(direction), dim=0))
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "radius", "entry", "leave", "meets"),
+    [
+        ((0, 0, -2), (0, 0, 1), 1, 1, 3, True),
+        ((0.6, 0, -2), (0, 0, 1), 1, 1.2, 2.8, True),  # half a chord is (1 - 0.36)^(1/2) = 0.8
+        ((0.3, 0, -2), (0, 0, 1), 0.5, 1.6, 2.4, True),
+        ((0, 0, 0), (0, 3, 4), 1, 0, 1, True),  # from the centre
+        ((0, 0, -0.5), (0, 0, 1), 1, 0, 1.5, True),  # from inside
+        ((0, 0, 0.5), (0, 0, 1), 1, 0, 0.5, True),  # from inside, the centre behind
+        ((0, 0, 2), (0, 0, 1), 1, None, None, False),  # behind the camera
+        ((2, 0, -3), (0, 0, 1), 1, 3, 3, False),  # passes by
+        ((2, 0, 3), (0, 0, 1), 1, None, None, False),  # passed by, and behind
+    ],
+)
+def test_spans_of_the_sphere_by_closed_form(origin, direction, radius, entry, leave, meets):
+    found_entry, found_leave, found_meets = sphere_span(ray(origin, direction), radius)
+    assert found_meets.item() is meets
+    if entry is not None:
+        assert found_entry.item() == pytest.approx(entry)
+        assert found_leave.item() == pytest.approx(leave)
+    assert found_entry >= 0
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32), radius=st.floats(0.1, 2))
+def test_a_span_ends_on_the_sphere_or_begins_at_the_origin(seed, radius):
+    generator = torch.Generator().manual_seed(seed)
+    origins, directions = torch.randn(2, 200, 3, dtype=torch.float64, generator=generator)
+    rays = Rays(origins, torch.nn.functional.normalize(directions, dim=-1))
+    entry, leave, meets = sphere_span(rays, radius)
+    inside = origins.norm(dim=-1) < radius
+    assert (meets | ~inside).all()
+    torch.testing.assert_close(entry[inside], torch.zeros_like(entry[inside]))
+    outside = meets & ~inside
+    for end in (rays.at(entry)[outside], rays.at(leave)[meets]):
+        torch.testing.assert_close(end.norm(dim=-1), torch.full_like(end[:, 0], radius))
+    assert (entry <= leave)[meets].all()
+    least = distance_to_origin(rays)
+    assert torch.equal(meets, least < radius)
+    steps = torch.linspace(0, 8, 2000, dtype=torch.float64)[:, None]
+    sampled = (rays.origins[:, None] + steps * rays.directions[:, None]).norm(dim=-1).amin(1)
+    assert (least <= sampled + 1e-12).all()
+    assert (least >= sampled - 4e-3).all()  # the samples' spacing
+
+
+def test_the_distance_to_the_origin_is_that_of_a_half_line():
+    assert distance_to_origin(ray((0.5, 0, -3), (0, 0, 1))).item() == pytest.approx(0.5)
+    assert distance_to_origin(ray((3, 0, 4), (0, 0, 1))).item() == pytest.approx(5)  # the origin lies behind
+    assert distance_to_origin(ray((0, 0, -3), (0, 0, 1))).item() == 0
+
+
+def test_gradients_of_spans_and_distances_are_exact_and_finite():
+    origins = torch.stack([vector((0.6, 0, -2)), vector((0.1, 0.2, -0.3)), vector((2, 0.5, -3))]).requires_grad_(True)
+    directions = vector((0, 0, 1)).expand(3, 3).clone().requires_grad_(True)
+
+    def spans(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        rays = Rays(origins, torch.nn.functional.normalize(directions, dim=-1))
+        return (*sphere_span(rays)[:2], distance_to_origin(rays))
+
+    assert torch.autograd.gradcheck(spans, (origins, directions))
+    # On a tangent, and through the centre, where a root and a length have no derivative: still finite.
+    edge = torch.stack([vector((1, 0, -2)), vector((0, 0, -2)), vector((0, 0, 0))]).requires_grad_(True)
+    total = sum(part.sum() for part in spans(edge, directions))
+    assert torch.autograd.grad(total, edge)[0].isfinite().all()
+
+
+def test_moved_by_nothing_is_the_same_camera():
+    camera = moving()
+    same = camera.moved(torch.zeros(6, dtype=torch.float64))
+    torch.testing.assert_close(same.world_to_camera, camera.world_to_camera)
+
+
+@pytest.mark.parametrize(
+    ("twist", "seen"),
+    [
+        ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
+        ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it
+        ((0, 0, 0, 0, torch.pi / 2, 0), (2, 0, 0)),  # a quarter turn about y, down: from ahead to the right
+        ((0, 0, 0, torch.pi / 2, 0, 0), (0, -2, 0)),
+        ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # about the line of sight
+    ],
+)
+def test_a_twist_moves_the_world_in_the_cameras_axes(twist, seen):
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[2, 3] = 2.0  # the origin lies 2 ahead
+    moved = Camera(torch.eye(3, dtype=torch.float64), motion, 4, 4).moved(torch.tensor(twist, dtype=torch.float64))
+    torch.testing.assert_close(
+        moved.world_to_camera[:3, 3], torch.tensor(seen, dtype=torch.float64), rtol=0, atol=1e-12
+    )
+
+
+def test_gradients_flow_to_the_twist():
+    camera, step = moving(), 1e-6
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(2, 5, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def weighed(twist: torch.Tensor) -> torch.Tensor:
+        rays = camera.moved(twist).rays()
+        return (weight * torch.stack([rays.origins, rays.directions])).sum()
+
+    (found,) = torch.autograd.grad(weighed(twist), twist)
+    for axis, offset in enumerate(step * torch.eye(6, dtype=torch.float64)):
+        assert found[axis].item() == pytest.approx(((weighed(offset) - weighed(-offset)) / (2 * step)).item(), abs=1e-8)
+
+
+def test_resized_sees_the_same_in_other_pixels():
+    camera = moving()
+    fine = camera.resized(15, 12)  # three times each way: the middle of a block is its pixel
+    torch.testing.assert_close(fine.rays().directions[1::3, 1::3], camera.rays().directions)
+    torch.testing.assert_close(fine.center, camera.center)
+    assert (camera.height, camera.width) == (5, 4)
+
+
+def test_double_is_the_same_in_float64():
+    camera = Camera(torch.eye(3), torch.eye(4), 2, 2)
+    assert camera.double().rays().origins.dtype is torch.float64
+    torch.testing.assert_close(camera.double().rays().directions.float(), camera.rays().directions)
+
+
+def moving() -> Camera:
+    """A camera off every axis, in float64."""
+    intrinsics = torch.tensor([[3.0, 0, 2], [0, 3.5, 2.4], [0, 0, 1]], dtype=torch.float64)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    motion[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
+    return Camera(intrinsics, motion, height=5, width=4)

@@ -1,0 +1,192 @@
+"""Evaluations of every renderer on planes and spheres, against closed forms and counts made by hand."""
+
+from dataclasses import replace
+from math import ceil, cos, log, radians, sin, sqrt
+
+import pytest
+import torch
+
+from bench.config import load
+from datasets.views import ViewSampler
+from renderers.camera import Rays, distance_to_origin
+from renderers.field import Counts, Field, Meter
+from renderers.fields.analytic import plane, sphere
+from renderers.rendering import Renderer
+from tests.renderers.analytic_cases import sphere_hits, vector
+
+EPSILON = 5e-5
+GROUND = plane((0, 1, 0), 0.0)
+PLAIN = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False)
+FULL = {  # renderers that ask every ray that meets the sphere equally often
+    "naive": (load("renderer", "naive", steps=7), 7),
+    "naive-practical": (load("renderer", "naive", steps=7, gradient="practical", n_gradient_samples=1), 7),
+    "naive-serial": (load("renderer", "naive", steps=7, serial=True), 7),
+    "dist-all-rays": (replace(PLAIN, active_only=False, steps=7), 7),
+}
+
+
+def forward(renderer: Renderer, field: Field, rays: Rays) -> int:
+    """Values that a rendering without gradient asks for."""
+    meter = Meter(field)
+    with torch.no_grad():
+        renderer.render(meter, rays)
+    assert meter.counts.gradient == 0
+    return meter.counts.value
+
+
+def down(degrees: float, count: int = 1) -> Rays:
+    """Rays at the origin, at an angle to the ground's normal; they enter the unit sphere 1 before it."""
+    direction = vector((sin(radians(degrees)), -cos(radians(degrees)), 0))
+    return Rays((-2 * direction).expand(count, 3), direction.expand(count, 3))
+
+
+def picture(size: int = 24) -> Rays:
+    """The unit sphere and some of what is beside it, from 2.5 away."""
+    camera = ViewSampler(2.5, 60.0, (0.0, 360.0), (15.0, 35.0), size).camera(30.0, 20.0).double()
+    return camera.rays()
+
+
+def plane_queries(degrees: float, alpha: float) -> int:
+    """The least k with cos |1 - alpha cos|^k < epsilon, at a distance of 1 along the ray, and the first query.
+
+    DIST, Eqs. 7 and 8, with its angle to the surface, and the field's value, which is what epsilon is compared with.
+    """
+    cosine = cos(radians(degrees))
+    rate = abs(1 - alpha * cosine)
+    return 1 + ceil((log(EPSILON) - log(cosine)) / log(rate)) if rate > 1e-12 else 2
+
+
+@pytest.mark.parametrize("degrees", [5.0, 20.0, 33.0, 47.0, 60.0, 72.0])
+@pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5, 1.9])
+def test_dist_on_a_plane_asks_as_often_as_equation_8_says(degrees, alpha):
+    renderer = replace(PLAIN, alpha=alpha, steps=200)
+    assert forward(renderer, GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, alpha)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 33.0, 60.0, 72.0])
+def test_idr_on_a_plane_asks_as_often_as_plain_sphere_tracing(degrees):
+    assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, 1.0)
+
+
+def test_the_papers_example_of_a_grazing_ray():
+    # DIST, A.1: at 10 degrees to the surface alpha = 1.5 takes 33 steps in place of 52, to where d (1 - alpha sin)^k is
+    # 5e-5. Epsilon bounds the field's value, d sin(10 degrees) of that, so that the queries are fewer.
+    steps = {alpha: ceil(log(EPSILON) / log(1 - alpha * sin(radians(10)))) for alpha in (1.0, 1.5)}
+    assert steps == {1.0: 52, 1.5: 33}
+    for alpha, most in steps.items():
+        count = forward(replace(PLAIN, alpha=alpha, steps=200), GROUND, down(80.0))
+        assert count == plane_queries(80.0, alpha) < most
+
+
+def test_a_ray_that_does_not_converge_asks_once_a_step():
+    for steps in (1, 5, 9):
+        for renderer in (replace(PLAIN, steps=steps), load("renderer", "idr", steps=steps)):
+            assert forward(renderer, GROUND, down(80.0, 2)) == 2 * steps
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.6])  # smaller, and the first step passes the centre
+def test_head_on_at_a_sphere_the_rest_shrinks_by_one_minus_alpha(radius):
+    head_on = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
+    assert forward(PLAIN, sphere(radius), head_on) == 2  # the first step ends on the surface
+    halvings = ceil(log((1 - radius) / EPSILON, 2))
+    assert forward(replace(PLAIN, alpha=1.5), sphere(radius), head_on) == halvings + 1
+
+
+def marched(rays: Rays, radius: float, *, alpha: float, steps: int) -> int:
+    """Queries of sphere tracing at a sphere about the origin, ray by ray, from the geometry of a triangle."""
+    queries = 0
+    middle = -(rays.origins * rays.directions).sum(-1).flatten()
+    for passing, along in zip(distance_to_origin(rays).flatten().tolist(), middle.tolist(), strict=True):
+        if passing >= 1 or along < 0:
+            continue
+        half = sqrt(1 - passing**2)
+        t = -half  # from the middle of the chord
+        for _ in range(steps):
+            value = sqrt(passing**2 + t**2) - radius
+            queries += 1
+            if abs(value) < EPSILON:
+                break
+            t += alpha * value
+            if t > half:
+                break
+    return queries
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.5])
+def test_the_evaluations_of_an_image_are_the_sum_of_its_rays(alpha):
+    rays = picture()
+    expected = marched(rays, 0.5, alpha=alpha, steps=50)
+    assert forward(replace(PLAIN, alpha=alpha), sphere(0.5), rays) == expected
+    if alpha == 1:
+        assert forward(load("renderer", "idr"), sphere(0.5), rays) == expected
+
+
+@pytest.mark.parametrize("name", FULL)
+def test_who_asks_all_rays_asks_steps_times_the_rays_that_meet_the_sphere(name):
+    renderer, steps = FULL[name]
+    rays = picture(12)
+    meets = int((distance_to_origin(rays) < 1).sum())
+    assert 20 < meets < 144
+    assert forward(renderer, sphere(0.5), rays) == steps * meets
+
+
+@pytest.mark.parametrize("samples", [2, 16, 33])
+@pytest.mark.parametrize("refinement", [0, 8])
+def test_dvr_asks_all_samples_of_all_rays_and_refines_each_hit(samples, refinement):
+    renderer = load("renderer", "dvr", n_ray_samples=samples, refinement_steps=refinement)
+    rays = picture()
+    with torch.no_grad():
+        hits = int(renderer.render(sphere(0.5), rays).hit.sum())
+    meets = int((distance_to_origin(rays) < 1).sum())
+    assert forward(renderer, sphere(0.5), rays) == samples * meets + refinement * hits
+    if samples > 2:
+        assert hits == pytest.approx(int(sphere_hits(rays, 0.5)[1].sum()), abs=8)
+
+
+@pytest.mark.parametrize(("samples", "asked"), [(2, 2), (16, 9), (17, 9), (128, 65)])
+def test_dvr_that_stops_early_asks_up_to_the_surface(samples, asked):
+    # The ground is half way through the sphere: the first sample at or beyond it is number ceil((n - 1) / 2), from 0.
+    renderer = load("renderer", "dvr", n_ray_samples=samples, early_stop=True)
+    ray = down(20.0, 4)
+    assert asked == ceil((samples - 1) / 2) + 1
+    below = Meter(plane((0, 1, 0), -1e-9))  # a hair lower, so that the half way sample is free
+    with torch.no_grad():
+        renderer.render(below, ray)
+    late = asked + (samples % 2)
+    assert below.counts.value == 4 * (late + renderer.refinement_steps)
+    aside = Rays(vector((0, 2, -2)).expand(3, 3), vector((0, 0, 1)).expand(3, 3))
+    assert forward(renderer, GROUND, aside) == 0  # they miss the sphere
+    above = Rays(vector((0, 0.5, -2)).expand(3, 3), vector((0, 0, 1)).expand(3, 3))
+    assert forward(renderer, GROUND, above) == 3 * samples  # nothing to stop at
+
+
+def test_coarse_to_fine_counts_by_hand():
+    # 8 x 8 rays that are all the same: 4, then 16, then 64. Plain, 2 queries hit the wall, and each finer ray
+    # finds itself there. At alpha = 1.5 it takes 16: 3, 3 and then 10.
+    wall = plane((0, 0, -1), 0.0)
+    origins = vector((0, 0, -2)).expand(8, 8, 3)
+    rays = Rays(origins, vector((0, 0, 1)).expand(8, 8, 3), image=True)
+    fine = replace(PLAIN, coarse_to_fine=True, careful_split=False)
+    assert forward(fine, wall, rays) == 2 * 4 + 16 + 64
+    assert forward(replace(fine, alpha=1.5), wall, rays) == 3 * 4 + 3 * 16 + 10 * 64
+    assert forward(replace(fine, alpha=1.5, steps=8), wall, rays) == 3 * 4 + 3 * 16 + 2 * 64
+
+
+@pytest.mark.parametrize("name", ["dist", "idr", "dvr", "naive"])
+def test_evaluations_of_the_gradient(name):
+    """Beside the search: each ray once more for its closest sample, and what the rule asks of each hit."""
+    settings = {"coarse_to_fine": False} if name == "dist" else {"steps": 9} if name == "naive" else {}
+    renderer, rays = load("renderer", name, **settings), picture()
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    search = forward(renderer, sphere(0.5), rays)
+    meter = Meter(sphere(radius))
+    rendering = renderer.render(meter, rays)
+    meets, hits = int((distance_to_origin(rays) < 1).sum()), int(rendering.hit.sum())
+    before = meter.counts.gradient
+    extra = {"dist": meets, "idr": meets + hits, "dvr": meets + hits, "naive": 0}[name]
+    assert meter.counts.value == search + extra
+    assert before == {"dist": 0, "idr": hits, "dvr": hits, "naive": 0}[name]  # the slope along the ray
+    rendering.distance[rendering.hit].sum().backward()
+    after = meter.counts.gradient - before
+    assert after == hits if name != "naive" else hits < after <= 9 * hits
+    assert Counts(3, 2) - Counts(1, 1) == Counts(2, 1)

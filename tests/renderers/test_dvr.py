@@ -1,0 +1,225 @@
+"""DVR and IDR: what is found, what is missed, gradients and mask losses, by hand."""
+
+from dataclasses import replace
+from math import log, log1p
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from bench.config import load
+from renderers.camera import Rays
+from renderers.field import Kind, Meter, occupancy_field
+from renderers.fields.analytic import Shape, box, plane, sphere
+from renderers.fields.occupancy import OccupancyNetwork
+from renderers.gradients import implicit
+from renderers.rendering import Rendering, Spaced, Status, at_iteration
+from tests.renderers.analytic_cases import CASES, Case, vector
+
+DVR = load("renderer", "dvr", mask_weight=1.0)
+IDR = load("renderer", "idr", epsilon=1e-11, steps=300)
+EXACT = {"dvr": replace(DVR, refinement_steps=60), "idr": IDR}
+by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+by_name = pytest.mark.parametrize("name", EXACT)
+
+
+def along_z(*heights: float) -> Rays:
+    origins = torch.stack([vector((0, y, -2)) for y in heights])
+    return Rays(origins, vector((0, 0, 1)).expand_as(origins))
+
+
+def slab(thickness: float) -> Shape:
+    return box((2.0, 2.0, thickness / 2))
+
+
+@pytest.mark.parametrize("samples", [8, 17, 64])
+def test_a_slab_thinner_than_the_spacing_is_met_only_by_luck(samples):
+    spacing = 2 / (samples - 1)
+    renderer = replace(DVR, n_ray_samples=samples)
+    # Slabs beside the middle of an interval, a little thinner and a little thicker than the spacing.
+    middle = -1 + spacing * (samples // 2 - 0.5)
+    thin, thick = (slab(share * spacing).translate((0.0, 0.0, middle)) for share in (0.98, 1.02))
+    assert renderer.render(thin, along_z(0.0)).status.tolist() == [Status.MISS]
+    assert renderer.render(thick, along_z(0.0)).status.tolist() == [Status.HIT]
+
+
+def test_stopping_early_changes_nothing():
+    rays = along_z(0.0, 0.2, 0.45, 0.7, 0.99, 1.5)
+    origins = torch.cat([rays.origins, vector((0.1, 0, 0))[None]])
+    inside = Rays(origins, rays.directions[:1].expand_as(origins))
+    plain, early = (replace(DVR, early_stop=stop).render(sphere(0.5), inside) for stop in (False, True))
+    assert set(plain.status.tolist()) == {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
+    for part in ("distance", "status", "points", "residual", "closest"):
+        assert torch.equal(getattr(plain, part), getattr(early, part)), part
+
+
+def test_the_secant_is_sooner_there_than_bisection():
+    ray, truth = along_z(0.1), 2 - (0.25 - 0.01) ** 0.5
+    errors = {}
+    for method in ("secant", "bisection"):
+        for steps in (0, 3, 6):
+            renderer = replace(DVR, n_ray_samples=16, refinement=method, refinement_steps=steps)
+            errors[method, steps] = abs(renderer.render(sphere(0.5), ray).distance.item() - truth)
+        assert errors[method, 0] > errors[method, 3] > errors[method, 6]
+    assert errors["secant", 6] < 1e-6 < errors["bisection", 6]
+
+
+def test_samples_double_on_schedule_up_to_all():
+    renderer = replace(DVR, n_ray_samples=128, doublings=(50, 150, 250))
+    assert [renderer.at_iteration(i).n_ray_samples for i in (0, 49, 50, 149, 150, 249, 250, 10_000)] == [
+        16, 16, 32, 32, 64, 64, 128, 128,
+    ]  # fmt: skip
+    assert at_iteration(renderer, 0).n_ray_samples == 16
+    assert at_iteration(replace(renderer, doublings=()), 0).n_ray_samples == 128
+    assert at_iteration(IDR, 0) is IDR  # it has no schedule
+    for wrong in ((3, 3), (5, 2), (-1,)):
+        with pytest.raises(ValueError, match="doublings must be rising iterations from 0"):
+            replace(renderer, doublings=wrong)
+
+
+def test_samples_set_from_outside_leave_no_doublings():
+    assert isinstance(DVR, Spaced) and not isinstance(load("renderer", "dist"), Spaced)
+    assert DVR.with_samples(33) == replace(DVR, n_ray_samples=33, doublings=())
+
+
+def test_any_level_set_will_do():
+    bent = Shape(lambda p: torch.tanh(9 * (sphere(0.5)(p))) ** 3, Kind.LEVEL, None)
+    found = replace(DVR, refinement="bisection", refinement_steps=40).render(bent, along_z(0.0, 0.3))
+    assert found.distance.tolist() == pytest.approx([1.5, 1.6], abs=1e-6)
+
+
+def test_an_occupancy_network_is_rendered_where_its_probability_is_the_threshold():
+    torch.manual_seed(0)
+    network = OccupancyNetwork(width=16, code_length=0).double().at(torch.zeros(0, dtype=torch.float64))
+    there = along_z(-0.4, -0.2, 0.0, 0.2, 0.4)
+    back = Rays(there.at(torch.full((5,), 4.0, dtype=torch.float64)), -there.directions)
+    rays = Rays(torch.cat([there.origins, back.origins]), torch.cat([there.directions, back.directions]))
+    renderer = replace(DVR, refinement="bisection", refinement_steps=40)
+    threshold = torch.sigmoid(network.logits(vector((0, 0, 0)))).item()  # met from one side, if not from both
+    field = occupancy_field(network.logits, threshold)
+    rendering = renderer.render(field, rays)
+    hit = rendering.hit
+    assert hit.any()
+    probability = torch.sigmoid(network.logits(rendering.points[hit]))
+    assert probability.tolist() == pytest.approx([threshold] * int(hit.sum()), abs=1e-9)
+
+
+@by_name
+@by_case
+def test_the_implicit_gradient_is_exact(name, case: Case):
+    parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
+    rays = case.rays()
+    origins, directions = rays.origins.requires_grad_(True), rays.directions.requires_grad_(True)
+    distance = EXACT[name].render(case.shape(parameter), Rays(origins, directions)).distance
+    by_parameter, by_origin, by_direction = torch.autograd.grad(distance.sum(), (parameter, origins, directions))
+    assert by_parameter.item() == pytest.approx(case.parameter_rate, rel=1e-7)
+    torch.testing.assert_close(by_origin[0], case.origin_rate, rtol=1e-7, atol=1e-7)
+    # A turn of the ray moves its end by the distance times what an origin moves it by.
+    torch.testing.assert_close(by_direction[0], case.distance * case.origin_rate, rtol=1e-7, atol=1e-7)
+
+
+@by_name
+def test_no_field_is_asked_for_a_gradient_that_nobody_wants(name):
+    meter = Meter(sphere(0.5))
+    rendering = EXACT[name].render(meter, along_z(0.1, 0.8))
+    assert not rendering.distance.requires_grad
+    assert meter.counts.gradient == 0
+
+
+@pytest.mark.parametrize(("slope", "used"), [(-2e-4, -1e-3), (2e-4, 1e-3), (-0.5, -0.5), (0.5, 0.5), (0.0, -1e-3)])
+def test_a_flat_slope_keeps_its_sign(slope, used):
+    offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    field = Shape(lambda p: slope * p[..., 2] + offset, Kind.LEVEL, None)
+    distance = implicit(field, along_z(0.0), vector((2.0,)), least_slope=1e-3)
+    (found,) = torch.autograd.grad(distance.sum(), offset)
+    assert found.item() == pytest.approx(-1 / used)  # Eq. 8; the official clamp makes -2e-4 to +1e-3
+
+
+def masks(renderer, field, rays: Rays, mask: list[bool], seed: int = 0) -> tuple[Tensor, Rendering, Tensor]:
+    """The silhouette loss of a seed, the rendering, and the shares of the rays' chords that the seed draws."""
+    rendering = renderer.render(field, rays)
+    torch.manual_seed(seed)
+    loss = renderer.silhouette_loss(field, rays, rendering, torch.tensor(mask))
+    torch.manual_seed(seed)
+    return loss, rendering, torch.rand(rays.shape, dtype=torch.float64)
+
+
+def test_dvr_mask_losses_by_hand():
+    # A hit that is wanted costs nothing; a hit on the background log 2, at the surface (Eq. 14); a ray that misses is
+    # judged at the drawn point, as free (Eq. 14) or as occupied (Eq. 15); one that misses the sphere is not judged.
+    width, rays = 0.1, along_z(0.0, 0.0, 0.8, 0.8, 1.5, 1.5)
+    renderer = replace(DVR, occupancy_width=width, refinement_steps=40)
+    loss, rendering, shares = masks(renderer, sphere(0.5), rays, [True, False, False, True, True, False])
+    assert rendering.hit.tolist() == [True, True, False, False, False, False]
+    values = []
+    for share in shares[2:4].tolist():
+        z = 0.6 * (2 * share - 1)  # the chord at height 0.8 goes from -0.6 to 0.6
+        values.append((0.64 + z**2) ** 0.5 - 0.5)
+    free, occupied = (softplus(torch.tensor(sign * v / width)).item() for sign, v in ((-1, values[0]), (1, values[1])))
+    assert loss.item() == pytest.approx((log(2) + free + occupied) / 6, rel=1e-6)
+
+
+def test_the_loss_takes_values_of_a_level_set_as_logits():
+    field = Shape(lambda p: sphere(0.5)(p) * 3, Kind.LEVEL, None)
+    loss, _, shares = masks(DVR, field, along_z(0.8), [False])
+    z = 0.6 * (2 * shares.item() - 1)
+    logit = -3 * ((0.64 + z**2) ** 0.5 - 0.5)
+    assert loss.item() == pytest.approx(log1p(torch.tensor(logit).exp().item()), rel=1e-6)
+
+
+def test_mask_losses_push_the_right_way():
+    for renderer in (DVR, load("renderer", "idr")):
+        for mask, sign in (([True], -1), ([False], 1)):
+            radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+            height = 0.6 if mask[0] else 0.4  # missed though wanted, hit though not
+            loss, _, _ = masks(renderer, sphere(radius), along_z(height), mask)
+            (found,) = torch.autograd.grad(loss, radius)
+            assert found.item() * sign > 0
+
+
+def test_idr_mask_loss_by_hand():
+    rays = along_z(0.0, 0.0, 0.8, 0.9)
+    renderer = load("renderer", "idr", mask_sharpness=20.0, mask_weight=1.0)
+    loss, rendering, _ = masks(renderer, sphere(0.5), rays, [True, False, False, True])
+    entropies = [softplus(-20 * rendering.closest[i]) for i in (1, 2)] + [softplus(20 * rendering.closest[3])]
+    assert rendering.closest[2].item() == pytest.approx(0.3, abs=0.1)
+    assert loss.item() == pytest.approx(sum(e.item() for e in entropies) / (20 * 4), rel=1e-9)
+
+
+def test_idr_has_the_hits_of_plain_sphere_tracing():
+    rays = along_z(0.0, 0.2, 0.45, 0.499, 0.6, 1.2)
+    plain = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False)
+    one, other = load("renderer", "idr").render(sphere(0.5), rays), plain.render(sphere(0.5), rays)
+    for part in ("distance", "status", "residual", "closest"):
+        assert torch.equal(getattr(one, part), getattr(other, part)), part
+
+
+def test_naive_is_the_same_one_by_one_and_its_practical_gradient_is_that_of_dist():
+    rays = along_z(0.0, 0.2, 0.45, 0.6, 1.2)
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    shared = {"n_gradient_samples": 2, "epsilon": 1e-6, "silhouette_average": "all"}
+    dist = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False, active_only=False, **shared)
+    found = {}
+    for gradient in ("unrolled", "practical"):
+        for serial in (False, True):
+            renderer = load("renderer", "naive", gradient=gradient, serial=serial, **shared)
+            rendering = renderer.render(sphere(radius), rays)
+            (rate,) = torch.autograd.grad(rendering.distance[rendering.hit].sum(), radius)
+            found[gradient, serial] = rendering, rate
+        for part in ("distance", "status", "residual", "closest"):
+            assert torch.equal(getattr(found[gradient, False][0], part), getattr(found[gradient, True][0], part)), part
+        assert found[gradient, False][1] == pytest.approx(found[gradient, True][1].item())
+    other = dist.render(sphere(radius), rays)
+    (rate,) = torch.autograd.grad(other.distance[other.hit].sum(), radius)
+    assert torch.equal(other.distance, found["practical", False][0].distance)
+    assert rate.item() == pytest.approx(found["practical", False][1].item())
+    assert rate.item() != pytest.approx(found["unrolled", False][1].item(), rel=0.01)
+
+
+def test_a_plane_that_grazes_is_crossed_once():
+    tilted = plane((0.02, 1.0, 0.0), 0.0)
+    ray = Rays(vector((-2, 0, 0))[None], vector((1, 0, 0))[None])
+    assert replace(DVR, refinement_steps=40).render(tilted, ray).status.item() == Status.STARTED_INSIDE
+    back = Rays(vector((2, 0, 0))[None], vector((-1, 0, 0))[None])
+    assert DVR.render(tilted, back).distance.item() == pytest.approx(2.0, abs=1e-9)

@@ -1,0 +1,369 @@
+"""Fields: distances worked out by hand, bounds against sampled surfaces, kinds, normals, and what the Meter counts."""
+
+from math import pi, sqrt
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from renderers.field import Counts, Field, Flops, Kind, Meter, autograd_normals, central_difference_normals
+from renderers.fields.analytic import (
+    Shape,
+    box,
+    capsule,
+    cylinder,
+    plane,
+    rounded_box,
+    smooth_union,
+    sphere,
+    torus,
+)
+from renderers.fields.mlp import CHUNK, Decoder
+from tests.renderers.analytic_cases import CASES, vector
+
+PRIMITIVES = {
+    "sphere": sphere(0.5, (0.1, -0.2, 0.3)),
+    "box": box((0.3, 0.5, 0.7)),
+    "rounded_box": rounded_box((0.3, 0.5, 0.7), 0.1),
+    "torus": torus(0.6, 0.2),
+    "capsule": capsule((-0.3, 0.1, 0.2), (0.4, 0.3, -0.5), 0.15),
+    "cylinder": cylinder(0.4, 0.6),
+    "plane": plane((1.0, 2.0, -2.0), 0.2),
+}
+A, B = PRIMITIVES["box"], PRIMITIVES["sphere"]
+COMBINATIONS = {
+    "union": A | B,
+    "intersection": A & B,
+    "difference": A - B,
+    "smooth_union": smooth_union(A, B, radius=0.2),
+    "chain": ((A | PRIMITIVES["torus"]) - PRIMITIVES["capsule"]) & PRIMITIVES["cylinder"],
+    "translate": A.translate((0.2, -0.1, 0.3)),
+    "scale": A.scale(1.7),
+    "stretch": PRIMITIVES["torus"].stretch((0.5, 1.5, 0.8)),
+}
+LEVEL = Shape(lambda p: p.square().sum(-1) - 0.25, Kind.LEVEL, None)
+QUARTER_TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)  # about z: x to y
+
+
+def value(shape: Field, *point: float) -> float:
+    return shape(vector(point)).item()
+
+
+BOX, ROUND, TORUS, CYLINDER = box((1, 2, 3)), rounded_box((1, 2, 3), 0.5), torus(1, 0.25), cylinder(1, 2)
+CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("shape", "point", "distance"),
+    [
+        (sphere(0.5, (1, 0, 0)), (1, 0, 0), -0.5),
+        (sphere(0.5, (1, 0, 0)), (1, 2, 0), 1.5),
+        (sphere(0.5, (1, 0, 0)), (0.5, 0, 0), 0),
+        (sphere(), (3, 4, 0), 4),
+        (BOX, (0, 0, 0), -1),
+        (BOX, (0, 1.75, 0), -0.25),  # inside, nearest to a face that is not the nearest of the centre
+        (BOX, (3, 0, 0), 2),
+        (BOX, (-4, -6, 0), 5),  # off an edge by 3 and 4
+        (BOX, (2, -4, 5), 3),  # off a corner by 1, 2 and 2
+        (BOX, (1, 0.5, 0), 0),
+        (BOX, (1, 2, 0.5), 0),  # on an edge
+        (BOX, (-1, 2, -3), 0),  # on a corner
+        (ROUND, (0, 0, 0), -1),
+        (ROUND, (3, 0, 0), 2),  # the size over all is that of the sharp box
+        (ROUND, (1, 0, 0), 0),
+        (ROUND, (3.5, 5.5, 0), 4.5),  # 3 and 4 off the core's edge, less the rounding
+        (ROUND, (1, 2, 3), sqrt(0.75) - 0.5),  # the corner that was rounded away
+        (TORUS, (0, 0, 0), 0.75),
+        (TORUS, (1, 0, 0), -0.25),
+        (TORUS, (0, 0.25, -1), 0),
+        (TORUS, (4, 4, 0), 4.75),  # 3 and 4 off the ring
+        (CAPSULE, (0, 1, 0), -0.5),
+        (CAPSULE, (1, 1, 0), 0.5),
+        (CAPSULE, (0, 3, 0), 0.5),  # beyond the end
+        (CAPSULE, (0, -1, 0), 0.5),  # before the start
+        (CAPSULE, (0, 6, -3), 4.5),  # 3 and 4 off the end
+        (CAPSULE, (0.5, 0, 0), 0),
+        (capsule((1, 0, 0), (1, 0, 4), 1), (1, 3, 2), 2),
+        (CYLINDER, (0, 0, 0), -1),
+        (CYLINDER, (0, 1.75, 0), -0.25),
+        (CYLINDER, (0, 0, -3), 2),
+        (CYLINDER, (0, 5, 0), 3),
+        (CYLINDER, (4, -6, 0), 5),  # 3 and 4 off the rim
+        (CYLINDER, (0, 2, 1), 0),  # on the rim
+        (plane((0, 1, 0), 0.5), (7, 2, 3), 1.5),
+        (plane((0, 1, 0), 0.5), (7, -1, 3), -1.5),
+        (plane((3, 0, 4)), (1, 5, 1), 1.4),  # the normal is made a unit vector
+    ],
+)
+def test_distances_worked_out_by_hand(shape, point, distance):
+    assert value(shape, *point) == pytest.approx(distance, abs=1e-12)
+    assert shape.kind is Kind.DISTANCE
+
+
+def test_the_plane_is_where_normal_times_x_is_the_offset_whatever_the_length_of_the_normal():
+    # Stated in `plane`: "The half space below `normal . x = offset`", and the normal need not have unit length.
+    assert value(plane((0, 2, 0), 1), 3, 0.5, 4) == pytest.approx(0)
+    assert value(plane((0, 2, 0), 1), 3, 2.5, 4) == pytest.approx(2)
+
+
+@pytest.mark.parametrize("name", [*PRIMITIVES, *COMBINATIONS])
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32), size=st.sampled_from([1e-4, 1e-2, 1.0]))
+def test_no_field_changes_faster_than_distance(name, seed, size):
+    shape = (PRIMITIVES | COMBINATIONS)[name]
+    generator = torch.Generator().manual_seed(seed)
+    first = torch.rand(500, 3, dtype=torch.float64, generator=generator) * 3 - 1.5
+    second = first + size * torch.randn(500, 3, dtype=torch.float64, generator=generator)
+    assert shape.lipschitz == 1
+    assert ((shape(first) - shape(second)).abs() <= (first - second).norm(dim=-1) + 1e-12).all()
+    leaf = first.requires_grad_(True)
+    (gradient,) = torch.autograd.grad(shape(leaf).sum(), leaf)
+    assert (gradient.norm(dim=-1) <= 1 + 1e-12).all()
+
+
+def box_surface(half: torch.Tensor, grid: int = 41) -> torch.Tensor:
+    """Points on all six faces of a box, edges included."""
+    line = torch.linspace(-1, 1, grid, dtype=torch.float64)
+    u, v = (part.reshape(-1) for part in torch.meshgrid(line, line, indexing="ij"))
+    faces = [torch.stack([s * torch.ones_like(u), u, v], -1).roll(axis, -1) for s in (-1, 1) for axis in range(3)]
+    return torch.cat(faces) * half
+
+
+def sphere_surface(radius: float, center: torch.Tensor, grid: int = 100) -> torch.Tensor:
+    polar, around = torch.meshgrid(
+        torch.linspace(0, pi, grid, dtype=torch.float64), torch.linspace(0, 2 * pi, grid, dtype=torch.float64),
+        indexing="ij",
+    )  # fmt: skip
+    unit = torch.stack([polar.sin() * around.cos(), polar.sin() * around.sin(), polar.cos()], -1).reshape(-1, 3)
+    return center + radius * unit
+
+
+@pytest.mark.parametrize("name", ["union", "intersection", "difference"])
+@settings(max_examples=8)
+@given(
+    half=st.tuples(*[st.floats(0.2, 0.8)] * 3),
+    radius=st.floats(0.2, 0.7),
+    center=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
+    seed=st.integers(0, 2**32),
+)
+def test_a_combination_never_overshoots_its_sampled_surface(name, half, radius, center, seed):
+    half, center = vector(half), vector(center)
+    on_box, on_sphere = box_surface(half), sphere_surface(radius, center)
+    box_in_sphere = (on_box - center).norm(dim=-1) < radius
+    sphere_in_box = (on_sphere.abs() < half).all(-1)
+    a, b = box(half), sphere(radius, center)
+    shape, surface = {
+        "union": (a | b, torch.cat([on_box[~box_in_sphere], on_sphere[~sphere_in_box]])),
+        "intersection": (a & b, torch.cat([on_box[box_in_sphere], on_sphere[sphere_in_box]])),
+        "difference": (a - b, torch.cat([on_box[~box_in_sphere], on_sphere[sphere_in_box]])),
+    }[name]
+    if len(surface) == 0:  # apart, or one swallowed by the other
+        return
+    points = torch.rand(60, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 3 - 1.5
+    truth = torch.cdist(points, surface).amin(1)
+    assert (shape(points).abs() <= truth + 1e-9).all()
+    in_box, in_sphere = (points.abs() < half).all(-1), (points - center).norm(dim=-1) < radius
+    inside = {"union": in_box | in_sphere, "intersection": in_box & in_sphere, "difference": in_box & ~in_sphere}[name]
+    assert torch.equal(shape(points) < 0, inside)
+
+
+def test_a_smooth_union_fills_the_seam_by_a_quarter_of_its_radius_and_is_the_union_elsewhere():
+    # On the seam of two spheres both distances are 0.1, so the fillet takes 0.25 * 0.2.
+    a, b = sphere(0.5, (-0.6, 0, 0)), sphere(0.5, (0.6, 0, 0))
+    blend = smooth_union(a, b, radius=0.2)
+    assert value(blend, 0, 0, 0) == pytest.approx(0.1 - 0.05)
+    # One radius apart, the blend is the union: distances 0 and 0.2 at x = -0.1.
+    assert value(blend, -0.1, 0, 0) == pytest.approx(0)
+    assert value(a | b, -0.1, 0, 0) == pytest.approx(0)
+    assert value(blend, 0.05, 0, 0) == pytest.approx(0.05 - 0.25 * 0.2 * 0.5**2)  # half overlapped
+
+
+def test_a_smooth_union_is_a_bound_of_its_own_surface():
+    generator = torch.Generator().manual_seed(0)
+    shape = COMBINATIONS["smooth_union"]
+    surface = torch.randn(4000, 3, dtype=torch.float64, generator=generator)
+    for _ in range(40):  # Newton's method onto the zero set
+        leaf = surface.requires_grad_(True)
+        values = shape(leaf)
+        (gradient,) = torch.autograd.grad(values.sum(), leaf)
+        surface = (leaf - values[:, None] * gradient / gradient.square().sum(-1, keepdim=True)).detach()
+    surface = surface[shape(surface).abs() < 1e-12]
+    assert len(surface) > 2000
+    points = torch.rand(200, 3, dtype=torch.float64, generator=generator) * 3 - 1.5
+    assert (shape(points).abs() <= torch.cdist(points, surface).amin(1) + 1e-9).all()
+
+
+def test_every_shape_states_its_kind():
+    assert {shape.kind for shape in PRIMITIVES.values()} == {Kind.DISTANCE}
+    moved = (A.translate((1.0, 0, 0)), A.rotate(QUARTER_TURN), A.scale(2.0))
+    assert {shape.kind for shape in moved} == {Kind.DISTANCE}
+    bounds = (A | B, A & B, A - B, smooth_union(A, B, radius=0.1), A.stretch((1, 2, 3)), (A - B).scale(2.0))
+    assert {shape.kind for shape in bounds} == {Kind.BOUND}
+    levels = (
+        LEVEL | A, A | LEVEL, A & LEVEL, A - LEVEL, smooth_union(LEVEL, A, radius=0.1),
+        LEVEL.translate((1.0, 0, 0)), LEVEL.rotate(QUARTER_TURN), LEVEL.scale(2.0), LEVEL.stretch((1, 2, 3)),
+    )  # fmt: skip
+    assert {shape.kind for shape in levels} == {Kind.LEVEL}
+    assert {shape.lipschitz for shape in levels} == {None}
+    steep = Shape(A.function, Kind.LEVEL, 3.0)
+    assert (steep | A).lipschitz == (A - steep).lipschitz == steep.scale(2.0).lipschitz == 3.0
+    assert all(isinstance(shape, Field) for shape in (*PRIMITIVES.values(), *levels, Meter(A)))
+
+
+def test_moves_take_the_surface_along():
+    ball = sphere(0.25, (1, 0, 0))
+    assert value(ball.rotate(QUARTER_TURN), 0, 1, 0) == pytest.approx(-0.25)  # x goes to y, not to -y
+    assert value(ball.translate((0, 2, 0)), 1, 2, 0) == pytest.approx(-0.25)
+    assert value(ball.scale(3.0), 3, 0, 0) == pytest.approx(-0.75)
+    assert value(BOX.rotate(QUARTER_TURN), 5, 0, 0) == pytest.approx(3)  # 2 wide along x now
+    assert value(BOX.scale(2.0), 8, 0, 0) == pytest.approx(6)
+    assert value(BOX.translate((1, 0, 0)).scale(2.0), 8, 0, 0) == pytest.approx(4)  # in the order as written
+    stretched = sphere(1.0).stretch((1, 2, 4))
+    assert [value(stretched, *p) for p in ((1, 0, 0), (0, 2, 0), (0, 0, 4))] == pytest.approx([0, 0, 0])
+    assert value(stretched, 3, 0, 0) == pytest.approx(2)  # exact along the least stretched axis
+    assert value(stretched, 0, 0, 8) == pytest.approx(1)  # a bound along the most stretched
+
+
+def tensor(*numbers: float) -> torch.Tensor:
+    return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters"),
+    [
+        (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))),
+        (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
+        (box, (tensor(0.3, 0.4, 0.5),)),
+        (rounded_box, (tensor(0.3, 0.4, 0.5), tensor(0.1))),
+        (torus, (tensor(0.5), tensor(0.2))),
+        (capsule, (tensor(-0.3, 0.1, 0.2), tensor(0.4, 0.3, -0.5), tensor(0.15))),
+        (cylinder, (tensor(0.4), tensor(0.3))),
+        (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
+        (lambda factor: A.scale(factor), (tensor(1.5),)),
+        (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
+        (lambda angle: A.rotate(turn(angle)), (tensor(0.3),)),
+        (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
+        (lambda radius: A - sphere(radius), (tensor(0.4),)),
+    ],
+)
+def test_gradients_flow_to_tensor_parameters(make, parameters):
+    points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)).requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda p, *rest: make(*rest)(p), (points, *parameters))
+    gradients = torch.autograd.grad(make(*parameters)(points).abs().sum(), parameters)
+    assert all(gradient.abs().sum() > 0 for gradient in gradients)
+
+
+def turn(angle: torch.Tensor) -> torch.Tensor:
+    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one]).view(3, 3)
+
+
+@pytest.mark.parametrize("name", [*PRIMITIVES, *COMBINATIONS])
+def test_gradients_are_finite_where_a_length_is_zero(name):
+    # The centres, the capsule's axis, the torus' ring and axis, faces and edges.
+    points = vector((0, 0, 0, 0.1, -0.2, 0.3, -0.3, 0.1, 0.2, 0.6, 0, 0, 0.3, 0.5, 0.7, 0.3, 0, 0, 0.4, 0.6, 0))
+    points = points.view(-1, 3).requires_grad_(True)
+    (gradient,) = torch.autograd.grad((PRIMITIVES | COMBINATIONS)[name](points).sum(), points)
+    assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_fields_agree_with_the_closed_form_cases(case):
+    parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
+    rays = case.rays()
+    point = rays.at(vector((case.distance,)))
+    values = case.shape(parameter)(point)
+    assert values.item() == pytest.approx(0, abs=1e-12)
+    (gradient,) = torch.autograd.grad(values.sum(), parameter)
+    assert gradient.item() == pytest.approx(-1)  # as `analytic_cases` says of every field
+    assert -(rays.directions @ vector(case.normal)).item() == pytest.approx(case.cosine)
+    before = rays.at(torch.linspace(0, case.distance - 1e-6, 500, dtype=torch.float64)[:, None])
+    assert (case.field()(before) > 0).all()  # it is the first surface on the ray
+    assert autograd_normals(case.field(), point)[0].tolist() == pytest.approx(list(case.normal))
+    # Central differences are off by the third derivative times delta squared.
+    numeric = central_difference_normals(case.field(), point, delta=1e-4)
+    assert numeric[0].tolist() == pytest.approx(list(case.normal), abs=1e-6)
+
+
+def test_normals_keep_leading_shapes_leave_no_graph_and_vanish_with_the_gradient():
+    points = torch.randn(2, 0, 3), torch.randn(3), torch.randn(2, 5, 3)
+    for some in points:
+        assert autograd_normals(A, some).shape == central_difference_normals(A, some, delta=1e-3).shape == some.shape
+    with torch.no_grad():
+        normals = autograd_normals(A, points[2])
+    assert normals.norm(dim=-1).allclose(torch.ones(2, 5))
+    assert not normals.requires_grad
+    flat = Shape(lambda p: 0 * p.sum(-1))
+    assert autograd_normals(flat, points[1]).tolist() == [0, 0, 0]
+
+
+def test_central_differences_ask_six_values_a_point_at_delta_and_refuse_a_delta_of_zero():
+    asked = []
+    meter = Meter(Shape(lambda p: (asked.append(p), p.square().sum(-1))[1], Kind.LEVEL))
+    central_difference_normals(meter, torch.zeros(7, 3), delta=0.25)
+    assert meter.counts == Counts(value=42)
+    assert {tuple(p) for p in torch.cat([p.reshape(-1, 3) for p in asked]).tolist()} == {
+        (0.25, 0, 0), (-0.25, 0, 0), (0, 0.25, 0), (0, -0.25, 0), (0, 0, 0.25), (0, 0, -0.25),
+    }  # fmt: skip
+    for delta in (0.0, -1e-3):
+        with pytest.raises(ValueError, match="delta must be positive"):
+            central_difference_normals(A, torch.zeros(3), delta=delta)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (7,), (2, 3, 5)])
+def test_the_meter_counts_points_and_leaves_values_and_gradients_as_they_are(shape):
+    points = torch.randn(*shape, 3, requires_grad=True)
+    meter = Meter(B)
+    values = meter(points)
+    assert torch.equal(values, B(points))
+    count = values.numel()
+    assert meter.counts == Counts(value=count)
+    (metered,) = torch.autograd.grad(values.square().sum(), points)
+    (plain,) = torch.autograd.grad(B(points).square().sum(), points)
+    assert torch.equal(metered, plain)
+    assert meter.counts == Counts(value=count, gradient=count)
+
+
+def test_the_meter_counts_every_backward_pass_once():
+    meter, points = Meter(B), torch.randn(5, 3, requires_grad=True)
+    values = meter(points)
+    (values.sum() + values.square().mean()).backward(retain_graph=True)  # two uses of the values, one pass
+    assert meter.counts == Counts(5, 5)
+    values.sum().backward()
+    assert meter.counts == Counts(5, 10)
+    meter(points)  # never back-propagated
+    assert meter.counts == Counts(10, 10)
+    (meter(points).sum() + meter(points[:2]).sum()).backward()
+    assert meter.counts == Counts(17, 17)
+
+
+def test_the_meter_counts_no_gradient_where_there_is_none():
+    meter, points = Meter(B), torch.randn(5, 3, requires_grad=True)
+    with torch.no_grad():
+        meter(points)
+    meter(points.detach())
+    assert meter.counts == Counts(10, 0)
+    radius = torch.tensor(0.5, requires_grad=True)
+    to_parameter = Meter(sphere(radius), meter.counts)  # counts can be shared
+    to_parameter(points.detach()).sum().backward()
+    assert meter.counts == Counts(15, 5)
+
+
+def test_the_meter_counts_chunks_as_their_points():
+    torch.manual_seed(0)
+    decoder = Decoder(layers=1, width=2, code_length=0, skip=0, narrow=False)
+    count = 2 * CHUNK + 7
+    meter = Meter(decoder.at(torch.zeros(0)))
+    meter(torch.randn(count, 3)).sum().backward()
+    assert meter.counts == Counts(count, count)
+
+
+def test_the_meter_is_the_field_that_it_wraps_and_tells_its_cost():
+    shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
+    meter = Meter(shape)
+    assert (meter.kind, meter.lipschitz, meter.flops) == (Kind.LEVEL, 2.5, Flops(10, 20))
+    # A value with its gradient costs three values.
+    assert Counts(value=5, gradient=2).flops(meter) == 10 * 5 + 20 * 2
+    assert Counts(5, 2).flops(A) is None
+    assert Counts(5, 7) - Counts(1, 2) == Counts(4, 5)

@@ -1,0 +1,242 @@
+"""Gradients in float64: exact rules against closed forms and central differences, inexact ones for their bias."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from renderers import DIST
+from renderers.camera import Camera, Rays, distance_to_origin
+from renderers.field import Meter
+from renderers.fields.analytic import Shape, sphere
+from renderers.gradients import approximate
+from renderers.rendering import Rendering, Status
+from tests.renderers.analytic_cases import CASES, Case, ground, vector
+
+NAIVE = load("renderer", "naive", steps=300, epsilon=1e-11, silhouette_average="all")
+DIST_PLAIN = DIST(
+    steps=300, epsilon=1e-11, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=False,
+    careful_split=True,
+    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=True,
+    silhouette_average="all",
+)  # fmt: skip
+by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+
+
+def render(renderer, case: Case, *, parameter: float | None = None, shift: Tensor | None = None):
+    """The rendering of a case, its parameter and its ray's origin as leaves."""
+    leaf = torch.tensor(case.parameter if parameter is None else parameter, dtype=torch.float64, requires_grad=True)
+    rays = case.rays()
+    origins = (rays.origins + (torch.zeros(3) if shift is None else shift)).requires_grad_(True)
+    return renderer.render(case.shape(leaf), Rays(origins, rays.directions)), leaf, origins
+
+
+def rates(renderer, case: Case) -> tuple[float, Tensor]:
+    """The derivatives of the distance, by backward."""
+    rendering, parameter, origins = render(renderer, case)
+    assert rendering.status.item() == Status.HIT
+    assert rendering.distance.item() == pytest.approx(case.distance, abs=1e-9)
+    by_parameter, by_origin = torch.autograd.grad(rendering.distance.sum(), (parameter, origins))
+    return by_parameter.item(), by_origin[0]
+
+
+@by_case
+def test_naive_is_exact_towards_the_field(case):
+    found, _ = rates(NAIVE, case)
+    assert found == pytest.approx(case.parameter_rate, rel=1e-7)
+    h = 1e-5
+    ahead, behind = (render(NAIVE, case, parameter=case.parameter + s)[0].distance.item() for s in (h, -h))
+    assert found == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
+
+
+@by_case
+def test_naive_is_exact_towards_the_ray(case):
+    _, found = rates(NAIVE, case)
+    torch.testing.assert_close(found, case.origin_rate, rtol=1e-7, atol=1e-7)
+    h = 1e-5
+    for axis, offset in enumerate(h * torch.eye(3, dtype=torch.float64)):
+        ahead, behind = (render(NAIVE, case, shift=s * offset)[0].distance.item() for s in (1, -1))
+        assert found[axis].item() == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5, 10])
+@pytest.mark.parametrize("name", ["plane-oblique", "plane-grazing"])
+def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
+    case = next(case for case in CASES if case.name == name)
+    rendering, parameter, _ = render(replace(NAIVE, steps=steps), case)
+    (found,) = torch.autograd.grad(rendering.distance.sum(), parameter)
+    assert rendering.status.item() == Status.OUT_OF_STEPS
+    assert found.item() == pytest.approx(case.parameter_rate * (1 - (1 - case.cosine) ** steps))
+
+
+@by_case
+@pytest.mark.parametrize(("alpha", "samples"), [(1.0, 1), (1.5, 1), (1.5, 3)])
+def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
+    renderer = replace(DIST_PLAIN, alpha=alpha, n_gradient_samples=samples)
+    by_parameter, by_origin = rates(renderer, case)
+    bias = alpha * samples * case.cosine  # the kept samples lie so near the hit that the normal there is the same
+    assert by_parameter == pytest.approx(bias * case.parameter_rate, rel=1e-4)
+    torch.testing.assert_close(by_origin, bias * case.origin_rate, rtol=1e-4, atol=1e-4)
+    # The direction is right at each pixel.
+    assert torch.cosine_similarity(by_origin, case.origin_rate, dim=0).item() == pytest.approx(1, abs=1e-6)
+
+
+def test_dist_head_on_on_a_sphere_gives_minus_alpha_times_the_samples_that_exist():
+    # At alpha 1 there are two queries, 0.5 away and at the hit: K = 5 finds two. The truth is -1.
+    case = CASES[0]
+    for samples, kept in ((1, 1), (2, 2), (5, 2)):
+        assert rates(replace(DIST_PLAIN, n_gradient_samples=samples), case)[0] == pytest.approx(-kept)
+    assert rates(replace(DIST_PLAIN, alpha=1.5, n_gradient_samples=3), case)[0] == pytest.approx(-4.5)
+
+
+def test_dist_keeps_the_values_that_it_marched_to():
+    case = CASES[1]
+    rendering, _, _ = render(replace(DIST_PLAIN, n_gradient_samples=3), case)
+    with torch.no_grad():
+        plain, _, _ = render(replace(DIST_PLAIN, n_gradient_samples=3), case)
+    assert torch.equal(rendering.distance, plain.distance)
+    assert rendering.distance.requires_grad
+    assert not plain.distance.requires_grad
+
+
+@pytest.mark.parametrize("steps", [30, 300])
+@pytest.mark.parametrize("samples", [1, 3])
+def test_dist_back_propagates_one_value_a_sample_whatever_the_steps(steps, samples):
+    case = CASES[2]
+    parameter = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    meter = Meter(sphere(parameter))
+    with graph_size() as saved:
+        rendering = replace(DIST_PLAIN, epsilon=1e-3, steps=steps, n_gradient_samples=samples).render(
+            meter, case.rays()
+        )
+    assert rendering.hit.all()
+    assert meter.counts.value > 10 + samples
+    rendering.distance.sum().backward()
+    assert meter.counts.gradient == samples
+    assert saved[0] < 150  # numbers kept for the backward pass: a few vectors, none for a step
+    naive = Meter(sphere(parameter))
+    with graph_size() as unrolled:
+        replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
+    assert naive.counts.value == steps
+    assert samples < naive.counts.gradient <= steps  # none goes through the steps behind the last
+    assert unrolled[0] > 3 * steps
+
+
+class graph_size:
+    """Counts the numbers that autograd keeps for the backward pass."""
+
+    def __enter__(self) -> list[int]:
+        self.count = [0]
+
+        def pack(tensor: Tensor) -> Tensor:
+            self.count[0] += tensor.numel()
+            return tensor
+
+        self.hooks = torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor)
+        self.hooks.__enter__()
+        return self.count
+
+    def __exit__(self, *what) -> None:
+        self.hooks.__exit__(*what)
+
+
+def test_rays_that_hit_nothing_carry_one_sample_and_no_gradient_of_distance():
+    # Passes the ball at 0.7, and a ray that passes the unit sphere.
+    rays = Rays(vector((0.7, 0, -2, 2, 0, -2)).view(2, 3), vector((0, 0, 1)).expand(2, 3))
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    meter = Meter(sphere(radius))
+    rendering = replace(DIST_PLAIN, n_gradient_samples=3).render(meter, rays)
+    marched = meter.counts.value
+    assert (rendering.status == Status.MISS).all()
+    (gradient,) = torch.autograd.grad(rendering.distance.sum(), radius, allow_unused=True, retain_graph=True)
+    assert gradient is None or gradient == 0
+    before = meter.counts.gradient
+    rendering.closest.sum().backward()
+    assert meter.counts.gradient - before == 1
+    assert radius.grad == -1
+    assert marched > 3
+
+
+BESIDE = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a ball of radius 0.5 by 0.2
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.5])
+def test_the_soft_silhouette_of_dist_moves_as_the_field_does_at_its_fixed_sample(alpha):
+    center = vector((0, 0, 0)).requires_grad_(True)
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    shape, points = sphere(radius, center), []
+    recording = Shape(lambda p: points.append(p.detach()) or shape(p))
+    rendering = replace(DIST_PLAIN, alpha=alpha).render(recording, BESIDE)
+    assert rendering.status.item() == Status.MISS
+    by_radius, by_center = torch.autograd.grad(rendering.closest.sum(), (radius, center))
+    asked = torch.cat(points)
+    sample = asked[shape(asked).abs().argmin()]
+    assert rendering.closest.item() == pytest.approx(shape(sample).item())
+    assert by_radius.item() == pytest.approx(-1)
+    torch.testing.assert_close(by_center, -sample / sample.norm())  # the centre moves the value by the negative normal
+
+
+def test_the_soft_silhouette_of_naive_moves_with_its_sample():
+    def closest(radius: Tensor) -> Tensor:
+        return NAIVE.render(sphere(radius), BESIDE).closest[0]
+
+    radius, h = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), 1e-6
+    (found,) = torch.autograd.grad(closest(radius), radius)
+    numeric = (closest(radius.detach() + h) - closest(radius.detach() - h)).item() / (2 * h)
+    assert found.item() == pytest.approx(numeric, rel=1e-6)
+    assert found.item() < -1  # a fixed sample would give -1
+
+
+@pytest.mark.parametrize("renderer", [NAIVE, DIST_PLAIN, replace(DIST_PLAIN, coarse_to_fine=True)])
+def test_rays_that_pass_the_unit_sphere_tell_the_camera_by_how_much(renderer):
+    # DIST, A.3: the distance from the origin to the ray, less the radius.
+    origin = vector((1.5, 0.5, -2)).requires_grad_(True)
+    rays = Rays(origin.expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3), image=True)
+    rendering = renderer.render(sphere(0.5), rays)
+    far = (1.5**2 + 0.5**2) ** 0.5
+    assert (rendering.status == Status.MISS).all()
+    torch.testing.assert_close(rendering.closest, torch.full((4, 4), far - 1, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(rendering.closest[0, 0], origin)
+    torch.testing.assert_close(gradient, vector((1.5, 0.5, 0)) / far)
+
+
+@pytest.mark.parametrize("renderer", [replace(NAIVE, steps=50), replace(DIST_PLAIN, coarse_to_fine=True, epsilon=1e-6)])
+def test_gradients_reach_the_camera_from_hits_and_misses(renderer):
+    def see(height: Tensor) -> tuple[Rendering, Camera]:
+        world_to_camera = torch.eye(4, dtype=torch.float64)
+        world_to_camera[1, 3], world_to_camera[2, 3] = height, 2.5
+        camera = Camera(vector((12, 0, 8, 0, 12, 8, 0, 0, 1)).view(3, 3), world_to_camera, 16, 16)
+        return renderer.render(sphere(0.5), camera.rays()), camera
+
+    height = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    rendering, camera = see(height)
+    beyond = distance_to_origin(camera.rays()) > 1
+    assert rendering.hit.any()
+    assert beyond.any()
+    for part, where in ((rendering.distance, rendering.hit), (rendering.closest, beyond)):
+        (gradient,) = torch.autograd.grad(part[where][0], height, retain_graph=True)
+        assert gradient.isfinite()
+        assert gradient != 0
+    # The outer silhouette is exact: compare with central differences.
+    h = 1e-6
+    (gradient,) = torch.autograd.grad(rendering.closest[beyond].sum(), height)
+    ahead, behind = (see(height.detach() + s)[0].closest[beyond].sum().item() for s in (h, -h))
+    assert gradient.item() == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
+
+
+def test_the_approximate_rule_counts_the_samples_that_exist():
+    # Three rays down on the ground y = h, with 2, 1 and no samples; alpha 1.5.
+    offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    rays = Rays(vector((0, 2, 0)).expand(3, 3), vector((0, -1, 0)).expand(3, 3))
+    at = vector((1.5, 1.0, 1.75, 9, 9, 9)).view(3, 2)
+    values = vector((0.5, 1.0, 0.25, torch.inf, torch.inf, torch.inf)).view(3, 2)
+    distance, first = approximate(
+        ground(offset), rays, vector((1.9, 1.8, 1.7)), alpha=1.5, sample_distance=at, sample_value=values
+    )
+    assert distance.tolist() == [1.9, 1.8, 1.7]
+    assert first.tolist() == [0.5, 0.25, 0]
+    slopes = [torch.autograd.grad(part, offset, retain_graph=True)[0].item() for part in distance]
+    assert slopes == [-3, -1.5, 0]
+    assert torch.autograd.grad(first[0], offset)[0].item() == -1

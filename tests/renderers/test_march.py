@@ -1,0 +1,433 @@
+"""The stepping loops: queries, steps and statuses counted by hand, and the samples that are kept."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from renderers import DIST
+from renderers.camera import Camera, Rays
+from renderers.field import Counts, Kind, Meter
+from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
+from renderers.march import Front, Stepping, march, march_coarse_to_fine
+from renderers.rendering import Status
+from tests.renderers.analytic_cases import vector
+
+PLAIN = Stepping(epsilon=5e-5, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, careful_split=False)
+AGGRESSIVE = replace(PLAIN, alpha=1.5)
+WALL = plane((0, 0, -1), 0.0)  # solid beyond z = 0: at z the value is -z
+NAIVE = load("renderer", "naive", steps=50, epsilon=5e-5, silhouette_average="all")
+FINE = DIST(
+    steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=0.01, step_clamp=None, active_only=True, coarse_to_fine=False,
+    careful_split=True,
+    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=True,
+    silhouette_average="all",
+)  # fmt: skip
+COARSE = replace(FINE, coarse_to_fine=True)
+
+
+def beam(*origins: tuple[float, float, float]) -> Rays:
+    """Rays along z."""
+    starts = vector(sum(origins, ())).view(-1, 3)
+    return Rays(starts, vector((0, 0, 1)).expand_as(starts))
+
+
+def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
+    """An image of rays along z from z = -2, so far apart; by default all run through the centre."""
+    rows = (torch.arange(height, dtype=torch.float64) - (height - 1) / 2) * pitch
+    columns = (torch.arange(width, dtype=torch.float64) - (width - 1) / 2) * pitch
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    origins = torch.stack([x, y, torch.full_like(x, -2)], -1).expand(*batch, height, width, 3)
+    return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
+
+
+def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[Front, int]:
+    """The front, and how many values it cost; coarse to fine for an image."""
+    meter = Meter(field)
+    if rays.image:
+        front = march_coarse_to_fine(meter, rays, stepping, steps=steps, radius=1.0, samples=samples)
+    else:
+        front = Front.on_sphere(rays, radius=1.0, samples=samples)
+        march(meter, rays, front, stepping, steps)
+    assert meter.counts.gradient == 0
+    return front, meter.counts.value
+
+
+def constant(value: float) -> Shape:
+    return Shape(lambda p: torch.full_like(p[..., 0], value))
+
+
+HEAD_ON = beam((0, 0, -2))
+UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # turns the axis of a torus from y to z
+
+
+def test_a_wall_head_on_takes_two_queries():
+    # In at z = -1, where the value is 1; then z = 0, where it is 0.
+    front, count = trace(WALL, HEAD_ON, PLAIN, samples=3)
+    assert count == 2
+    assert front.distance.item() == 2
+    assert front.status.item() == Status.HIT
+    assert front.sample_value.tolist() == [[0, 1, torch.inf]]
+    assert front.sample_distance[0, :2].tolist() == [2, 1]
+
+
+def test_aggressive_steps_halve_the_distance_and_change_side():
+    # Values 1, -1/2, 1/4, ...: the first below 5e-5 is 2^-15, the 16th. The last moves without alpha (Eq. 1).
+    front, count = trace(WALL, HEAD_ON, AGGRESSIVE, samples=4)
+    assert count == 16
+    assert front.distance.item() == 2
+    assert front.value.item() == -(2**-15)
+    assert front.sample_value.tolist() == [[-(2**-15), 2**-14, -(2**-13), 2**-12]]
+
+
+def test_the_distance_is_that_of_equation_1():
+    values = []
+    recording = Shape(lambda p: values.append(WALL(p)) or values[-1])
+    direction = torch.nn.functional.normalize(vector((0.3, 0, 1)), dim=0)
+    rays = Rays(vector((-0.6, 0, -2))[None], direction[None])
+    front, count = trace(recording, rays, AGGRESSIVE)
+    entry = front.distance - sum(values) * 1.5 + 0.5 * values[-1]  # d = entry + alpha * sum + (1 - alpha) * last
+    assert rays.at(entry).norm().item() == pytest.approx(1)
+    assert count == len(values) > 3
+
+
+def test_the_extra_step_is_capped():
+    # 1 moves by 1.1 to z = 0.1; then -0.1, 0.05, -0.025, ...: 0.1 * 2^-11 is the first below 5e-5, the 13th.
+    assert trace(WALL, HEAD_ON, replace(AGGRESSIVE, extra_step_cap=0.1))[1] == 13
+
+
+def test_the_value_that_makes_a_step_is_clamped():
+    # From z = -1 to 0 by quarters, and once at 0.
+    front, count = trace(WALL, HEAD_ON, replace(PLAIN, step_clamp=0.25))
+    assert count == 5
+    assert front.distance.item() == 2
+
+
+@pytest.mark.parametrize(
+    ("alpha", "cap", "clamp", "expected"),
+    [
+        (1.0, None, None, [1, 0.1, 0, -0.1, -1]),
+        (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
+        (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
+        (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
+        (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
+    ],
+)
+def test_a_step_by_cap_and_clamp(alpha, cap, clamp, expected):
+    stepping = replace(PLAIN, alpha=alpha, extra_step_cap=cap, step_clamp=clamp)
+    assert stepping.length(vector((1, 0.1, 0, -0.1, -1))).tolist() == pytest.approx(expected)
+
+
+def test_a_ray_that_finds_nothing_leaves_the_sphere():
+    # Steps of 1/2 from 1 to 3, where the ray is still on the sphere: 5 queries; the next place lies beyond.
+    front, count = trace(constant(0.5), HEAD_ON, PLAIN)
+    assert count == 5
+    assert front.status.item() == Status.MISS
+    assert front.distance.item() == 3
+
+
+THREE = beam((0, 0, -2), (0.6, 0, -2), (2, 0, -2), (0, 0, 2))  # head on, 2 queries, in at z = -0.8; two pass by
+
+
+def test_finished_rays_are_asked_only_where_every_ray_is():
+    active, count = trace(WALL, THREE, PLAIN, steps=20, samples=2)
+    assert count == 2 + 2
+    every, count = trace(WALL, THREE, replace(PLAIN, active_only=False), steps=20, samples=2)
+    assert count == 2 * 20  # never those that miss the sphere
+    for name in ("distance", "status", "value", "sample_distance", "sample_value"):
+        torch.testing.assert_close(getattr(active, name), getattr(every, name), rtol=0, atol=0)
+    assert active.status.tolist() == [Status.HIT, Status.HIT, Status.MISS, Status.MISS]
+
+
+@pytest.mark.parametrize(
+    ("steps", "queries"),
+    [(1, 4), (2, 2 * 4), (3, 12), (4, 12 + 16), (6, 12 + 48), (7, 12 + 48 + 64), (10, 12 + 48 + 4 * 64)],
+)
+def test_coarse_to_fine_asks_blocks_of_16_then_of_4_then_pixels(steps, queries):
+    # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. At 0.01 a step none of them ends.
+    front, count = trace(constant(0.01), sheet(8, 8), PLAIN, steps=steps)
+    assert count == queries
+    assert (front.status == Status.OUT_OF_STEPS).all()
+    torch.testing.assert_close(front.distance, torch.full((64,), 1 + 0.01 * steps, dtype=torch.float64))
+
+
+def test_coarse_to_fine_fills_up_odd_sizes_and_takes_batches_of_images():
+    # 5 x 6 pixels: 2 x 2, 3 x 3, 5 x 6 rays.
+    assert trace(constant(0.01), sheet(5, 6), PLAIN, steps=8)[1] == 3 * 4 + 3 * 9 + 2 * 30
+    assert trace(constant(0.01), sheet(5, 6, 2), PLAIN, steps=8)[1] == 2 * (3 * 4 + 3 * 9 + 2 * 30)
+
+
+def test_coarse_to_fine_on_a_sphere_head_on():
+    # 4 rays hit after 2 queries (values 0.5, 0). Their children begin at the hit: one query each, 16 and 64.
+    front, count = trace(sphere(0.5), sheet(8, 8), PLAIN)
+    assert count == 2 * 4 + 16 + 64
+    assert front.distance.tolist() == [1.5] * 64
+    assert (front.status == Status.HIT).all()
+
+
+def test_every_finer_ray_goes_on_from_its_own_coarse_ray():
+    # The value grows with x and y, so after 3 coarse steps each block stands elsewhere; 5 x 7 pixels, 2 images.
+    slope = Shape(lambda p: 0.01 + 0.02 * p[..., 0].abs() + 0.005 * p[..., 1].abs())
+    rays = sheet(5, 7, 2, pitch=0.01)
+    front, _ = trace(slope, rays, PLAIN, steps=6)
+    blocks = rays
+    expected = torch.zeros(2, 5, 7, dtype=torch.float64)
+    entry = None
+    for factor in (4, 2):  # by hand: three steps of each block's constant value, on top of where its parent stands
+        blocks = rays.coarser(factor)
+        steps = 3 * slope(blocks.origins)
+        spread = steps.repeat_interleave(factor, 1).repeat_interleave(factor, 2)[:, :5, :7]
+        start = 2 - (1 - blocks.origins[..., :2].square().sum(-1)).sqrt()
+        start = start.repeat_interleave(factor, 1).repeat_interleave(factor, 2)[:, :5, :7]
+        entry = start if entry is None else torch.maximum(expected, start)
+        expected = entry + spread
+    own = 2 - (1 - rays.origins[..., :2].square().sum(-1)).sqrt()
+    expected = torch.maximum(expected, own)
+    torch.testing.assert_close(front.distance.view(2, 5, 7), expected, rtol=0, atol=1e-12)
+
+
+def pinhole(size: int = 64) -> Rays:
+    """An image of the whole unit sphere from z = -2.5, in float64."""
+    intrinsics = vector((1.07 * size, 0, size / 2, 0, 1.07 * size, size / 2, 0, 0, 1)).view(3, 3)
+    world_to_camera = torch.eye(4, dtype=torch.float64)
+    world_to_camera[2, 3] = 2.5
+    return Camera(intrinsics, world_to_camera, size, size).rays()
+
+
+def test_coarse_to_fine_finds_the_same_surface():
+    # Away from the outline, where a coarse ray that passes the shape takes the rays of its block along.
+    shape, rays = sphere(0.5, (0.1, -0.2, 0.1)), pinhole()
+    coarse, fine = COARSE.render(shape, rays), FINE.render(shape, rays)
+    clear = (fine.closest.abs() > 0.1) | (fine.hit & (rays.directions[..., 2] > 0) & (facing(shape, fine.points) > 0.5))
+    assert clear.double().mean() > 0.6
+    assert torch.equal(coarse.status[clear], fine.status[clear])
+    hit = fine.hit & clear
+    assert (coarse.distance - fine.distance)[hit].abs().max() < 2 * 5e-5 / 0.5
+
+
+def facing(shape: Shape, points: Tensor) -> Tensor:
+    """How much the surface about a point of a sphere faces the camera at z = -2.5: the cosine of the angle."""
+    leaf = points.detach().requires_grad_(True)
+    (normal,) = torch.autograd.grad(shape(leaf).sum(), leaf)
+    toward = torch.nn.functional.normalize(vector((0, 0, -2.5)) - points, dim=-1)
+    return (normal * toward).sum(-1)
+
+
+def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
+    for shape in (sphere(0.9), torus(0.6, 0.1).rotate(UPRIGHT)):
+        fine = FINE.render(shape, pinhole()).status
+        assert torch.equal(COARSE.render(shape, pinhole()).status, fine)
+        plain = replace(COARSE, careful_split=False).render(shape, pinhole()).status
+        assert 0 < (plain != fine).sum() < 0.1 * (fine == Status.HIT).sum()
+
+
+@pytest.mark.parametrize(
+    ("apart", "careful", "start"),
+    [
+        (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
+        (0.03, True, 1.2),  # it may have passed what the finer ray meets: back to where it was closest
+        (0.03, False, 2.0),
+    ],
+)
+def test_where_a_split_ray_goes_on(apart, careful, start):
+    # The coarse ray stands at 2.0, and had its least value, 0.05, at 1.2. The unit sphere begins at 1.
+    front = Front.on_sphere(HEAD_ON, radius=1.0, samples=2)
+    front.distance, front.fresh = vector((2.0,)), torch.tensor([False])
+    front.sample_distance, front.sample_value = vector((1.2, 1.9))[None], vector((-0.05, 0.07))[None]
+    rays = beam((apart, 0, -2), (0.8, 0, -2))
+    child = front.split(torch.zeros(2, dtype=torch.long), HEAD_ON, rays, radius=1.0, careful=careful)
+    assert child.distance[0].item() == start
+    assert child.active.all()
+    assert not child.fresh.any()
+    # A ray far apart enters the sphere at 1.4 only.
+    assert child.distance[1].item() == pytest.approx(1.4 if careful else 2.0)
+
+
+def test_coarse_to_fine_keeps_the_soft_silhouette():
+    # A field of distance differs by less than 0.15 between a coarse ray and the rays of its block: their gap there.
+    shape, rays = sphere(0.5), pinhole()
+    coarse, fine = COARSE.render(shape, rays), FINE.render(shape, rays)
+    missed = ~coarse.hit & ~fine.hit
+    assert (coarse.closest - fine.closest)[missed].abs().max() < 0.15
+
+
+def test_rays_begin_anew_where_their_coarse_ray_missed_the_sphere():
+    # 4 x 4 rays at x of 0.7, 1.1, 1.5 and 1.9: their coarse ray, at 1.3, passes the unit sphere by, the first do not.
+    rays = sheet(4, 4, pitch=0.4)
+    rays = Rays(rays.origins + vector((1.3, 0, 0)), rays.directions, image=True)
+    coarse, fine = COARSE.render(sphere(0.95), rays), FINE.render(sphere(0.95), rays)
+    assert fine.hit.any()
+    assert torch.equal(coarse.status, fine.status)
+    torch.testing.assert_close(coarse.distance[fine.hit], fine.distance[fine.hit], rtol=0, atol=4e-4)  # cosine 1/4
+
+
+def test_rays_that_start_inside_say_so_in_coarse_to_fine_too():
+    # Parallel rays from z = -0.3, at x of -0.45, -0.15, 0.15 and 0.45: the middle two start inside the ball.
+    rays = sheet(4, 4, pitch=0.3)
+    origins = rays.origins * vector((1, 0.01, 0)) + vector((0, 0, -0.3))
+    rays = Rays(origins, rays.directions, image=True)
+    coarse, fine = COARSE.render(sphere(0.4), rays), FINE.render(sphere(0.4), rays)
+    assert fine.status[0].tolist() == [Status.MISS, Status.STARTED_INSIDE, Status.STARTED_INSIDE, Status.MISS]
+    assert torch.equal(coarse.status, fine.status)
+    assert (coarse.distance >= 0).all()
+
+
+def stuck(limit: float) -> Shape:
+    """A wall that is NaN beyond a plane z = limit."""
+    return Shape(lambda p: torch.where(p[..., 2] > limit, torch.nan, WALL(p)))
+
+
+@pytest.mark.parametrize("renderer", [NAIVE, FINE, COARSE], ids=["naive", "dist", "dist-coarse"])
+@pytest.mark.parametrize(
+    ("field", "origin", "steps", "status", "distance"),
+    [
+        (sphere(0.5), (0, 0, -2), 50, Status.HIT, 1.5),
+        (sphere(0.2, (0, 0.5, 0)), (0, 0, -2), 50, Status.MISS, 3),  # leaves the unit sphere
+        (sphere(0.5), (0, 0, 2), 50, Status.MISS, None),  # behind the camera
+        (sphere(0.5), (2, 0, -2), 50, Status.MISS, None),  # passes the unit sphere by
+        (sphere(0.5), (0, 0, 0.1), 50, Status.STARTED_INSIDE, 0),
+        (sphere(1.5), (0, 0, -2), 50, Status.STARTED_INSIDE, 1),  # the shape sticks out of the unit sphere
+        (sphere(0.5), (0.49, 0, -2), 3, Status.OUT_OF_STEPS, None),  # grazing, with few steps
+        (constant(0.001), (0, 0, -2), 50, Status.OUT_OF_STEPS, None),
+        (stuck(-0.5), (0, 0, -2), 50, Status.OUT_OF_STEPS, None),  # NaN on the way
+        (stuck(-5.0), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),  # NaN from the start
+        (constant(torch.inf), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),
+    ],
+)  # fmt: skip
+def test_how_rays_end(renderer, field, origin, steps, status, distance):
+    rays = beam(*[origin] * 16)
+    rays = Rays(rays.origins.view(4, 4, 3), rays.directions.view(4, 4, 3), image=True)
+    rendering = replace(renderer, steps=steps).render(field, rays)
+    assert rendering.status.unique().tolist() == [status]
+    assert rendering.hit.all() == (status == Status.HIT)
+    if distance is not None:
+        assert rendering.distance[0, 0].item() == pytest.approx(distance, abs=1e-9)
+    for part in (rendering.distance, rendering.points, rendering.residual, rendering.closest):
+        assert part.isfinite().all()
+    torch.testing.assert_close(rendering.points, rays.at(rendering.distance))
+
+
+def test_a_ray_that_hits_on_its_first_query_has_hit_and_not_started_inside():
+    for offset in (-1 + 2e-5, -1 - 2e-5):  # the wall crosses the unit sphere's near end, just behind and just before
+        for renderer in (NAIVE, FINE):
+            rendering = renderer.render(plane((0, 0, -1), -offset), HEAD_ON)
+            assert rendering.status.item() == Status.HIT
+            assert rendering.distance.item() == pytest.approx(1 + (offset + 1))
+
+
+def bumpy(points: Tensor) -> Tensor:
+    """Uneven values that change sign at z = 0.2 without coming near zero, so that rays go to and fro there for ever."""
+    return (0.08 + 0.05 * torch.sin(17 * points[..., 2] + 5 * points[..., 0])) * torch.sign(0.2 - points[..., 2])
+
+
+@pytest.mark.parametrize("samples", [1, 3, 80])
+@pytest.mark.parametrize("alpha", [1.0, 1.5])
+def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples, alpha):
+    rays = beam(*((0.1 * i, -0.05 * i, -2) for i in range(8)))
+    together, _ = trace(Shape(bumpy, Kind.LEVEL, None), rays, replace(PLAIN, alpha=alpha), steps=60, samples=samples)
+    for index in range(8):
+        points, values = [], []
+
+        def record(p: Tensor, points=points, values=values) -> Tensor:
+            points.append(p[0])
+            values.append(bumpy(p)[0])
+            return values[-1][None]
+
+        one = Rays(rays.origins[index : index + 1], rays.directions[index : index + 1])
+        trace(Shape(record, Kind.LEVEL, None), one, replace(PLAIN, alpha=alpha), steps=60, samples=samples)
+        assert len(values) == 60
+        assert {value.sign().item() for value in values} == {-1, 1}
+        order = sorted(range(len(values)), key=lambda i: abs(values[i].item()))[:samples]  # first come, first kept
+        kept = len(order)
+        assert together.sample_value[index, :kept].tolist() == pytest.approx([values[i].item() for i in order])
+        assert together.sample_value[index, kept:].isinf().all()
+        expected = [(points[i] - one.origins[0])[2].item() for i in order]
+        assert together.sample_distance[index, :kept].tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("renderer", [NAIVE, replace(FINE, alpha=1.0)], ids=["naive", "dist"])
+def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
+    def render(field: Shape, ray: Rays) -> tuple[float, list[float]]:
+        recorded = []
+        recording = Shape(lambda p: recorded.append(field(p)) or recorded[-1], field.kind)
+        return renderer.render(recording, ray).closest.item(), torch.cat(recorded).tolist()
+
+    closest, values = render(capsule((0.2, -1, 0), (0.2, 1, 0), 0.1), beam((0, 0.01, -2)))  # passes a rod by 0.1
+    assert closest == pytest.approx(min(values))
+    assert closest == pytest.approx(0.1, abs=0.05)
+    signs = set()
+    for x in (0.0, 0.1, 0.2, 0.3, 0.4):
+        closest, values = render(Shape(bumpy, Kind.LEVEL), beam((x, 0, -2)))
+        assert closest == pytest.approx(min(values, key=abs))
+        signs.add(closest > 0)
+    assert signs == {False, True}
+    inside = renderer.render(sphere(0.5), beam((0.3, 0, 0)))
+    assert inside.closest.item() == pytest.approx(-0.2)
+
+
+def test_the_field_is_asked_for_the_kept_samples_again_and_no_more():
+    # Two queries to hit, then K with a graph, of those that exist; one for a ray that missed.
+    for samples, again in ((1, 1), (2, 2), (5, 2)):
+        meter = Meter(WALL)
+        replace(FINE, alpha=1.0, n_gradient_samples=samples).render(meter, HEAD_ON)
+        assert meter.counts == Counts(value=2 + again)
+    meter = Meter(constant(0.5))
+    replace(FINE, alpha=1.0, n_gradient_samples=3).render(meter, HEAD_ON)
+    assert meter.counts == Counts(value=5 + 1)
+
+
+def test_naive_asks_every_ray_that_meets_the_sphere_at_every_step():
+    meter = Meter(WALL)
+    replace(NAIVE, steps=17).render(meter, THREE)
+    assert meter.counts == Counts(value=2 * 17)
+
+
+def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> Front:
+    front = Front.on_sphere(rays, radius=1.0, samples=1)
+    march(field, rays, front, stepping, steps)
+    return front
+
+
+def plate(at: float, thickness: float) -> Shape:
+    """A plate across z."""
+    return plane((0, 0, -1), thickness / 2 - at) & plane((0, 0, 1), thickness / 2 + at)
+
+
+@pytest.mark.parametrize("at", [0.0, -0.5, 0.85], ids=["middle", "near", "before the exit"])
+def test_a_step_over_a_plate_is_taken_back(at):
+    rays, thin = beam((0, 0, -2)), plate(at, 0.04)
+    assert marched(thin, rays, AGGRESSIVE).status.item() == Status.MISS
+    kept = marched(thin, rays, replace(AGGRESSIVE, step_back=True))
+    assert kept.status.item() == Status.HIT
+    assert kept.distance.item() == pytest.approx(2 + at - 0.02, abs=1e-4)
+
+
+def test_a_step_that_jumped_nothing_is_not_taken_back():
+    rays, counts = beam((0, 0, -2)), [0, 0]
+    for place, stepping in enumerate((AGGRESSIVE, replace(AGGRESSIVE, step_back=True))):
+        shape = Meter(plate(0.0, 1.9))  # thick: what overshoots lands within, and the balls of both ends meet
+        assert marched(shape, rays, stepping).status.item() == Status.HIT
+        counts[place] = shape.counts.value
+    assert counts[0] == counts[1]
+
+
+def test_a_least_step_brings_a_grazing_ray_to_its_surface():
+    direction = torch.nn.functional.normalize(vector((1.0, -0.05, 0.0)), dim=-1)
+    origin = -1.5 * direction
+    rays = Rays(origin[None], direction[None])  # meets the plane y = 0 at the origin, at 2.9 degrees
+    ground = plane((0, 1, 0), 0.0)
+    assert marched(ground, rays, PLAIN).status.item() == Status.OUT_OF_STEPS
+    floored = marched(ground, rays, replace(PLAIN, least_step=0.05))
+    assert floored.status.item() == Status.HIT
+    assert floored.distance.item() == pytest.approx(1.5, abs=2e-3)
+
+
+def test_values_are_divided_by_the_slope_before_a_step_is_made_of_them():
+    rays = beam((0, 0, -2))
+    steep = Shape(lambda points: 4 * sphere(0.5)(points))
+    front = marched(steep, rays, replace(PLAIN, slope=4.0))
+    assert front.status.item() == Status.HIT
+    assert front.distance.item() == pytest.approx(1.5, abs=1e-4)
+    assert marched(steep, rays, PLAIN).status.item() != Status.HIT

@@ -1,0 +1,84 @@
+"""The slow judge against closed forms, in float64."""
+
+import pytest
+import torch
+
+from renderers.camera import Rays
+from renderers.field import steepest
+from renderers.fields.analytic import Shape, box, plane, sphere
+from renderers.reference import trace
+from renderers.rendering import Status
+from tests.renderers.analytic_cases import CASES, sphere_hits, vector
+
+
+def evaluate(field: Shape, rays: Rays, *, lipschitz: float = 1.0, least_step: float = 2e-4):
+    return trace(field, rays, lipschitz=lipschitz, least_step=least_step, radius=1.0)
+
+
+def along_z(*heights: float, start: float = -2.0) -> Rays:
+    origins = torch.stack([vector((0, y, start)) for y in heights]) if heights else torch.zeros(0, 3).double()
+    return Rays(origins, vector((0, 0, 1)).expand_as(origins))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_closed_forms_to_the_last_digits(case):
+    rendering = evaluate(case.field(), case.rays())
+    assert rendering.status.item() == Status.HIT
+    assert rendering.distance.item() == pytest.approx(case.distance, abs=1e-12)
+    assert abs(rendering.residual.item()) < 1e-12
+
+
+def test_grazing_rays_hit_or_miss_as_they_should():
+    heights = (0.4999, 0.499999, 0.5000001, 0.501)
+    rays = along_z(*heights)
+    rendering = evaluate(sphere(0.5), rays, least_step=1e-5)
+    distance, hit = sphere_hits(rays, 0.5)
+    assert rendering.hit.tolist() == hit.tolist() == [True, True, False, False]
+    assert rendering.distance[:2].tolist() == pytest.approx(distance[:2].tolist(), abs=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 60.0])
+def test_a_plate_of_a_thousandth_is_found(degrees):
+    turn = torch.tensor(degrees).deg2rad().double()
+    zero, one = torch.zeros_like(turn), torch.ones_like(turn)
+    rows = [one, zero, zero, zero, turn.cos(), -turn.sin(), zero, turn.sin(), turn.cos()]
+    plate = box((0.6, 0.6, 5e-4)).rotate(torch.stack(rows).view(3, 3)).translate((0.0, 0.0, 0.123))
+    assert evaluate(plate, along_z(0.0, 0.05)).hit.all()
+
+
+def test_the_step_is_as_short_as_the_bound_asks():
+    steep = Shape(lambda p: 4 * box((0.6, 0.6, 5e-3))(p), lipschitz=4.0)
+    assert evaluate(steep, along_z(0.0), lipschitz=4.0).hit.all()
+    assert not evaluate(steep, along_z(0.0), lipschitz=1.0).hit.any()  # steps of four times the distance
+
+
+def test_every_ray_has_a_status():
+    origins = vector((0, 0, -2, 0, 0.8, -2, 0, 3, -2, 0.1, 0, 0, 0, 0, 2)).view(5, 3)
+    rendering = evaluate(sphere(0.5), Rays(origins, vector((0, 0, 1)).expand(5, 3)))
+    assert rendering.status.tolist() == [Status.HIT, Status.MISS, Status.MISS, Status.STARTED_INSIDE, Status.MISS]
+    assert rendering.distance.isfinite().all()
+    assert evaluate(sphere(0.5), along_z()).distance.shape == (0,)
+    shaped = evaluate(sphere(0.5), Rays(origins[:4].view(2, 2, 3), vector((0, 0, 1)).expand(2, 2, 3)))
+    assert shaped.status.shape == (2, 2)
+
+
+def test_the_first_of_two_surfaces_is_the_hit():
+    shells = sphere(0.2).translate((0.0, 0.0, -0.5)) | sphere(0.2).translate((0.0, 0.0, 0.5))
+    assert evaluate(shells, along_z(0.0)).distance.item() == pytest.approx(1.3, abs=1e-12)
+
+
+def test_invalid_numbers_are_errors():
+    with pytest.raises(ValueError, match="lipschitz must be positive, not 0"):
+        evaluate(sphere(0.5), along_z(0.0), lipschitz=0.0)
+    with pytest.raises(ValueError, match="least_step must be positive, not -1"):
+        evaluate(sphere(0.5), along_z(0.0), least_step=-1.0)
+    rays = along_z(0.0)
+    with pytest.raises(ValueError, match=r"rays must be in float64, not torch\.float32"):
+        evaluate(sphere(0.5), Rays(rays.origins.float(), rays.directions.float()))
+
+
+def test_steepest_is_the_longest_gradient_and_a_margin():
+    assert steepest(sphere(0.5), radius=1.0) == pytest.approx(1.2)
+    assert steepest(plane((0, 1, 0), 0.0), radius=1.0, margin=1.0) == pytest.approx(1)
+    bent = Shape(lambda p: p[..., 0] ** 2)  # 2 |x|, at most 2 in the sphere
+    assert steepest(bent, radius=1.0, margin=1.0) == pytest.approx(2, abs=0.05)

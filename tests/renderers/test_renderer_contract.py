@@ -1,0 +1,358 @@
+"""What every renderer in conf/renderer must hold to, built as the command line builds it.
+
+A renderer is tested on fields of the kinds that it says it needs, and only for the gradients that it says it has.
+A variant, whose YAML builds on another, may give up accuracy for speed, or safety as the paper does: it may find fewer
+hits, but those that it finds are right, and all else holds.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from torch import Tensor
+from torch.nn.functional import max_pool2d, normalize
+
+from bench.config import CONF, build
+from renderers.camera import Camera, Rays
+from renderers.field import Kind
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.rendering import Renderer, Rendering, Status
+from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
+
+PARTS = ("distance", "status", "points", "residual", "closest")
+
+
+FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "renderer").glob("*.yaml"))}
+VARIANTS = [name for name, file in FILES.items() if "defaults" in file]
+
+
+@pytest.fixture(scope="module", params=[name for name in FILES if name not in VARIANTS])
+def renderer(request, compose_config) -> Renderer:
+    yours = [f"renderer._target_={request.config.getoption('--renderer')}"] if request.param == "custom" else []
+    return build(compose_config(f"renderer={request.param}", *yours).renderer, "renderer")
+
+
+def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:
+    """How far a hit may lie from the truth: where the field is below epsilon the surface is epsilon / cosine away.
+
+    Twice that, since fields that are bounds may be lower than the distance (see `stated`).
+    """
+    return 2 * getattr(renderer, "epsilon", 1e-4) / cosine + (2e-6 if dtype is torch.float32 else 1e-9)
+
+
+def stated(shape: Shape, kind: Kind) -> Shape:
+    """A field with the same surface that is no more than it says."""
+    if kind is Kind.DISTANCE:
+        return shape
+    if kind is Kind.BOUND:
+        return Shape(lambda p: 0.7 * shape(p), kind, 0.7)
+    return Shape(lambda p: (1.5 + torch.sin(3 * p[..., 0])) * shape(p), kind, None)
+
+
+def same(first: Rendering, second: Rendering, atol: float = 1e-12) -> None:
+    for part in PARTS:
+        one, other = getattr(first, part), getattr(second, part)
+        torch.testing.assert_close(one.reshape(other.shape), other, rtol=0, atol=atol)
+
+
+def check_rendering(rendering: Rendering, rays: Rays) -> None:
+    """Shapes, dtypes, finite numbers, and that the parts agree with one another."""
+    for part in PARTS:
+        wanted = (*rays.shape, 3) if part == "points" else rays.shape
+        assert getattr(rendering, part).shape == wanted, part
+        assert getattr(rendering, part).isfinite().all(), part
+        assert getattr(rendering, part).dtype == (torch.int8 if part == "status" else rays.origins.dtype), part
+    assert set(rendering.status.unique().tolist()) <= set(Status)
+    assert torch.equal(rendering.hit, rendering.status == Status.HIT)
+    assert not rendering.residual.requires_grad
+    torch.testing.assert_close(rendering.points, rays.at(rendering.distance), rtol=0, atol=1e-6)
+
+
+def mixed(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Rays:
+    """Rays that hit a ball of radius 0.5, that miss it, that miss the unit sphere, that start in either, behind it."""
+    count = torch.Size(shape).numel()
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, dtype=torch.float64, generator=generator)
+    targets = 0.6 * torch.randn(count, 3, dtype=torch.float64, generator=generator)
+    directions = normalize(targets - origins, dim=-1)
+    return Rays(origins.view(*shape, 3).to(dtype), directions.view(*shape, 3).to(dtype))
+
+
+def aimed(seed: int, count: int = 20) -> Rays:
+    """Rays from all around at what lies about the origin, so that none grazes it."""
+    generator = torch.Generator().manual_seed(seed)
+    around = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    targets = 0.1 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    return Rays(2.2 * around, normalize(targets - 2.2 * around, dim=-1))
+
+
+def pinhole(height: int, width: int, dtype: torch.dtype = torch.float32) -> Camera:
+    """Sees the whole unit sphere from a corner of space, level."""
+    size = min(height, width)
+    intrinsics = torch.tensor([[1.0 * size, 0, width / 2], [0, 1.0 * size, height / 2], [0, 0, 1]], dtype=dtype)
+    world_to_camera = torch.eye(4, dtype=dtype)
+    world_to_camera[:3, :3] = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], dtype=dtype)
+    world_to_camera[2, 3] = 2.5
+    return Camera(intrinsics, world_to_camera, height, width)
+
+
+def test_it_is_a_renderer_with_capabilities(renderer):
+    assert isinstance(renderer, Renderer)
+    assert renderer.capabilities.needs
+    text = type(renderer).__doc__ or ""
+    for line in ("Source:", "Differentiable in:", "Needs:", "Deviates from the paper:"):
+        assert line in text, f"the docstring of {type(renderer).__name__} lacks the line {line!r}: see renderers/idr.py"
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_hits_are_those_of_the_closed_forms(renderer, case, dtype):
+    rays = case.rays(dtype)
+    for kind in renderer.capabilities.needs:
+        rendering = renderer.render(stated(case.field(), kind), rays)
+        check_rendering(rendering, rays)
+        assert rendering.status.item() == Status.HIT
+        assert rendering.distance.item() == pytest.approx(case.distance, abs=tolerance(renderer, case.cosine, dtype))
+        assert rendering.residual.abs().item() <= getattr(renderer, "epsilon", torch.inf)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(48, 48), (45, 51)])
+def test_images_are_those_of_the_closed_forms(renderer, dtype, size):
+    rays = pinhole(*size, dtype).rays()
+    half = (0.45, 0.5, 0.4)
+    for field, (distance, hit) in ((sphere(0.6), sphere_hits(rays, 0.6)), (box(half), box_hits(rays, half))):
+        rendering = renderer.render(field, rays)
+        check_rendering(rendering, rays)
+        # Pixels near an outline are left out: there a renderer that shares steps between neighbours may differ.
+        around = max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 9, stride=1, padding=4)[:, 0] > 0
+        clear = ~(around[0] & around[1])
+        assert (clear & hit).sum() > 5
+        assert (clear & ~hit).sum() > 50
+        assert torch.equal(rendering.hit[clear], hit[clear])
+        assert (rendering.distance - distance)[clear & hit].abs().max() < tolerance(renderer, 0.5, dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (30,), (2, 3, 5), (3, 0, 2)])
+def test_rays_may_have_any_leading_shape(renderer, shape, dtype):
+    rays, field = mixed(*shape, dtype=dtype), sphere(0.5)
+    rendering = renderer.render(field, rays)
+    check_rendering(rendering, rays)
+    same(rendering, renderer.render(field, rays.flat()))
+    if len(shape) == 3 and rendering.hit.numel():
+        assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (2, 4, 6), (0, 4, 4)])
+def test_images_may_have_any_size_and_come_in_batches(renderer, shape):
+    one = pinhole(*shape[-2:], dtype=torch.float64).rays()
+    rays = Rays(one.origins.expand(*shape, 3), one.directions.expand(*shape, 3), image=True)
+    rendering = renderer.render(sphere(0.5), rays)
+    check_rendering(rendering, rays)
+    alone = renderer.render(sphere(0.5), one)
+    for part in PARTS:
+        torch.testing.assert_close(getattr(alone, part).expand_as(getattr(rendering, part)), getattr(rendering, part))
+
+
+def test_inputs_are_left_as_they_are(renderer):
+    rays = mixed(40)
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    for image in (False, True):
+        origins, directions = rays.origins.view(5, 8, 3).clone(), rays.directions.view(5, 8, 3).clone()
+        given_rays = Rays(origins, directions, image)
+        before = origins._version, directions._version, radius._version
+        rendering = renderer.render(sphere(radius), given_rays)
+        mask = torch.ones(5, 8, dtype=torch.bool)
+        renderer.silhouette_loss(sphere(radius), given_rays, rendering, mask)
+        assert before == (origins._version, directions._version, radius._version)
+        assert torch.equal(origins, rays.origins.view(5, 8, 3))
+        assert not origins.requires_grad
+        assert radius.grad is None
+
+
+def test_the_same_input_gives_the_same_output(renderer):
+    for rays in (mixed(50), pinhole(9, 9, torch.float64).rays()):
+        same(renderer.render(sphere(0.5), rays), renderer.render(sphere(0.5), rays), atol=0)
+
+
+def test_rays_that_find_nothing_miss(renderer):
+    aside = Rays(vector((2, 0, -2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
+    behind = Rays(vector((0, 0, 2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
+    through = Rays(vector((0.8, 0, -2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
+    for rays in (aside, behind, through):
+        for image in (False, True):
+            rays = Rays(rays.origins, rays.directions, image)
+            rendering = renderer.render(sphere(0.5), rays)
+            check_rendering(rendering, rays)
+            assert (rendering.status == Status.MISS).all()
+            assert (rendering.closest > 0.1).all()  # outside, by its sign
+
+
+def test_splitting_the_rays_changes_nothing(renderer):
+    rays, field = mixed(60), box((0.4, 0.3, 0.5))
+    whole = renderer.render(field, rays)
+    for size in (1, 7):
+        parts = [
+            renderer.render(field, Rays(*some))
+            for some in zip(rays.origins.split(size), rays.directions.split(size), strict=True)
+        ]
+        same(whole, Rendering(*(torch.cat([getattr(part, name) for part in parts]) for name in PARTS)))
+
+
+def leaves() -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
+    """A radius and rays that end in every way, tangents and a ray through the centre among them."""
+    some = mixed(30)
+    edge = vector((0, 0, -2, 0.5, 0, -2, 1, 0, -2, 0, 0, 0, 0.499999, 0, -2)).view(5, 3)
+    origins = torch.cat([some.origins, edge]).requires_grad_(True)
+    directions = torch.cat([some.directions, vector((0, 0, 1)).expand(5, 3)]).requires_grad_(True)
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    return radius, Rays(origins, directions), (radius, origins, directions)
+
+
+@pytest.mark.parametrize("part", ["distance", "closest", "points", "silhouette"])
+def test_gradients_are_finite_on_every_kind_of_ray(renderer, part):
+    radius, rays, wanted = leaves()
+    rendering = renderer.render(sphere(radius), rays)
+    assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
+    mask = torch.arange(35) % 2 == 0
+    if part == "silhouette":
+        output = renderer.silhouette_loss(sphere(radius), rays, rendering, mask)
+        assert output.shape == ()
+        assert output.isfinite()
+        assert output > 0
+    else:
+        output = getattr(rendering, part).sum()
+    for gradient in torch.autograd.grad(output, wanted, allow_unused=True):
+        assert gradient is None or gradient.isfinite().all()
+
+
+def test_gradients_of_hits_point_the_right_way(renderer):
+    for case in CASES:
+        parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
+        rays = case.rays()
+        origins = rays.origins.requires_grad_(True)
+        distance = renderer.render(case.shape(parameter), Rays(origins, rays.directions)).distance.sum()
+        if renderer.capabilities.field_gradient:
+            assert torch.autograd.grad(distance, parameter, retain_graph=True)[0] < -0.2
+        if renderer.capabilities.ray_gradient:
+            (found,) = torch.autograd.grad(distance, origins)
+            assert torch.cosine_similarity(found[0], case.origin_rate, dim=0) > 0.99
+
+
+def test_points_move_as_distances_do_and_residuals_do_not(renderer):
+    radius, rays, wanted = leaves()
+    rendering = renderer.render(sphere(radius), rays)
+    assert not rendering.residual.requires_grad
+    found = torch.autograd.grad(rendering.points.sum(), wanted, retain_graph=True, allow_unused=True)
+    expected = torch.autograd.grad(rays.at(rendering.distance).sum(), wanted, allow_unused=True)
+    torch.testing.assert_close(found, expected)
+
+
+def test_no_graph_is_built_where_none_is_wanted(renderer):
+    radius, rays, _ = leaves()
+    with torch.no_grad():
+        rendering = renderer.render(sphere(radius), rays)
+    plain = renderer.render(sphere(0.5), Rays(rays.origins.detach(), rays.directions.detach()))
+    for quiet in (rendering, plain):
+        assert not any(getattr(quiet, part).requires_grad for part in PARTS)
+    same(rendering, plain)
+
+
+def test_the_right_mask_costs_less_than_its_opposite(renderer):
+    rays = pinhole(16, 16, torch.float64).rays()
+    field = sphere(0.5)
+    rendering = renderer.render(field, rays)
+    _, truth = sphere_hits(rays, 0.5)
+    right, wrong = (renderer.silhouette_loss(field, rays, rendering, mask) for mask in (truth, ~truth))
+    assert right >= 0  # its scale is the renderer's own
+    assert wrong > 10 * right
+    assert wrong > 1e-5
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def variant(request, compose_config) -> Renderer:
+    return build(compose_config(f"renderer={request.param}").renderer, "renderer")
+
+
+def test_a_variant_gives_what_a_renderer_gives(variant):
+    test_it_is_a_renderer_with_capabilities(variant)
+    test_the_same_input_gives_the_same_output(variant)
+    test_inputs_are_left_as_they_are(variant)
+    test_rays_may_have_any_leading_shape(variant, (2, 3, 5), torch.float32)
+    test_rays_may_have_any_leading_shape(variant, (3, 0, 2), torch.float64)
+    test_images_may_have_any_size_and_come_in_batches(variant, (2, 4, 6))
+
+
+def test_what_a_variant_hits_is_there_and_what_it_misses_is_not(variant):
+    test_rays_that_find_nothing_miss(variant)
+    rays = aimed(0)
+    truth, hit = sphere_hits(rays, 0.5)
+    rendering = variant.render(sphere(0.5), rays)
+    check_rendering(rendering, rays)
+    assert hit.all() and not (rendering.status == Status.MISS).any()
+    wrong = (rendering.distance - truth).abs()[rendering.hit]
+    assert wrong.numel() == 0 or wrong.max() < tolerance(variant, 0.9)
+    assert (rendering.residual.abs()[rendering.hit] <= getattr(variant, "epsilon", torch.inf)).all()
+
+
+@pytest.mark.parametrize("part", ["distance", "silhouette"])
+def test_a_variants_gradients_are_finite_and_its_points_move_as_its_distances(variant, part):
+    test_gradients_are_finite_on_every_kind_of_ray(variant, part)
+    test_points_move_as_distances_do_and_residuals_do_not(variant)
+
+
+def rotation(seed: int) -> Tensor:
+    """A random rotation, evenly distributed."""
+    q, r = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)))
+    q = q * r.diagonal().sign()
+    return q * torch.linalg.det(q)
+
+
+@settings(max_examples=10)
+@given(
+    seed=st.integers(0, 2**32),
+    offset=st.tuples(*[st.floats(-0.15, 0.15)] * 3),
+    half=st.tuples(*[st.floats(0.3, 0.4)] * 3),
+)
+def test_a_rigid_motion_moves_the_hit_with_the_ray(renderer, seed, offset, half):
+    rays, turn, offset = aimed(seed), rotation(seed), vector(offset)
+    moved = Rays(rays.origins @ turn.T + offset, rays.directions @ turn.T)
+    before = renderer.render(box(half), rays)
+    after = renderer.render(box(half).rotate(turn).translate(offset), moved)
+    assert before.hit.all()
+    assert after.hit.all()
+    assert (before.distance - after.distance).abs().max() < tolerance(renderer, 0.25)
+    torch.testing.assert_close(after.points, before.points @ turn.T + offset, rtol=0, atol=tolerance(renderer, 0.25))
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32), factor=st.floats(0.5, 1.6))
+def test_scaling_scales_the_distance(renderer, seed, factor):
+    rays = aimed(seed)
+    scaled = Rays(rays.origins * factor, rays.directions)
+    before = renderer.render(box((0.3, 0.35, 0.4)), rays)
+    after = renderer.render(box((0.3, 0.35, 0.4)).scale(factor), scaled)
+    assert before.hit.all()
+    assert after.hit.all()
+    assert (factor * before.distance - after.distance).abs().max() < 2 * tolerance(renderer, 0.25)
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32))
+def test_a_tighter_epsilon_never_raises_the_residual(renderer, seed):
+    if not hasattr(renderer, "epsilon"):
+        pytest.skip("it has no epsilon")
+    rays, loose = aimed(seed), None
+    truth, _ = sphere_hits(rays, 0.5)
+    for epsilon in (1e-2, 1e-3, 1e-4, 1e-5):
+        tight = replace(renderer, epsilon=epsilon)
+        rendering = tight.render(sphere(0.5), rays)
+        assert rendering.hit.all()
+        assert (rendering.residual.abs() < epsilon).all()
+        assert ((rendering.distance - truth).abs() < tolerance(tight, 0.9)).all()
+        assert loose is None or (rendering.residual.abs() <= loose).all()
+        loose = rendering.residual.abs()

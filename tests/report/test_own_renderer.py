@@ -1,0 +1,77 @@
+"""A renderer that is one Python file and one YAML runs, and stands in Table 1, in the front and in the atlas."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.report.__main__ import main as report
+from tests.run.driving import command
+
+CODE = """
+from renderers import IDR, Capabilities, Kind
+
+
+class Mine:
+    capabilities = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True)
+
+    def __init__(self, steps):
+        self.tracer = IDR(
+            steps=steps, epsilon=1e-4, least_slope=1e-3, mask_sharpness=50.0, mask_weight=100.0, sphere_radius=1.0
+        )
+
+    def render(self, field, rays):
+        return self.tracer.render(field, rays)
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        return self.tracer.silhouette_loss(field, rays, rendering, mask)
+"""
+SMALL = (
+    "scale=smoke", "isolation=off", "threads=1", "evaluation.picture=null", "evaluation.grid=16",
+    "evaluation.points=200",
+)  # fmt: skip
+NETWORK = (
+    "prior.network.layers=2", "prior.network.width=16", "prior.network.code_length=4", "prior.network.skip=0",
+    "prior.steps=20", "prior.samples=500", "view.resolution=16", "task.repeats=1",
+)  # fmt: skip
+RUNS = (
+    ("+experiment=table1", "dataset=sphere", *NETWORK),
+    ("+experiment=speed_rendering", "dataset=sphere", "prior=fit", *NETWORK),
+    (
+        "+experiment=stability",
+        "stress=thin_plate",
+        "scale.stability.search.levels=5",
+        "scale.stability.search.repeats=2",
+        "task.resolution=16",
+    ),
+)
+ROWS = {"table1": "table1", "front": "speed_front", "atlas": "stability"}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> Path:
+    """What the runs of a renderer of a user's own left, with its report."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "conf" / "renderer").mkdir(parents=True)
+    (folder / "conf" / "renderer" / "mine.yaml").write_text("_target_: mypkg_of_tests.Mine\n_label_: Mine\nsteps: 40\n")
+    (folder / "mypkg_of_tests.py").write_text(CODE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        for overrides in RUNS:
+            done = command(
+                f"--config-dir={folder / 'conf'}", *overrides, *SMALL, "renderer=mine", "packages=[mypkg_of_tests]",
+                f"results_dir={folder / 'results'}",
+            )  # fmt: skip
+            assert done.code == 0, done.err
+    report([f"results_dir={folder / 'results'}"])
+    return folder / "results"
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_it_has_a_row(results, name):
+    table = pd.read_csv(results / "paper" / f"{ROWS[name]}.csv")
+    assert "Mine" in set(table.to_numpy().ravel())
+
+
+def test_its_figures_are_drawn(results):
+    assert all((results / "paper" / f"{name}.png").stat().st_size > 1000 for name in ("speed_front", "stability"))

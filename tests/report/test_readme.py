@@ -1,0 +1,58 @@
+"""README files show the numbers of `results/paper`, and no others."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bench.report.write.readme import write_readme
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = ROOT / "results" / "paper"
+
+
+def rows(text: str) -> list[list[str]]:
+    """The rows of all Markdown tables of a text, cell by cell."""
+    lines = [line for line in text.splitlines() if line.startswith("|") and not line.startswith("| ---")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_the_results_page_is_that_of_the_committed_tables(tmp_path):
+    shutil.copytree(PAPER, tmp_path / "paper")
+    assert write_readme(tmp_path).read_text() == (ROOT / "results" / "README.md").read_text()
+
+
+def test_the_results_page_follows_its_tables(tmp_path):
+    folder = tmp_path / "paper"
+    folder.mkdir()
+    assert write_readme(tmp_path) is None
+    (folder / "mine.md").write_text("**Mine.** Of one run.\n\n| a | b |\n| --- | ---: |\n| x | 1.5 |\n\n- A note\n")
+    text = write_readme(tmp_path).read_text()
+    assert "- [Mine](#mine)" in text and "Of one run." in text and ["x", "1.5"] in rows(text)
+    assert re.search(r"<details><summary>Notes</summary>\n\n- A note\n\n</details>", text)
+
+
+@pytest.mark.parametrize("line", range(12))
+def test_readme_shows_the_numbers_of_table_1(line):
+    mine = [row for row in rows((ROOT / "README.md").read_text()) if row[0] in STRATEGIES]
+    theirs = {row[0]: row for row in rows((PAPER / "table1.md").read_text())}
+    assert len(mine) == len(STRATEGIES)
+    shown = mine[line]
+    heading = theirs["Strategy"]
+    for name, cell in zip(SHOWN, shown, strict=True):
+        assert cell == theirs[shown[0]][heading.index(name)], (shown[0], name)
+
+
+PUBLISHED = ("Published queries", "Published time")
+STRATEGIES = [row[0] for row in rows((PAPER / "table1.md").read_text())[1:]]
+SHOWN = (
+    "Strategy",
+    "Size",
+    "Queries",
+    "Forward",
+    "Step",
+    "Lost / false / wrong",
+    "Published queries",
+    "Published time",
+)

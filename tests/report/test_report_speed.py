@@ -1,0 +1,245 @@
+"""Speed against accuracy, made from run folders whose numbers are known."""
+
+import json
+import math
+import shutil
+import subprocess
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data.curves import history_of
+from bench.report.data.experiments import choose
+from bench.report.data.speed import COMPLETION, TARGET, TRIALS, settings
+from bench.report.pages import loss_chamfer, speed_curves, speed_front, speed_volume
+from bench.report.write.html import write_index
+from bench.report.write.paper import write_paper
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+
+def completed(results, label, errors, **changed):
+    """A completion whose looks have these errors x 1000, at 1, 2, 3, ... seconds; the last is that of its end."""
+    status, index, renderer = changed.get("status", "ok"), changed.get("index", 0), changed.get("renderer", "dist")
+    steps = len(errors) - 1
+    folder = write_run(
+        results,
+        "speed_completion",
+        label,
+        task="completion",
+        status=status,
+        dataset="sofa",
+        renderer=renderer,
+        metrics={"chamfer_l2": errors[-1] / 1000},
+        seconds={"forward": 0.75 * steps, "backward": 0.25 * steps},
+        evaluations={"value": 100 * steps},
+        settings={"index": index, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "test"},
+    )
+    lines = [
+        {
+            "iteration": i,
+            "seconds": i + 1.0,
+            "value_evaluations": 100 * (i + 1),
+            "total": 5.0 - i,
+            "chamfer_l2": e / 1000,
+        }
+        for i, e in enumerate(errors[:-1])
+    ]
+    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def rendered(results, label, seconds, error, *, size=64, status="ok"):
+    """A rendering."""
+    metrics = {"forward_seconds": seconds, "error_p95": error, "queries": 1000}
+    return write_run(
+        results, "speed_rendering", label, task="ablation", dataset="sofa", status=status, metrics=metrics,
+        settings={"view": {"resolution": size}, "split": "train"},
+    )  # fmt: skip
+
+
+def made(results, page):
+    records = read_records(results)[0]
+    return page.make(*(choose(records, selection, results) for selection in page.READS))
+
+
+@pytest.fixture
+def three(tmp_path):
+    """A fast one, a good one, and one that is worse than both in everything; a fourth fails on two shapes of three."""
+    for index in range(3):
+        completed(tmp_path, "fast", [9, 6 + index], index=index)
+        completed(tmp_path, "good", [9, 5, 3, 0.5 + index / 10], index=index)
+        completed(tmp_path, "bad", [9, 8, 8, 8, 8], index=index)
+        completed(tmp_path, "broken", [9, 1], index=index, status="ok" if index == 0 else "nan", renderer="idr")
+    return tmp_path
+
+
+def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
+    data = made(three, speed_front).data.set_index("setting")
+    assert data["dominated"].to_dict() == {"fast": False, "good": False, "bad": True, "broken": True}
+    chance = 7 / 27  # that at least two of three draws are the shape that it did not fail on; then it beats "fast"
+    expected = {"fast": 1 - chance, "good": 1.0, "bad": 0.0, "broken": chance}
+    assert data["on_front"].to_dict() == pytest.approx(expected, abs=0.03)
+    assert data.loc["good", ["seconds", "error"]].tolist() == pytest.approx([3.0, 0.6])
+    assert data.loc["broken", ["failed", "runs"]].tolist() == [2, 3]
+    assert math.isinf(data.loc["broken", "error"])
+
+
+def test_failed_and_dominated_points_are_drawn(three):
+    records = read_records(three)[0]
+    rows = [settings(choose(records, trial.selection, three), trial) for trial in TRIALS]
+    points = {point.row.name: point for point in speed_front.place(rows[0])}
+    assert rows[1] == []
+    assert points["broken"].infinite and not points["broken"].on_front
+    assert (points["broken"].x, points["broken"].y) == pytest.approx((1.5 * 4, 1.5 * 8))
+    figure = made(three, speed_front).figure
+    drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in figure.axes[0].lines
+             if len(line.get_xdata()) == 1}  # fmt: skip
+    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0), (6.0, 12.0)}
+    assert drawn[6.0, 12.0].get_marker() == "x"
+    assert drawn[4.0, 8.0].get_markerfacecolor() == "none"
+    assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
+
+
+def test_the_page_works_without_a_network_and_leads_to_the_runs(three):
+    write_paper(read_records(three)[0], three)
+    page, index = (three / "paper" / "speed_front.html").read_text(), write_index(three).read_text()
+    assert 'src="plotly.min.js"' in page
+    assert (three / "paper" / "plotly.min.js").stat().st_size > 1e6
+    assert "window.open" in page
+    assert "paper/speed_front.html" in index
+    for folder in (three / "runs").iterdir():
+        assert json.loads((folder / "record.json").read_text())["status"] != "ok" or f"#run-{folder.name}" in page
+        assert f'id="run-{folder.name}"' in index
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to open the page in")
+def test_a_browser_draws_the_page(three, tmp_path):
+    write_paper(read_records(three)[0], three)
+    for name, marks in (("speed_front", 4), ("speed_curves", 1)):
+        options = ("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000", "--dump-dom")
+        place = (f"--user-data-dir={tmp_path / 'browser'}", (three / "paper" / f"{name}.html").as_uri())
+        command = ["chromium", *options, *place]
+        dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False).stdout
+        assert dom.count('class="trace scatter') >= marks
+        assert "time (seconds)" in dom
+
+
+def test_a_look_costs_what_was_spent_before_it(three):
+    data = made(three, speed_curves).data
+    good = data[(data["row"] == "good") & (data["index"] == 0)]
+    assert good["error"].tolist() == [9, 5, 3, 0.5]
+    assert good["seconds"].tolist() == [0, 1, 2, 3]
+    assert good["value_evaluations"].tolist() == [0, 100, 200, 300]
+    assert good["loss"].tolist()[:3] == [5, 4, 3] and math.isnan(good["loss"].iloc[3])
+
+
+def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
+    assert TARGET == 1e-3
+    table = made(three, speed_curves).table.set_index("Setting")
+    assert table.loc["good"].tolist() == ["3", "3", "3.00 s"]
+    assert table.loc["bad"].tolist() == ["3", "0", "–"]
+    assert table.loc["broken"].tolist() == [
+        "3",
+        "1",
+        "1.00 s",
+    ]  # failed runs did not, whatever they scored
+
+
+def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_path):
+    for index in range(5):
+        completed(tmp_path, "dist", [9, 8], index=index, status="nan")
+    completed(tmp_path, "dist", [9, 8, 8, 0.5], index=5)
+    figure = made(tmp_path, speed_curves).figure
+    figure.draw_without_rendering()  # also where every median is infinite
+    (steps,) = [line for line in figure.axes[2].lines if len(line.get_xdata()) > 1]
+    assert steps.get_ydata()[-1] == pytest.approx(5 / 6)
+
+
+def test_a_run_without_a_curve_that_ended_ok_is_censored_when_it_ended(tmp_path):
+    folder = completed(tmp_path, "dist", [9, 8, 2])
+    (folder / "curve.jsonl").unlink()
+    (record,) = read_records(tmp_path)[0]
+    history = history_of(choose([record], COMPLETION.selection, tmp_path), record)
+    assert speed_curves.time_to(history, record) == (2.0, False)
+
+
+def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
+    for index in range(2):
+        completed(tmp_path, "dist", [9, 1], index=index)
+    completed(tmp_path, "idr", [9, 1], renderer="idr")
+    result = made(tmp_path, speed_front)
+    row = result.table.set_index("Setting").loc["idr"]
+    assert row["Failed"] == "0 of 1, 1 missing"
+    assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
+
+
+def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
+    folder = completed(tmp_path, "dist", [9, 1])
+    record = json.loads((folder / "record.json").read_text())
+    record["seconds"]["forward"] = "nan"
+    (folder / "record.json").write_text(json.dumps(record))
+    assert math.isinf(made(tmp_path, speed_front).data["seconds"].iloc[0])
+
+
+def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
+    completed(tmp_path, "dist", [9, 1])
+    settings = {"index": 0, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "validation"}
+    write_run(tmp_path, "speed_completion", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
+              settings=settings, minute=0)  # fmt: skip
+    result = made(tmp_path, speed_front)
+    assert result.data["error"].tolist() == [1.0]
+    assert "Not shown: 1 run" in told(result)
+
+
+def test_the_median_over_runs_holds_a_failed_run_as_infinite():
+    columns = ["seconds", "value_evaluations", "error"]
+    runs = [pd.DataFrame([[0, 0, 9.0], [1, 10, e], [2, 20, e]], columns=columns) for e in (1.0, 2.0)]
+    lost = pd.DataFrame([[0, 0, 9.0], [1, 10, 0.1]], columns=columns)
+    where, _, middle, _ = speed_curves.band([*runs, lost], [False, False, True], "seconds")
+    assert where[0] == 1 and where[-1] == 2
+    assert (middle[0], middle[-1]) == (1.0, 2.0)
+
+
+def test_renderings_of_another_size_are_not_compared(tmp_path):
+    rendered(tmp_path, "dist", 1.0, 0.01)
+    rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
+    rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
+    result = made(tmp_path, speed_front)
+    data = result.data
+    assert "Not shown: 1 renderings of another size." in result.notes
+    assert data["setting"].tolist() == ["dist", "dist, 20 steps"]
+    assert data["dominated"].tolist() == [False, False]
+    assert data["evaluations"].tolist() == [1000, 1000]
+
+
+def test_the_hypervolume_is_that_of_the_renderers_settings(tmp_path):
+    for index in range(2):
+        completed(tmp_path, "one", [9, 9, 1], index=index)
+        completed(tmp_path, "two", [9, 9, 10], index=index, renderer="idr")
+    data = made(tmp_path, speed_volume).data.set_index("renderer")
+    assert data.loc["dist", ["reference_seconds", "reference_error"]].tolist() == [4.0, 20.0]
+    assert data.loc["dist", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 1))
+    assert data.loc["idr", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 10))
+
+
+def test_loss_and_error_are_correlated_by_rank(three):
+    data = made(three, loss_chamfer).data.set_index("row")
+    assert data.loc["good", ["within", "together", "looks", "runs"]].tolist() == [1.0, 1.0, 9, 3]
+    assert data["together"].isna()["fast"]  # one look is no correlation
+
+
+def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
+    completed(tmp_path, "dist", [9, 5, 1])
+    folder = completed(tmp_path, "idr", [9, 5, 1], status="timeout", renderer="idr")
+    (folder / "curve.jsonl").unlink()
+    for page in (speed_front, speed_volume, speed_curves, loss_chamfer):
+        result = made(tmp_path, page)
+        assert "idr" in result.table.to_string()
+
+
+def test_an_error_of_zero_does_not_break_the_volume(tmp_path):
+    rendered(tmp_path, "dist", 1.0, 0.0)
+    rendered(tmp_path, "idr", 0.5, 0.02)
+    assert np.isfinite(made(tmp_path, speed_volume).data["hypervolume"].astype(float)).all()

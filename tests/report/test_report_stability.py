@@ -1,0 +1,160 @@
+"""The stability atlas as tables and figures, made from run folders whose numbers are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data.atlas import STABILITY, atlas
+from bench.report.data.experiments import choose
+from bench.report.pages import stability, stability_cost, stability_curves, stability_failures
+from bench.report.write.paper import write_paper
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
+
+
+def broke(results, axis, label, level, *, status="ok", measure="rendering", predicted=None, criteria=None, **metrics):
+    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials."""
+    within = {"breakdown": None if not 0 <= level <= 1 else 0.01**level}
+    ends = {"level": level, "level_low": level - 0.05, "level_high": level + 0.05}
+    within |= {
+        f"breakdown{end}": 0.01 ** (level + by) if 0 <= level + by <= 1 else None
+        for end, by in (("_low", -0.05), ("_high", 0.05))
+    }
+    counts = {"trials": 10, "grid_trials": 40, "mild_trials": 5, "severe_trials": 5}
+    counts |= {"mild_successes": 5 * (level > 0), "severe_successes": 5 * (level > 1), "evaluations_per_ray": 4.0}
+    known = {**within, **ends, **counts, "failed_lost": 3, "failed_false": 1, **metrics}
+    known |= {} if predicted is None else {"predicted": predicted}
+    stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP}
+    search = {"levels": 11, "repeats": 4}
+    folder = write_run(
+        *(results, "stability", label),
+        task="stability",
+        dataset=axis,
+        status=status,
+        reason="" if status == "ok" else "why",
+        metrics=known if status == "ok" else {},
+        settings={
+            "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
+            "stress": stress,
+        },
+    )
+    if status == "ok":
+        lines = [
+            {"trial": i, "level": i / 10, "severity": 0.01 ** (i / 10), "success": i / 10 < level} for i in range(11)
+        ]
+        (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def made(results, function):
+    return function(choose(read_records(results)[0], STABILITY, results))
+
+
+def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5, predicted=0.125)
+    table = made(tmp_path, stability.make)
+    assert table.table.loc[0, "Axis"] == "wires"
+    assert table.table.loc[0, "DIST"] == "0.100 (0.126 to 0.0794)"
+    assert "Predicted, wires: DIST 0.125, measured 0.100 (0.126 to 0.0794)." in table.notes
+    assert "DIST: worst on wires 0.100 (0.126 to 0.0794) scene units. Failed trials: 3 lost, 1 false." in table.notes
+    assert "n = 10 trials in all, of 1 axes and 1 renderers" in table.caption
+    assert "25 % of a full grid's" in told(table)
+
+
+def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
+    broke(tmp_path, "wires", "DIST", -0.1)
+    broke(tmp_path, "wires", "DVR", 1.1)
+    row = made(tmp_path, stability.make).table.iloc[0]
+    assert row["DIST"] == "at once (5 of 5 failed, 57-100 %)"
+    assert row["DVR"] == "none (0 of 5 failed, 0-43 %)"  # Wilson: 0 of 5 still allows 43 %
+
+
+def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    broke(tmp_path, "wires", "DVR", 0.5, status="crashed")
+    broke(tmp_path, "alpha", "DIST", 0.5)
+    broke(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
+    result = made(tmp_path, stability.make)
+    assert list(result.table["DVR"]) == ["crashed", "–"]
+    assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in result.caption
+    assert made(tmp_path, stability_curves.make).figure is not None
+
+
+def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
+    for label, level in (("DIST", 0.25), ("DVR", 0.75)):
+        broke(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
+        broke(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
+        broke(tmp_path, "gap", label, 0.5)
+        broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
+    broke(tmp_path, "alpha", "DIST", 0.9)
+    broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
+    rows = made(tmp_path, stability_cost.make).data.set_index("row")
+    columns = ["axes", "at_once", "never", "cost"]
+    assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
+    assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
+    assert rows["rank"].to_dict() == {"DIST": pytest.approx(5.5 / 3), "DVR": pytest.approx(3.5 / 3)}
+
+
+@pytest.mark.parametrize("status", ["timeout", "missing"])
+def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
+    for label in ("DIST", "DVR"):
+        broke(tmp_path, "wires", label, 0.5)
+    if status != "missing":
+        broke(tmp_path, "thin_plate", "DIST", 0.1, status=status)
+    broke(tmp_path, "thin_plate", "DVR", 0.1)
+    rows = made(tmp_path, stability_cost.make).data.set_index("row")
+    assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
+    if status != "missing":
+        assert "DIST: worst on thin plate timeout" in " ".join(made(tmp_path, stability.make).notes)
+
+
+def test_rows_of_other_criteria_are_not_compared(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
+    broke(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
+    result = made(tmp_path, stability.make)
+    assert list(result.table.columns) == ["Axis", "Unit", "DVR"]
+    assert "Success: 0.99 of the true hits" in told(result) and "Not shown: 1 run" in told(result)
+
+
+def test_axes_stand_in_their_groups(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    records = read_records(tmp_path)[0]
+    grid = atlas(choose(records, STABILITY, tmp_path))
+    (row,) = grid.rows
+    assert (grid.axes, row.name, grid.group("wires")) == (["wires"], "DIST", "viewing")
+    assert grid.cells["wires", row].place(0.1) == pytest.approx(0.5)
+
+
+def test_curves_have_a_row_a_level_with_its_interval(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.45)
+    data = made(tmp_path, stability_curves.make).data
+    assert len(data) == 11
+    assert data["successes"].sum() == 5
+    assert (data["low"] <= data["share"]).all() and (data["share"] <= data["high"]).all()
+    assert data["level"].iloc[-1] == 1.0
+
+
+def test_first_failures_are_drawn_with_the_truth_beside(tmp_path):
+    kinds = np.zeros((8, 8), dtype=np.uint8)
+    kinds[2:4] = 2
+    for label, level, severity in (("DIST", 0.5, 0.3), ("DVR", 0.4, 0.2)):
+        folder = broke(tmp_path, "wires", label, level)
+        np.savez(folder / "images.npz", kinds=kinds, true_distance=np.ones((8, 8)), severity=severity)
+    broke(tmp_path, "depth_noise", "DIST", 0.5, measure="fit")  # has no picture
+    result = made(tmp_path, stability_failures.make)
+    assert result.data[["axis", "row", "severity", "lost"]].to_numpy().tolist() == [["wires", "DIST", 0.3, 16]]
+
+
+def test_all_four_are_written(tmp_path):
+    folder = broke(tmp_path, "wires", "DIST", 0.5)
+    (folder / "curve.jsonl").write_text("not a line\n")
+    (folder / "images.npz").write_bytes(b"nothing")
+    written = write_paper(read_records(tmp_path)[0], tmp_path)
+    assert [path.stem for path in written] == [
+        "stability", "stability_cost", "stability_curves", "stability_failures",
+    ]  # fmt: skip
+    for path in written[:3]:
+        assert path.with_suffix(".png").stat().st_size > 1000

@@ -1,0 +1,294 @@
+"""Table 2 and the priors' page, made from run folders whose numbers are known."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.pictures import style
+from bench.records.read import read_records
+from bench.report.data import oracle
+from bench.report.data.completions import POINTS
+from bench.report.data.experiments import choose
+from bench.report.pages import priors, table2, table2_intervals
+from bench.report.write.paper import write_paper
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+REFERENCE, OTHER = "DIST with mask", "Naive with mask"
+
+
+def completed(results, label, chamfer, **changed):
+    """A run of Table 2; `points`, `index`, `dataset` as named."""
+    points, index = changed.pop("points", "100"), changed.pop("index", 0)
+    task, minute = changed.pop("task", "completion"), changed.pop("minute", None)
+    failed = chamfer is None
+    return write_run(
+        results,
+        "table2",
+        label,
+        **{"task": task, "dataset": "sofa", "status": "diverged" if failed else "ok"} | changed,
+        metrics={} if failed else {"chamfer_l2": chamfer / 1000},
+        settings={"task": {"points": points, "_target_": task}, "index": index, "dataset": {"name": "sofa"}},
+        **({"minute": minute} if minute is not None else {}),
+    )
+
+
+def made(results, page=table2):
+    return page.make(choose(read_records(results)[0], page.READS[0], results))
+
+
+def p_values(result):
+    return [note for note in result.notes if "p = " in note]
+
+
+def cell(result, method, column):
+    row = result.table[result.table["Method"] == method]
+    return row[column].iloc[0]
+
+
+def test_a_cell_is_the_median_over_shapes_and_a_failure_is_infinite(tmp_path):
+    for index, value in enumerate((1.0, 2.0, 4.0)):
+        completed(tmp_path, REFERENCE, value, index=index)
+    for index, value in enumerate((1.0, None, None)):
+        completed(tmp_path, OTHER, value, index=index)
+    result = made(tmp_path)
+    assert cell(result, REFERENCE, "100 pts") == "2.00"
+    assert cell(result, OTHER, "100 pts") == "∞"
+    assert cell(result, REFERENCE, "Failed") == "0 of 3"
+    assert cell(result, OTHER, "Failed") == "2 of 3"
+    assert len(result.data) == 6  # no run disappears
+    assert f"2 of 6 runs did not end ok: {OTHER}, 100 points, shape 1: diverged" in result.caption
+
+
+def test_columns_stand_as_in_the_paper_and_published_numbers_are_marked(tmp_path):
+    for points in ("7", "20", "10%", "dense"):
+        completed(tmp_path, REFERENCE, 1.0, points=points)
+    result = made(tmp_path)
+    assert list(result.table.columns) == ["Family", "Method", "dense", "10%", "20 pts", "7 pts", "Failed"]
+    assert cell(result, "published: DIST with mask", "20 pts") == "4.94"
+    assert cell(result, "published: DeepSDF", "dense") == "5.37"
+    assert cell(result, "published: DIST", "7 pts") == "–"
+    assert "cannot be compared directly" in told(result)
+
+
+@pytest.mark.parametrize("family", table2.PUBLISHED)
+def test_published_numbers_with_a_mask_are_no_worse_than_without(family):
+    """As the paper says of them: a wrong digit would stand out; dense depth has the mask in both."""
+    numbers = table2.PUBLISHED[family]
+    assert all(len(values) == len(POINTS) for values in numbers.values())
+    assert numbers["DIST"][0] == numbers["DIST with mask"][0]
+    assert all(b < a for a, b in zip(numbers["DIST"][1:], numbers["DIST with mask"][1:], strict=True))
+
+
+def test_another_setting_of_the_shared_parts_is_left_out_and_counted(tmp_path):
+    completed(tmp_path, REFERENCE, 1.0)
+    write_run(tmp_path, "table2", OTHER, task="completion", settings={"view": {"resolution": 8}}, minute=0)
+    result = made(tmp_path)
+    assert set(result.data["row"]) == {REFERENCE}
+    assert "Not shown: 1 run" in told(result)
+
+
+def test_the_same_cell_run_again_is_its_newest_run(tmp_path):
+    completed(tmp_path, REFERENCE, 9.0)
+    completed(tmp_path, REFERENCE, 3.0)
+    assert cell(made(tmp_path), REFERENCE, "100 pts") == "3.00"
+
+
+def test_families_and_both_tasks_share_a_table(tmp_path):
+    completed(tmp_path, REFERENCE, 1.0)
+    completed(tmp_path, "DeepSDF samples", 2.0, task="deepsdf")
+    task = {"points": "100", "_target_": "completion"}
+    folder = {"task": task, "index": 0, "dataset": {"path": "/some/where/chairs"}}
+    write_run(
+        tmp_path, "table2", REFERENCE, task="completion", dataset="mesh", metrics={"chamfer_l2": 0.005}, settings=folder
+    )
+    table = made(tmp_path).table
+    own = table[~table["Method"].str.startswith("published")]
+    assert own[["Family", "Method", "100 pts"]].to_numpy().tolist() == [
+        ["sofa", REFERENCE, "1.00"],
+        ["sofa", "DeepSDF samples", "2.00"],
+        ["where/chairs", REFERENCE, "5.00"],
+    ]
+
+
+def test_the_oracle_is_of_the_tables_shapes(tmp_path):
+    completed(tmp_path, REFERENCE, 1.0, index=3)
+    for index, value in ((3, 0.25), (4, 9.0)):
+        fitted(tmp_path, value, index=index)
+    assert cell(made(tmp_path), oracle.LABEL, "100 pts") == "0.250"
+
+
+def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
+    generator = np.random.default_rng(0)
+    size = np.exp(generator.normal(0, 1, 8))
+    for index, value in enumerate(size):
+        completed(tmp_path, REFERENCE, value, index=index)
+        completed(tmp_path, OTHER, 2 * value, index=index)
+    result = made(tmp_path, table2_intervals)
+    data = result.data.set_index("row")
+    for row in (REFERENCE, OTHER):
+        assert data.loc[row, "iqm_low"] < data.loc[row, "iqm"] < data.loc[row, "iqm_high"]
+        assert data.loc[row, "failed_high"] == pytest.approx(0.324, abs=1e-3)  # Wilson, 0 of 8
+    assert data.loc[OTHER, "iqm"] == pytest.approx(2 * data.loc[REFERENCE, "iqm"])
+    assert cell(result, OTHER, "Ratio to the reference") == "2.00 [2.00, 2.00]"
+    assert cell(result, REFERENCE, "Mean rank") == "1.00"
+    assert cell(result, OTHER, "Mean rank") == "2.00"
+    assert p_values(result) == [f"{OTHER} is no better (0 of 8 shapes) than {REFERENCE}: p = 0.0078"]  # 2 / 2^8
+
+
+@pytest.mark.parametrize("missing", ["deleted", "not_run"])
+def test_dropping_failed_runs_improves_no_rank(tmp_path, missing):
+    """The reference does badly on two shapes, the other fails on one of them: without that it may not look better."""
+    for index, value in enumerate((1.0, 1.0, 5.0, 5.0)):
+        completed(tmp_path, REFERENCE, value, index=index)
+    for index, value in enumerate((2.0, 2.0, 2.0, None)):
+        folder = completed(tmp_path, OTHER, value, index=index)
+    before = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+    if missing == "deleted":
+        (folder / "record.json").unlink()
+        folder.rmdir()
+        after = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+    else:
+        text = (folder / "record.json").read_text().replace('"diverged"', '"not_run"')
+        (folder / "record.json").write_text(text)
+        after = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+    assert after >= before
+
+
+def test_a_shape_that_a_row_lacks_is_a_failure_in_its_rank_and_no_part_of_its_ratio(tmp_path):
+    for index, value in enumerate((1.0, 9.0)):
+        completed(tmp_path, REFERENCE, value, index=index)
+    completed(tmp_path, OTHER, 2.0, index=1)
+    result = made(tmp_path, table2_intervals)
+    assert cell(result, OTHER, "Mean rank") == "1.50"
+    assert cell(result, OTHER, "Ratio to the reference") == "0.222"
+    assert "Shapes per cell: 1 to 2." in result.notes
+
+
+def test_a_method_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
+    for index in range(6):
+        for points in ("dense", "100", "20"):
+            completed(tmp_path, REFERENCE, 1.0 + index, index=index, points=points)
+            completed(tmp_path, OTHER, None if points == "20" else 0.5, index=index, points=points)
+    result = made(tmp_path, table2_intervals)
+    assert cell(result, OTHER, "Ratio to the reference").startswith("∞")
+    assert cell(result, OTHER, "Shapes with a failure") == "100 % [61, 100]"
+    assert p_values(result) == [f"{OTHER} is no better (0 of 6 shapes) than {REFERENCE}: p = 0.031"]
+
+
+def test_a_row_without_some_points_has_no_ratio(tmp_path):
+    for points in ("dense", "20"):
+        completed(tmp_path, REFERENCE, 1.0, points=points)
+    completed(tmp_path, OTHER, 2.0, points="dense")
+    result = made(tmp_path, table2_intervals)
+    assert cell(result, OTHER, "Ratio to the reference") == ""
+    assert cell(result, OTHER, "20 pts") == "–"
+
+
+def test_the_points_of_a_shape_are_not_drawn_as_if_they_were_seeds(tmp_path):
+    for points, mine, other in (("dense", 1.0, 4.0), ("20", 4.0, 1.0)):
+        for index in range(6):
+            completed(tmp_path, REFERENCE, mine, index=index, points=points)
+            completed(tmp_path, OTHER, other, index=index, points=points)
+    assert cell(made(tmp_path, table2_intervals), OTHER, "Ratio to the reference") == "1.00 [1.00, 1.00]"
+
+
+@pytest.mark.parametrize("changed", [{"evaluation": {"grid": 8}}, {"split": "validation"}, {"prior": {"shapes": 1}}])
+def test_an_oracle_that_was_judged_otherwise_is_not_shown(tmp_path, changed):
+    completed(tmp_path, REFERENCE, 1.0)
+    settings = {"index": 0, "dataset": {"name": "sofa"}} | changed
+    write_run(
+        tmp_path, "priors", None, task="prior_fit", dataset="sofa", metrics={"chamfer_l2": 1e-4}, settings=settings
+    )
+    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
+
+
+def test_an_oracle_of_some_shapes_is_not_shown(tmp_path):
+    for index in range(2):
+        completed(tmp_path, REFERENCE, 1.0, index=index)
+    fitted(tmp_path, 0.25)
+    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
+
+
+def test_another_setting_under_the_same_label_is_no_part_of_the_row(tmp_path):
+    for index in range(3):
+        completed(tmp_path, REFERENCE, 2.0, index=index, minute=10 + index)
+    task = {"points": "100", "_target_": "completion"}
+    odd = {"task": task, "index": 0, "dataset": {"name": "sofa"}, "renderer": {"epsilon": 1.0}}
+    write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 1}, settings=odd,
+              minute=1)  # fmt: skip
+    result = made(tmp_path)
+    assert cell(result, REFERENCE, "100 pts") == "2.00"
+    assert "Not shown: 1 run" in told(result)
+    write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 1}, settings=odd,
+              minute=50)  # fmt: skip
+    assert cell(made(tmp_path), REFERENCE, "Failed") == "0 of 1"  # the newest setting, alone
+
+
+def test_the_number_of_points_given_is_told_and_orders_the_figure(tmp_path):
+    for points, given in (("10%", 20), ("50", 50), ("dense", 200)):
+        folder = completed(tmp_path, REFERENCE, float(given), points=points)
+        record = json.loads((folder / "record.json").read_text())
+        record["evaluations"] = {"observed": given}
+        (folder / "record.json").write_text(json.dumps(record))
+    result = made(tmp_path)
+    assert "Points given, medians: sofa dense 200, 10% 20." in result.notes
+    assert list(result.figure.axes[0].lines[0].get_xdata()) == [20, 50, 200]
+
+
+def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
+    for points in ("dense", "20"):
+        completed(tmp_path, REFERENCE, 1.0, points=points)
+        completed(tmp_path, OTHER, None, points=points)
+    fitted(tmp_path, 0.2)
+    figure = made(tmp_path).figure
+    (axis,) = [axis for axis in figure.axes if axis.axison]
+    lines = {line.get_label(): line.get_ydata() for line in axis.lines}
+    assert list(lines[REFERENCE]) == [1.0, 1.0]
+    assert all(math.isnan(y) for y in lines[OTHER])
+    assert lines["1.5 times that"][0] == pytest.approx(0.3)
+    assert axis.get_title() == "sofa"
+    assert style.look("dist_mask") != style.look("naive_mask")
+
+
+def fitted(results, chamfer, *, index=0, status="ok", floor=0.2):
+    """A run of the experiment of priors."""
+    metrics = {"chamfer_l2": chamfer / 1000, "floor_chamfer_l2": floor / 1000, "slope_median": 0.98, "slope_p99": 1.2}
+    metrics["distance_error"] = 1e-3
+    return write_run(
+        results, "priors", None, task="prior_fit", dataset="sofa", status=status, metrics=metrics,
+        settings={"index": index, "dataset": {"name": "sofa"}},
+    )  # fmt: skip
+
+
+def test_a_prior_is_shown_beside_its_floor(tmp_path):
+    for index, value in enumerate((0.2, 0.24, 0.5)):
+        folder = fitted(tmp_path, value, index=index)
+    normals, hit = np.zeros((8, 8, 3)), np.ones((8, 8), dtype=bool)
+    images = {"normals": normals, "reference_normals": normals, "hit": hit, "reference_hit": hit}
+    np.savez(folder / "images.npz", **images, gradient_length=np.array([0.9, 1.0, 1.1]))
+    result = made(tmp_path, priors)
+    row = result.table.iloc[0]
+    assert (row["Fit"], row["Floor"], row["Fit / floor"], row["largest"]) == ("0.240", "0.200", "1.20", "2.50")
+    assert row["|gradient|"] == "0.980"
+    heights = [patch.get_height() for patch in result.figure.axes[-1].patches]
+    assert sum(heights) > 0
+    assert result.data["ratio"].tolist() == pytest.approx([1.0, 1.2, 2.5])
+
+
+def test_a_prior_that_failed_on_a_shape_scores_worst_there(tmp_path):
+    fitted(tmp_path, 0.2)
+    fitted(tmp_path, 0.1, index=1, status="crashed")
+    row = made(tmp_path, priors).table.iloc[0]
+    assert row["largest"] == "∞"
+    assert row["Shapes"] == "2"
+
+
+def test_all_files_are_written(tmp_path):
+    completed(tmp_path, REFERENCE, 1.0)
+    fitted(tmp_path, 0.2)
+    written = {path.name for path in write_paper(read_records(tmp_path)[0], tmp_path)}
+    assert written == {"table2.csv", "table2_intervals.csv", "priors.csv"}
+    assert pd.read_csv(tmp_path / "paper" / "table2.csv")["chamfer_l2"].tolist() == [0.001]

@@ -1,0 +1,170 @@
+"""Shape from many views and camera pose, as tables and figures made from run folders whose numbers are known."""
+
+import math
+
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data import oracle
+from bench.report.data.experiments import choose
+from bench.report.data.records import ONE_WAY
+from bench.report.pages import fig6, fig10, table3
+from bench.report.write.paper import write_paper
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+ENDS = ONE_WAY
+
+
+def found(results, experiment, label, chamfer, *, index=0, start=8.0, **task):
+    """A run of shape from many views; None as its Chamfer distance x 1000 is a run that failed."""
+    return write_run(
+        results,
+        experiment,
+        label,
+        task="multiview",
+        status="ok" if chamfer is not None else "not_reached",
+        metrics={} if chamfer is None else {ENDS: chamfer / 1000},
+        metrics_start={ENDS: start / 1000},
+        seconds={"forward": 2.0, "backward": 1.0},
+        evaluations={"value": 5000},
+        settings={"task": {"focal": 1.0, "start_scale": 1.0, **task}, "index": index, "dataset": {"name": "car"}},
+    )
+
+
+def posed(results, label, degrees, success, *, seed=0, task="pose", **changed):
+    """A run of camera pose; None as its success is a run that failed."""
+    return write_run(
+        results,
+        "fig6",
+        label,
+        task=task,
+        status="ok" if success is not None else "nan",
+        metrics={} if success is None else {"success": float(success)},
+        seconds={"forward": 1.5, "backward": 0.5} if task == "pose" else {"forward": 0.25, "backward": 0.0},
+        settings={
+            "task": {"degrees": degrees, "shift": 0.1, "success_degrees": 5.0, "success_distance": 0.05, "starts": 1},
+            "seed": seed,
+            "dataset": {"name": "car"},
+        },
+        **{"seed": seed} | changed,
+    )
+
+
+def made(results, page):
+    return page.make(choose(read_records(results)[0], page.READS[0], results))
+
+
+def row(result, method):
+    return result.table[result.table["Method"] == method].iloc[0]
+
+
+def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
+    for index, (end, start) in enumerate(((1.0, 8.0), (2.0, 4.0), (4.0, 40.0))):
+        found(tmp_path, "table3", "DIST", end, index=index, start=start)
+    result = made(tmp_path, table3)
+    ours = row(result, "DIST")
+    assert (ours["Start"], ours["End"], ours["End / start"]) == ("8.00", "2.00", "0.125")
+    assert ours["Failed"].startswith("0 of 3")
+    assert (ours["Loop"], ours["Evaluations"]) == ("3.00 s", "5.00k")
+    assert row(result, "published: DIST, random start")["End"] == "0.919"
+    assert row(result, "published: PMO, random start")["End"] == "1.19"
+    assert "cannot be compared directly" in told(result)
+
+
+def test_a_run_that_failed_is_infinite_and_told(tmp_path):
+    for index in range(3):
+        found(tmp_path, "table3", "DIST", 1.0, index=index)
+        found(tmp_path, "table3", "Naive", 1.0 if index == 0 else None, index=index)
+    result = made(tmp_path, table3)
+    assert row(result, "Naive")["End"] == "∞"
+    assert row(result, "Naive")["Failed"].startswith("2 of 3")
+    assert "2 of 6 runs did not end ok" in result.caption
+    assert len(result.data) == 6
+
+
+def test_the_oracle_stands_beside_where_all_shapes_have_one(tmp_path):
+    for index in range(2):
+        found(tmp_path, "table3", "DIST", 0.6, index=index)
+        write_run(
+            *(tmp_path, "priors", None),
+            task="prior_fit",
+            metrics={ENDS: 0.0002, "chamfer_l2": 0.0005},
+            settings={"index": index, "dataset": {"name": "car"}},
+        )
+    result = made(tmp_path, table3)
+    assert row(result, "DIST")["End / oracle"] == "3.00"
+    assert row(result, oracle.LABEL)["End"] == "0.200"
+
+
+def test_a_run_that_never_began_costs_no_table(tmp_path):
+    found(tmp_path, "table3", "DIST", 1.0)
+    write_run(
+        *(tmp_path, "table3", "DIST"),
+        task="multiview",
+        status="killed",
+        settings={"task": {"focal": 1.0, "start_scale": 1.0}, "index": 1, "dataset": {"name": "car"}},
+    )
+    result = made(tmp_path, table3)
+    assert row(result, "DIST")["End / start"] == "∞"
+    assert row(result, "DIST")["Loop"] == "3.00 s"
+
+
+def test_rows_may_have_images_of_their_own_size(tmp_path):
+    found(tmp_path, "table3", "DIST", 1.0)
+    write_run(
+        *(tmp_path, "table3", "Naive, 32 x 32"),
+        task="multiview",
+        metrics={ENDS: 0.002},
+        metrics_start={ENDS: 0.004},
+        settings={"task": {"focal": 1.0}, "view": {"resolution": 32}, "dataset": {"name": "car"}},
+    )
+    result = made(tmp_path, table3)
+    assert row(result, "DIST")["End"] == "1.00"
+    assert row(result, "Naive, 32 x 32")["End"] == "2.00"
+    assert "Not shown" not in told(result)
+
+
+def test_figure_10_varies_one_condition_at_a_time(tmp_path):
+    found(tmp_path, "fig10", "DIST", 1.0)
+    found(tmp_path, "fig10", "DIST", 3.0, focal=0.5)
+    found(tmp_path, "fig10", "DIST", 5.0, start_scale=2.0)
+    found(tmp_path, "fig10", "DIST", 9.0, focal=0.5, start_scale=2.0)  # both: in neither panel
+    result = made(tmp_path, fig10)
+    medians = dict(zip(result.table["Condition"], result.table["Median"], strict=True))
+    focal, noise = fig10.PANELS.values()
+    assert medians == {f"{focal}: 0.5": "3.00", f"{focal}: 1": "1.00", f"{noise}: 1": "1.00", f"{noise}: 2": "5.00"}
+    assert len(result.data) == 4
+
+
+def test_poses_found_are_counted_at_each_angle(tmp_path):
+    for seed, success in enumerate((1, 1, 0, None)):
+        posed(tmp_path, "DIST", 30, success, seed=seed)
+        posed(tmp_path, "ICP, point to plane", 30, 1, seed=seed, task="pose_icp")
+    posed(tmp_path, "DIST", 90, 0)
+    result = made(tmp_path, fig6)
+    mine, theirs = row(result, "DIST"), row(result, "ICP, point to plane")
+    assert mine["30°"].startswith("2 of 4 [15")  # a failed run is a pose that was not found
+    assert mine["90°"].startswith("0 of 1")
+    assert theirs["30°"].startswith("4 of 4")
+    assert theirs["90°"] == ""
+    assert (mine["Loop"], theirs["Loop"]) == ("2.00 s", "250 ms")
+    assert "1 of 9 runs did not end ok: DIST, 30 degrees, seed 3: nan (" in result.caption
+    assert "5 degrees and 0.05 scene units" in result.caption
+
+
+def test_all_three_are_written(tmp_path):
+    found(tmp_path, "table3", "DIST", 1.0)
+    found(tmp_path, "fig10", "DIST", None)
+    posed(tmp_path, "DIST", 30, None)
+    written = write_paper(read_records(tmp_path)[0], tmp_path)
+    assert [path.stem for path in written] == ["table3", "fig10", "fig6"]
+    for path in written:
+        assert path.with_suffix(".png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("family", table3.PUBLISHED)
+def test_published_numbers_are_as_the_paper_tells_of_them(family):
+    """A random start costs PMO most; DIST from a random start lies between."""
+    numbers = table3.PUBLISHED[family]
+    assert numbers["PMO"] < numbers["DIST, random start"] < numbers["PMO, random start"]
+    assert all(math.isfinite(number) for number in numbers.values())

@@ -1,0 +1,395 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.integrate import quad
+
+from bench.report.data.statistics import (
+    Interval,
+    bootstrap,
+    compare,
+    dominated,
+    front,
+    holm,
+    hypervolume,
+    hypervolume_interval,
+    interquartile_mean,
+    kaplan_meier,
+    median,
+    paired_bootstrap,
+    rank,
+    wilson,
+)
+
+INF = math.inf
+
+
+def singles(*values: float) -> list[np.ndarray]:
+    """Groups of one seed each."""
+    return [np.array([value], dtype=float) for value in values]
+
+
+def mean(values: np.ndarray) -> np.ndarray:
+    return values.mean(axis=-1)
+
+
+def seen(statistic) -> tuple:
+    """A statistic that notes what it gave for draws."""
+    noted = []
+
+    def noting(values):
+        result = statistic(values)
+        if values.shape[0] > 1:
+            noted.extend(result)
+        return result
+
+    return noting, noted
+
+
+@pytest.mark.parametrize(
+    "values, expected",
+    [
+        ([7], 7),
+        ([1, 4], 2.5),
+        ([12, 0, 3], 4),  # weights 1/4, 1, 1/4 of 1.5
+        ([0, 100, 2, 1], 1.5),
+        ([0, 1, 2, 4, 100], (0.75 * 1 + 2 + 0.75 * 4) / 2.5),
+        ([0, 0, 1, 2, 4, 9], (0.5 * 0 + 1 + 2 + 0.5 * 4) / 3),
+        ([0, 1, 2, INF], 1.5),  # a failure in the outer quarter costs no more than a bad run
+        ([0, 1, INF, INF], INF),
+        ([0, 1, INF], INF),  # of three, each end counts in part
+        ([INF], INF),
+    ],
+)
+def test_interquartile_mean_closed_form(values, expected):
+    assert interquartile_mean(values) == pytest.approx(expected)
+
+
+def test_interquartile_mean_is_a_trimmed_mean_and_reduces_the_last_axis():
+    values = np.random.default_rng(0).lognormal(size=(3, 5, 12))
+    expected = stats.trim_mean(values, 0.25, axis=-1)
+    np.testing.assert_allclose(interquartile_mean(values), expected)
+    assert interquartile_mean(values[1, 2]) == pytest.approx(expected[1, 2])
+
+
+@pytest.mark.parametrize("values", [[], [1.0, math.nan], [1.0, -INF], np.zeros((3, 0))])
+@pytest.mark.parametrize("average", [interquartile_mean, median])
+def test_averages_refuse_what_is_no_error(average, values):
+    with pytest.raises(ValueError, match="values must be"):
+        average(values)
+
+
+ERRORS = st.lists(st.floats(0, 1e6) | st.just(INF), min_size=1, max_size=12)
+
+
+@given(ERRORS, st.data())
+def test_a_run_counted_as_failed_never_improves_an_average(errors, data):
+    lost = data.draw(st.lists(st.booleans(), min_size=len(errors), max_size=len(errors)))
+    fewer = np.where(lost, INF, errors)
+    for average in (interquartile_mean, median):
+        assert average(fewer) >= average(errors)
+
+
+# Populations of one run's errors: what draws [shapes, seeds], and the true interquartile mean. The mean of the middle
+# half is the integral of the quantile function from 1/4 to 3/4, times two.
+def middle(distribution) -> float:
+    return 2 * quad(distribution.ppf, 0.25, 0.75)[0]
+
+
+NORMAL = (lambda generator, n: generator.normal(5, 1, (n, 1)), 5.0)
+LOGNORMAL = (lambda generator, n: generator.lognormal(0, 1, (n, 1)), middle(stats.lognorm(1)))
+SEEDS = (
+    lambda generator, n: np.exp(0.8 * generator.normal(size=(n, 1)) + 0.4 * generator.normal(size=(n, 3))),
+    middle(stats.lognorm(math.sqrt(0.8**2 + 0.4**2))),
+)
+
+
+@pytest.mark.parametrize("n", [8, 16])
+@pytest.mark.parametrize("population, truth", [NORMAL, LOGNORMAL, SEEDS], ids=["normal", "lognormal", "seeds"])
+def test_interval_covers_the_true_interquartile_mean(population, truth, n):
+    generator, covered = np.random.default_rng(n), 0
+    for repetition in range(1000):
+        interval = bootstrap(list(population(generator, n)), interquartile_mean, seed=repetition, draws=300)
+        covered += interval.low <= truth <= interval.high
+    assert 930 <= covered < 990  # of 1000; below 990: not by being much too wide
+
+
+@pytest.mark.parametrize("n", [8, 16])
+def test_paired_interval_covers_the_true_ratio(n):
+    generator, covered, truth = np.random.default_rng(n), 0, 1.25
+    for repetition in range(1000):
+        shapes, noise = generator.normal(size=(n, 1)), generator.normal(size=(2, n, 1))
+        first, second = np.exp(shapes + 0.3 * noise) * np.array([truth, 1])[:, None, None]
+        interval = paired_bootstrap(list(first), list(second), interquartile_mean, seed=repetition, draws=300)
+        covered += interval.low <= truth <= interval.high
+    assert 930 <= covered < 990
+
+
+@pytest.mark.parametrize("level", [0.8, 0.95])
+def test_interval_of_a_mean_is_that_of_student(level):
+    # A draw's mean varies by the shapes' variance (over n) and by the seeds' within a shape. With one seed the widening
+    # makes it mean +- t s / sqrt(n), s with n - 1 in the denominator; a plain percentile would be narrower by 11 %.
+    n, t = 16, stats.t.ppf(0.5 + level / 2, 15)
+    shapes = 10 + stats.norm.ppf((np.arange(n) + 0.5) / n)[:, None]
+    interval = bootstrap(list(shapes), mean, seed=0, level=level, draws=40_000)
+    half = t * shapes.std(ddof=1) / math.sqrt(n)
+    assert interval.value == pytest.approx(10)
+    assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
+
+    groups = shapes + np.array([-2.0, 0, 2])
+    interval = bootstrap(list(groups), mean, seed=0, level=level, draws=40_000)
+    half = t * math.sqrt((shapes.var() + groups[0].var() / 3) / (n - 1))
+    assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
+
+
+def test_a_single_shape_draws_its_seeds_only():
+    seeds = 10 + stats.norm.ppf((np.arange(16) + 0.5) / 16)
+    half = stats.t.ppf(0.975, 15) * seeds.std(ddof=1) / 4
+    interval = bootstrap([seeds], mean, seed=0, draws=40_000)
+    assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
+    alone = bootstrap(singles(3), mean, seed=0)
+    assert alone.value == 3 and math.isnan(alone.low) and math.isnan(alone.high)
+
+
+def test_shapes_with_unequal_numbers_of_seeds():
+    # Draws AA, AB or BA, BB with chances 1/4, 1/2, 1/4 have means 0, 3/4, 1.
+    noting, noted = seen(mean)
+    assert bootstrap([np.zeros(1), np.ones(3)], noting, seed=0, draws=4000).value == 0.75
+    values, counts = np.unique(noted, return_counts=True)
+    assert values.tolist() == [0, 0.75, 1]
+    assert counts / 4000 == pytest.approx([0.25, 0.5, 0.25], abs=0.03)
+
+
+def test_the_seed_decides_the_draws():
+    groups = list(np.random.default_rng(0).lognormal(size=(6, 2)))
+    once, again, other = (bootstrap(groups, interquartile_mean, seed=seed) for seed in (1, 1, 2))
+    assert once == again != other and once.value == other.value
+
+
+@pytest.mark.parametrize("average", [interquartile_mean, median, mean])
+def test_failures_make_infinite_ends(average):
+    assert bootstrap(singles(INF, INF, INF, INF), average, seed=0) == Interval(INF, INF, INF)
+    half = bootstrap(singles(1, 2, 3, 4, 5, INF, INF, INF), average, seed=0)
+    assert half.low < 5 and half.high == INF
+    uneven = bootstrap([np.array([1.0, INF]), np.array([2.0]), np.array([3.0, 4.0])], average, seed=0)
+    assert uneven.low < 2 and uneven.high == INF
+
+
+def test_paired_ratio_of_failures():
+    good, bad = singles(1, 2, 3, 4), singles(INF, INF, INF, INF)
+    for first, second, expected in ((bad, bad, 1), (bad, good, INF), (good, bad, 0), (good, good, 1)):
+        assert paired_bootstrap(first, second, median, seed=0) == Interval(expected, expected, expected)
+    zero = singles(0, 0, 0, 0)
+    assert paired_bootstrap(zero, zero, median, seed=0).value == 1
+    assert paired_bootstrap(good, zero, median, seed=0).low == INF
+
+
+def test_pairing_narrows_the_interval():
+    generator = np.random.default_rng(0)
+    shapes = np.exp(1.5 * generator.normal(size=(16, 1)))
+    first, second = (list(shapes * np.exp(0.1 * generator.normal(size=(16, 3)))) for _ in range(2))
+    paired = paired_bootstrap(first, second, interquartile_mean, seed=0)
+    mixed = paired_bootstrap(first, second[::-1], interquartile_mean, seed=0)  # the same errors of other shapes
+    assert paired.value == pytest.approx(mixed.value)
+    assert 5 * math.log(paired.high / paired.low) < math.log(mixed.high / mixed.low)
+
+
+@pytest.mark.parametrize("second", [singles(1, 2), [np.ones(1), np.ones(2), np.ones(1)]])
+def test_pairing_needs_the_same_runs(second):
+    with pytest.raises(ValueError, match="same shapes and seeds"):
+        paired_bootstrap(singles(1, 2, 3), second, median, seed=0)
+
+
+def test_bad_groups_and_levels():
+    for groups in ([], [np.ones(2), np.ones(0)], [np.array([1.0, math.nan])]):
+        with pytest.raises(ValueError, match="must"):
+            bootstrap(groups, median, seed=0)
+    with pytest.raises(ValueError, match="level"):
+        bootstrap(singles(1, 2), median, seed=0, level=95)
+
+
+@pytest.mark.parametrize("failures, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_wilson_formula(failures, n, level):
+    p, z = failures / n, stats.norm.ppf(0.5 + level / 2)
+    centre, half = p + z**2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    interval = wilson(failures, n, level=level)
+    assert interval.value == p
+    assert (interval.low, interval.high) == pytest.approx(
+        ((centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)), abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("failures, n", [(0, 0), (-1, 3), (4, 3)])
+def test_wilson_needs_runs(failures, n):
+    with pytest.raises(ValueError, match="count the runs"):
+        wilson(failures, n)
+
+
+def test_kaplan_meier_worked_example():
+    # At risk 6, 5, 3, 1: reached at 1 (5/6 remain), at 3 with a run censored then (4/5), at 4 (2/3), censored at 5, 7.
+    survival = kaplan_meier([5, 1, 3, 3, 4, 7], [False, True, True, False, True, False])
+    assert survival.times.tolist() == [0, 1, 3, 4, 5, 7]
+    remaining = np.array([5 / 6, 2 / 3, 4 / 9])
+    assert survival.remaining == pytest.approx([1, *remaining, 4 / 9, 4 / 9])
+    # log-log: S^exp(+-z s), s^2 = sum(d / (r (r - d))) / log(S)^2 over the steps so far (Greenwood)
+    spread = 1.959964 * np.sqrt(np.cumsum([1 / 30, 1 / 20, 1 / 6])) / np.abs(np.log(remaining))
+    assert survival.low[1:4] == pytest.approx(remaining ** np.exp(spread))
+    assert survival.high[1:4] == pytest.approx(remaining ** np.exp(-spread))
+    assert survival.low[0] == survival.high[0] == 1
+
+
+def test_kaplan_meier_where_none_or_all_reach():
+    assert kaplan_meier([3, 2], [False, False]).remaining.tolist() == [1, 1, 1]
+    everyone = kaplan_meier([3.0, 2.0], [True, True])
+    assert (everyone.times.tolist(), everyone.remaining.tolist()) == ([0, 2, 3], [1, 0.5, 0])
+    assert everyone.low[1] < 0.5 < everyone.high[1] and math.isnan(everyone.low[2])
+    assert kaplan_meier([2.0], [True]).remaining.tolist() == [1, 0]
+    assert kaplan_meier([2.0], [False]).remaining.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("times, reached", [([], []), ([1.0], [True, False]), ([INF], [False]), ([-1.0], [True])])
+def test_kaplan_meier_needs_times(times, reached):
+    with pytest.raises(ValueError, match="times"):
+        kaplan_meier(times, reached)
+
+
+def test_holm_worked_example():
+    # In order 0.005 * 4, 0.01 * 3, 0.03 * 2, and 0.04 * 1 raised to the one before.
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.5, 0.9]).tolist() == [1, 1]
+    assert holm([]).tolist() == []
+    with pytest.raises(ValueError, match="p-values"):
+        holm([0.1, math.nan])
+
+
+@pytest.mark.parametrize("n", [1, 5, 12, 40])
+def test_compare_is_the_exact_signed_rank_test(n):
+    generator = np.random.default_rng(n)
+    first, second = generator.normal(0.4, 1, (n, 3)), generator.normal(size=(n, 3))
+    expected = stats.wilcoxon(np.median(first, axis=1) - np.median(second, axis=1), method="exact").pvalue
+    assert compare(list(first), list(second)) == pytest.approx(expected)
+    assert compare(list(second), list(first)) == pytest.approx(expected)
+
+
+def test_compare_with_ties_zeros_and_failures():
+    first, second = singles(3, 1, 5, 2, INF, 9, INF, 4), singles(1, 3, 1, 1, 2, 9, INF, INF)
+    ranks, signs = [2.5, 2.5, 4, 1, 5.5, 5.5], [1, -1, 1, 1, 1, -1]  # of 2, -2, 4, 1, inf, -inf; two zeros left out
+    extreme = abs(np.dot(ranks, signs))
+    flips = [abs(np.dot(ranks, flip)) >= extreme for flip in itertools.product((-1, 1), repeat=6)]
+    assert compare(first, second) == pytest.approx(np.mean(flips))
+    assert compare(singles(1, INF), singles(1, INF)) == 1
+    assert compare(singles(*[INF] * 6), singles(*range(6))) == 2 / 64
+    with pytest.raises(ValueError, match="same shapes"):
+        compare(singles(1), singles(1, 2))
+
+
+def test_rank_worked_example():
+    table = {
+        "a": {"cow": 1.0, "car": 2.0, "sofa": None, "hat": INF},
+        "b": {"cow": 1.0, "car": 1.0, "sofa": math.nan},
+        "c": {"cow": 3.0, "sofa": 5.0},
+    }
+    # cow 1.5, 1.5, 3; car 2, 1, fails; sofa fails, fails, 1; a hat nobody makes does not count; failing has rank 3
+    assert rank(table) == pytest.approx({"a": (1.5 + 2 + 3) / 3, "b": (1.5 + 1 + 3) / 3, "c": (3 + 3 + 1) / 3})
+    assert rank({"a": {"cow": None}, "b": {}}) == {"a": 2, "b": 2}
+    assert rank({}) == {}
+
+
+RUN = st.sampled_from([0.0, 1.0, 2.0, 3.0]) | st.sampled_from([None, INF, math.nan])
+TABLE = st.dictionaries(st.sampled_from("abcd"), st.dictionaries(st.integers(0, 4), RUN), min_size=1)
+
+
+@given(TABLE, st.data())
+def test_leaving_out_runs_never_improves_a_rank(table, data):
+    method = data.draw(st.sampled_from(sorted(table)))
+    runs = table[method]
+    failed = [shape for shape, error in runs.items() if error is None or not math.isfinite(error)]
+    gone = data.draw(st.sets(st.sampled_from(failed))) if failed else set()
+    for kept in (
+        {shape: error for shape, error in runs.items() if shape not in gone},
+        {shape: None if shape in gone else error for shape, error in runs.items()},
+    ):
+        assert rank({**table, method: kept}) == rank(table)
+    hidden = data.draw(st.sets(st.sampled_from(sorted(runs)))) if runs else set()  # and what succeeded no more
+    kept = {shape: error for shape, error in runs.items() if shape not in hidden}
+    assert rank({**table, method: kept})[method] >= rank(table)[method]
+
+
+def test_dominated():
+    costs, errors = [1, 2, 2, 3, 3, 1], [3, 2, 4, 1, 1, INF]
+    assert dominated(costs, errors).tolist() == [False, False, True, False, False, True]  # equal points: neither
+    assert dominated(np.array([[1, 2], [2, 1]]), np.array([[1, 1], [2, 2]])).tolist() == [[False, True], [True, False]]
+
+
+def point(costs, errors) -> tuple:
+    return singles(*costs), singles(*errors)
+
+
+def test_front_of_certain_cases():
+    ones = (1, 1, 1, 1, 1)
+    points = [
+        point(ones, (1, 20, 300, 4000, 50000)),
+        point(ones, (1.1, 22, 330, 4400, 55000)),  # worse on every shape, though shapes differ far more
+        point((2, 2, 2, 2, 2), (0.5, 10, 150, 2000, 25000)),
+        point((0.1, 0.1, 0.1, 0.1, 0.1), (INF, INF, INF, INF, INF)),
+        point((INF, INF, INF, INF, INF), (0.1, 0.1, 0.1, 0.1, 0.1)),
+    ]
+    assert front(points, seed=0) == [1, 0, 1, 0, 0]
+
+
+def test_front_of_uncertain_cases():
+    # The first one's median of three draws is 1, not 3, if two or three of them are of two shapes of three: 20 of 27.
+    chances = front([point((1, 1, 1), (1, 1, 3)), point((1, 1, 1), (2, 2, 2))], seed=0, draws=8000)
+    assert chances == pytest.approx([20 / 27, 7 / 27], abs=0.02)
+    # Mirror images: who wins is tossed, and where medians tie both are on the front.
+    spread = np.random.default_rng(0).uniform(size=10)
+    mirrored = np.append(spread, -spread)
+    chances = front([point(np.ones(20), 2 + mirrored), point(np.ones(20), 2 - mirrored)], seed=0)
+    assert chances == pytest.approx([0.5, 0.5], abs=0.08)
+    # A failure on one shape of two: the median is infinite if it is drawn at all.
+    assert front([point((1, 1), (1, INF))], seed=0, draws=8000) == pytest.approx([0.25], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "costs, errors, expected",
+    [
+        ([10], [0.01], 1 * 2),
+        ([1, 10], [0.1, 0.01], 1 * 1 + 1 * 2),
+        ([10, 1], [0.01, 0.1], 3),
+        ([1, 10, 10, 20], [0.1, 0.01, 0.05, 0.5], 3),  # dominated points add nothing
+        ([1000, 1, INF, 1], [0.001, 10, 0.1, INF], 0),  # beyond the reference
+    ],
+)
+def test_hypervolume(costs, errors, expected):
+    assert hypervolume(costs, errors, reference=(100, 1)) == pytest.approx(expected)
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 1e3), st.floats(0.01, 1e3)), min_size=2, max_size=6))
+def test_hypervolume_of_more_points_is_no_less_and_at_most_the_sum(points):
+    costs, errors = np.array(points).T
+    area = hypervolume(costs, errors, reference=(100, 10))
+    fewer, last = (hypervolume(costs[i], errors[i], reference=(100, 10)) for i in (slice(-1), slice(-1, None)))
+    assert max(fewer, last) - 1e-9 <= area <= fewer + last + 1e-9
+
+
+@pytest.mark.parametrize("costs, errors, reference", [([0], [1], (9, 9)), ([1], [0], (9, 9)), ([1], [1], (9, INF))])
+def test_hypervolume_needs_logarithms(costs, errors, reference):
+    with pytest.raises(ValueError, match="above 0"):
+        hypervolume(costs, errors, reference=reference)
+
+
+def test_hypervolume_interval_is_that_of_the_median():
+    # One setting of cost 10: the area is 1 (to the cost of 100) times the digits between its median error and 1.
+    errors = 10 ** np.random.default_rng(0).uniform(-4, -1, (9, 2))
+    interval = hypervolume_interval([(list(np.full((9, 2), 10.0)), list(errors))], reference=(100, 1), seed=3)
+    expected = bootstrap(list(errors), median, seed=3)
+    assert (interval.value, interval.high, interval.low) == pytest.approx(
+        (-math.log10(expected.value), -math.log10(expected.low), -math.log10(expected.high))
+    )
+    failed = [point((1, 1), (INF, INF))]
+    assert hypervolume_interval(failed, reference=(100, 1), seed=3) == Interval(0, 0, 0)

@@ -1,0 +1,134 @@
+"""Command lines in this process and in processes of their own, and the small runs that the tests of runs start."""
+
+import contextlib
+import io
+import json
+import multiprocessing.forkserver
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+from hydra.core.global_hydra import GlobalHydra
+
+from bench.__main__ import main
+from bench.run import process
+
+ROOT = Path(__file__).parents[2]
+FAILING = (
+    "renderer=custom", "renderer._target_=tests.failing.Failing", "scale=smoke", "task.optimiser.iterations=4",
+    "view.resolution=12", "task.points=20", "evaluation.grid=16", "evaluation.points=100", "evaluation.picture=null",
+    "evaluation.every=null", "threads=1",
+)  # fmt: skip
+PATIENCE = 120.0  # seconds that a test waits for what must come; it is there to end a test that hangs
+
+
+class Outcome(NamedTuple):
+    """What a command line left: its exit status, standard output and standard error."""
+
+    code: int
+    out: str
+    err: str
+
+
+def record_of(out: str) -> dict:
+    """The record in the run folder that is the last line of an output."""
+    return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+
+
+def command(*arguments: str) -> Outcome:
+    """A command line in this process; its runs have processes of their own, unless it says isolation=off."""
+    GlobalHydra.instance().clear()
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.dict(os.environ),  # what the command sets is put back
+        mock.patch.object(sys, "argv", ["bench", *arguments]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = main()
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+class Driver:
+    """A command line in a process of its own, forked from the server of processes, which has loaded torch already."""
+
+    def __init__(self, output: Path, arguments: tuple[str, ...]) -> None:
+        output.mkdir(parents=True)
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["bench.run.child"])
+        self.output, self.process = output, context.Process(target=_drive, args=(output, arguments))
+        self.process.start()
+
+    def send(self, number: signal.Signals) -> Outcome:
+        """Sends a signal, unless it has ended, and waits for the end."""
+        assert self.process.pid is not None
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.process.pid, number)
+        return self.ended()
+
+    def ended(self) -> Outcome:
+        """Waits for the end; the exit status is negative where a signal ended it."""
+        self.process.join(PATIENCE)
+        assert self.process.exitcode is not None, "the driver does not end"
+        return Outcome(self.process.exitcode, *((self.output / name).read_text() for name in ("out", "err")))
+
+
+def _drive(output: Path, arguments: tuple[str, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(output / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
+    server = multiprocessing.forkserver._forkserver
+    server.ensure_running = lambda: None  # its runs come from the server that it came from; Python would start another
+    process.GRACE = PATIENCE  # a run that is stopped on a busy machine takes longer to say how far it came
+    sys.argv = ["bench", *arguments]
+    sys.exit(main())
+
+
+@contextlib.contextmanager
+def driver(output: Path, *arguments: str) -> Iterator[Driver]:
+    """A driver, which is killed if it is still there at the end.
+
+    Args:
+        output: a folder that is made for its standard output and standard error.
+        arguments: of its command line.
+    """
+    started = Driver(output, arguments)
+    try:
+        yield started
+    finally:
+        started.process.kill()
+        started.process.join()
+
+
+def wait_for(ready: Callable[[], object], running: Driver | None = None) -> None:
+    """Waits until something is so; fails where the driver that should see to it ends before."""
+    latest = time.monotonic() + PATIENCE
+    while not ready():
+        if running is not None and not running.process.is_alive():
+            assert ready(), (running.output / "err").read_text()
+            return
+        assert time.monotonic() < latest, "it does not come"
+        time.sleep(0.02)
+
+
+def lines_of_curves(results: Path) -> int:
+    """How many iterations the runs of a results folder have done, those under way with them."""
+    return sum(path.read_bytes().count(b"\n") for path in results.glob("runs/*/curve.jsonl"))
+
+
+def at_work(results: Path) -> list[int]:
+    """Processes that hold a log of a run open."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            links = [str(link.readlink()) for link in (place / "fd").iterdir()]
+        except OSError:
+            continue
+        if any(link.startswith(str(results)) and link.endswith("log.txt") for link in links):
+            found.append(int(place.name))
+    return found

@@ -1,0 +1,93 @@
+"""Whatever a user types gives one clear line or a run that holds it: never a traceback, never a silent default."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from bench.__main__ import main
+from bench.config import CONF, register
+from bench.run.command import USAGE, _dotted
+from tests.run.driving import FAILING
+
+LIMITS = ("time_limit=3", "memory_limit=2")
+FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit", "rerun", "tracker", "verbose", "label"}
+GROUPS = ("task", "renderer", "dataset", "prior", "scale")
+
+
+def keys() -> list[str]:
+    register()
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        found = _dotted(compose("config"))
+    return [key for key in found if key.split(".")[0] not in FIXED and "_target_" not in key]
+
+
+KEYS = keys()
+NUMBERS = st.integers(-3, 40) | st.sampled_from([0.0, 0.5, -1.5, 1e-9, 1e9, 10**30, math.inf, -math.inf, math.nan])
+WORDS = st.sampled_from(
+    ["true", "false", "null", "abc", "dist", "sofa", "''", "[]", "[1,2]", "{a:1}", "[0,360]", "10%"]
+)
+ODD = st.text(st.characters(exclude_characters="\x00", exclude_categories=("Cs", "Cc")), min_size=1, max_size=8)
+VALUES = NUMBERS.map(str) | WORDS | ODD
+OVERRIDES = st.builds("{}={}".format, st.sampled_from(KEYS), VALUES) | st.builds(
+    "{}{}={}".format, st.sampled_from(["", "+", "~", "++"]), st.sampled_from([*KEYS, *GROUPS, "a.b", "sed"]), VALUES
+)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+def check(capsys, monkeypatch, results: Path, overrides: list[str]) -> None:
+    GlobalHydra.instance().clear()
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["bench", *FAILING_DIST, *LIMITS, *overrides, f"results_dir={results}"])
+    code = main()
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err, overrides
+    if code == USAGE:
+        assert len(err.strip().splitlines()) == 1, (overrides, err)
+        assert err.startswith("error: "), (overrides, err)
+        return
+    assert code in (0, 1), (overrides, code, err)
+    record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+    assert record["status"] == "ok" or record["reason"], overrides
+    assert "\n" not in record["reason"], overrides
+    for override in OverridesParser.create().parse_overrides(overrides[-1:]):  # the last word on a key holds
+        key = override.key_or_group
+        if override.is_delete() or key in GROUPS or OmegaConf.select(OmegaConf.create(record["config"]), key) is None:
+            continue
+        found, typed = OmegaConf.select(OmegaConf.create(record["config"]), key), override.value()
+        same = str(found) == str(typed) or str(found).lower() == str(typed).lower()
+        number = isinstance(found, int | float) and float(found) == pytest.approx(float(typed), nan_ok=True)
+        assert same or number or OmegaConf.is_config(found), (override.input_line, found)
+
+
+FAILING_DIST = tuple(argument for argument in FAILING if not argument.startswith("renderer"))
+RELAXED = settings(
+    deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None, print_blob=False
+)
+
+
+@settings(RELAXED, max_examples=20)
+@given(overrides=st.lists(OVERRIDES, min_size=1, max_size=2))
+def test_twenty_command_lines(capsys, monkeypatch, results, overrides):
+    check(capsys, monkeypatch, results, overrides)
+
+
+@pytest.mark.slow
+@seed(3)
+@settings(RELAXED, max_examples=300, derandomize=False)
+@given(overrides=st.lists(OVERRIDES, min_size=1, max_size=2))
+def test_three_hundred_command_lines(capsys, monkeypatch, results, overrides):
+    check(capsys, monkeypatch, results, overrides)

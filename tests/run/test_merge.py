@@ -1,0 +1,141 @@
+"""Results of several machines become one folder: whatever the order, and however often."""
+
+import json
+import shutil
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.merge.__main__ import main, merge
+from bench.records.read import read_records
+from bench.records.record import Record, RunStatus
+from bench.run.sweep import Plan, PlannedCell
+
+CELLS = ("completion-dist-sofa-1", "completion-dist-sofa-2", "completion-dvr-car-3")
+
+
+def write_run(
+    results: Path, cell: str, status: str = "ok", started: str = "2026-01-01T00:00:00+00:00", **changed
+) -> Path:
+    folder = results / "runs" / cell
+    folder.mkdir(parents=True)
+    record = Record(cell, "completion", "dist", "sofa", 0, {"seed": 0}, started=started, asked=started, **changed)
+    record.status = RunStatus(status)
+    record.write(folder)
+    (folder / "curve.jsonl").write_text(f'{{"iteration": 0, "total": {len(started)}}}\n')
+    return folder
+
+
+def content(results: Path) -> dict[str, bytes]:
+    """All files but the page, whose folder's name stands in it, and locks."""
+    return {
+        str(path.relative_to(results)): path.read_bytes()
+        for path in results.rglob("*")
+        if path.is_file() and path.name != "index.html" and ".locks" not in path.parts
+    }
+
+
+def test_runs_of_different_cells_are_joined(tmp_path, capsys):
+    for name, cell in zip("abc", CELLS, strict=True):
+        write_run(tmp_path / name, cell)
+    assert main([*(str(tmp_path / name) for name in "abc"), "--into", str(tmp_path / "d")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "d" / "index.html")]
+    records, problems = read_records(tmp_path / "d")
+    assert problems == []
+    assert {record["id"] for record in records} == set(CELLS)
+    for name, cell in zip("abc", CELLS, strict=True):
+        assert content(tmp_path / name / "runs" / cell) == content(tmp_path / "d" / "runs" / cell)
+
+
+@st.composite
+def machines(draw):
+    """What three machines have of two cells: nothing, or a run with one of a few ends and times."""
+    ends = st.sampled_from(["ok", "timeout", "killed", "crashed"])
+    times = st.sampled_from(["2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00"])
+    run = st.none() | st.tuples(ends, times, st.sampled_from([1.0, 2.0]))
+    return [[draw(run) for _ in range(2)] for _ in range(3)]
+
+
+@settings(max_examples=40)  # each merges in all orders, twice
+@given(machines())
+def test_the_order_does_not_matter_and_a_second_time_changes_nothing(tmp_path_factory, found):
+    base = tmp_path_factory.mktemp("merge")
+    for name, cells in zip("abc", found, strict=True):
+        (base / name / "runs").mkdir(parents=True)
+        for cell, run in zip(CELLS, cells, strict=False):
+            if run is not None:
+                write_run(base / name, cell, run[0], run[1], metrics={"chamfer_l2": run[2]})
+    results = []
+    for order in permutations("abc"):
+        into = base / f"into-{''.join(order)}"
+        merge([base / name for name in order], into)
+        results.append(content(into))
+        merge([base / name for name in order], into)
+        assert content(into) == results[-1]
+    stepwise = base / "stepwise"
+    for name in "cab":
+        merge([base / name], stepwise)
+    assert all(result == results[0] for result in [*results, content(stepwise)])
+    for number, cell in enumerate(CELLS[:2]):
+        runs = {cells[number] for cells in found if cells[number] is not None}
+        assert len([name for name in results[0] if name.endswith("record.json") and cell in name]) == len(runs)
+        if any(run[0] == "ok" for run in runs):
+            assert json.loads(results[0][f"runs/{cell}/record.json"])["status"] == "ok"
+
+
+def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsys):
+    write_run(tmp_path / "a", CELLS[0], "timeout", "2026-01-02T00:00:00+00:00")
+    write_run(tmp_path / "b", CELLS[0], "ok", "2026-01-01T00:00:00+00:00")
+    main([str(tmp_path / "a"), str(tmp_path / "b"), "--into", str(tmp_path / "d")])
+    (line, _) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"{CELLS[0]}: 2 runs; kept ok of 2026-01-01")
+    assert "set aside in earlier: timeout of 2026-01-02" in line
+    assert len(list((tmp_path / "d" / "earlier").iterdir())) == 1
+
+
+def test_the_same_run_asked_for_later_is_no_conflict(tmp_path, capsys):
+    folder = write_run(tmp_path / "a", CELLS[0])
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    record = json.loads((folder / "record.json").read_text())
+    (folder / "record.json").write_text(json.dumps(record | {"reused": True, "asked": "2026-03-01T00:00:00+00:00"}))
+    main([str(tmp_path / "a"), str(tmp_path / "b"), "--into", str(tmp_path / "d")])
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    assert read_records(tmp_path / "d")[0][0]["asked"].startswith("2026-03-01")
+    assert not (tmp_path / "d" / "earlier").exists()
+
+
+def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
+    cells = [PlannedCell(cell, [], "completion", "dist", "sofa", 0, {"seed": 0}) for cell in CELLS]
+    Plan("table-1", tmp_path / "a", cells, "2026-01-01T00:00:00+00:00").write()
+    write_run(tmp_path / "a", CELLS[0])
+    write_run(tmp_path / "b", CELLS[1])
+    merge([tmp_path / "a", tmp_path / "b"], tmp_path / "d")
+    statuses = {record["id"]: record["status"] for record in read_records(tmp_path / "d")[0]}
+    assert statuses == {CELLS[0]: "ok", CELLS[1]: "ok", CELLS[2]: "not_run"}
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[1]", '{"schema": 99}'])
+def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path, damage):
+    folder = write_run(tmp_path / "a", CELLS[0])
+    (folder / "record.json").write_text(damage)
+    write_run(tmp_path / "b", CELLS[0], "killed")
+    merge([tmp_path / "a", tmp_path / "b"], tmp_path / "d")
+    assert [record["status"] for record in read_records(tmp_path / "d")[0]] == ["killed"]
+    (kept,) = (tmp_path / "d" / "earlier").iterdir()
+    assert (kept / "record.json").read_text() == damage
+
+
+def test_what_is_no_results_folder_is_told(tmp_path, capsys):
+    assert main([str(tmp_path), "--into", str(tmp_path / "d")]) == 1
+    assert "is not a results folder" in capsys.readouterr().err
+
+
+def test_a_place_within_what_is_joined_is_refused(tmp_path, capsys):
+    write_run(tmp_path / "a", CELLS[0])
+    before = content(tmp_path / "a")
+    assert main([str(tmp_path / "a"), "--into", str(tmp_path / "a" / "runs" / "x")]) == 1
+    assert "lies within" in capsys.readouterr().err
+    assert content(tmp_path / "a") == before

@@ -1,0 +1,147 @@
+"""A sweep that is cut short goes on where it was; what is finished is reused, and nothing is lost or run twice."""
+
+import json
+import random
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from bench.records.identity import _package
+from bench.records.read import read_records
+from tests.run.driving import FAILING, ROOT, command, driver, record_of, wait_for
+
+
+def results_of(results: Path) -> dict[str, dict]:
+    """All that a sweep came to, but for times and machines, by cell."""
+    records, problems = read_records(results)
+    assert problems == []
+    timeless = ("id", "task", "renderer", "dataset", "seed", "status", "reason", "config_hash", "code")
+    timeless += ("metrics", "metrics_start", "evaluations", "flops", "definitions", "scene")
+    return {record["id"]: {name: record[name] for name in timeless} for record in records}
+
+
+def ended(results: Path) -> int:
+    """How many cells of a sweep have come to an end."""
+    return sum(bool(record.get("ended")) for record in read_records(results)[0]) if under_way(results) else 0
+
+
+def killed_and_resumed(tmp_path: Path, cells: int, kills: int, seed: int) -> None:
+    """A sweep that is killed again and again, each time when one cell more has ended or is under way."""
+    whole, broken, draw = tmp_path / "whole", tmp_path / "broken", random.Random(seed)
+    arguments = ("-m", *FAILING, "+renderer.how=not,raise", f"seed={','.join(map(str, range(cells // 2)))}")
+    command(*arguments, f"results_dir={whole}")
+    for number in range(kills):
+        begun = ended(broken)
+        with driver(tmp_path / f"driver {number}", *arguments, f"results_dir={broken}") as running:
+            moment, most = draw.choice([ended, under_way]), begun + cells // (kills + 1)
+            wait_for(lambda moment=moment, most=most: moment(broken) > min(most, cells - 1), running)
+            time.sleep(draw.uniform(0.0, 0.3))  # anywhere within a cell
+            running.send(draw.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]))
+    done = command(*arguments, f"results_dir={broken}")
+    assert f"{cells} planned" in done.out
+    assert len(results_of(whole)) == cells
+    assert results_of(broken) == results_of(whole)
+
+
+def under_way(results: Path) -> int:
+    """How many cells of a sweep have begun."""
+    return len(list(results.glob("runs/*/record.json")))
+
+
+def test_a_sweep_whose_driver_is_killed_goes_on_where_it_was(tmp_path):
+    killed_and_resumed(tmp_path, cells=4, kills=2, seed=0)
+
+
+@pytest.mark.slow
+def test_a_sweep_of_30_killed_at_20_moments_ends_as_one_that_was_not(tmp_path):
+    killed_and_resumed(tmp_path, cells=30, kills=20, seed=1)
+
+
+def test_what_is_finished_is_reused_and_failures_are_tried_again_on_request(isolated, tmp_path):
+    times = []
+    for more in ((), (), ("rerun=failed",), ("rerun=all",)):
+        isolated("-m", *FAILING, "+renderer.how=not,raise", *more)
+        records = {r["config"]["renderer"]["how"]: r for r in read_records(tmp_path / "r")[0]}
+        times.append(
+            {how: (record["ended"], record["seconds"]["total"], record["reused"]) for how, record in records.items()}
+        )
+    first, again, failed, everything = times
+    assert [first["not"][2], first["raise"][2]] == [False, False]
+    assert {how: value[:2] for how, value in again.items()} == {how: value[:2] for how, value in first.items()}
+    assert [again["not"][2], again["raise"][2]] == [True, True]
+    assert failed["not"][:2] == first["not"][:2]
+    assert failed["raise"][1] != first["raise"][1]
+    assert everything["not"][1] != first["not"][1]
+    assert len(list((tmp_path / "r" / "earlier").iterdir())) == 3  # what was run again is kept
+
+
+def test_other_code_is_no_reason_to_reuse(isolated, tmp_path, monkeypatch):
+    package = tmp_path / "theirs"
+    package.mkdir()
+    shutil.copy(ROOT / "tests" / "failing.py", package / "mypkg.py")
+    monkeypatch.syspath_prepend(str(package))
+    outputs = []
+    for change in ("", "", "\n# another line\n"):
+        with (package / "mypkg.py").open("a") as file:
+            file.write(change)
+        _package.cache_clear()  # a command looks at the code once
+        outputs.append(isolated(*FAILING, "renderer._target_=mypkg.Failing", "+renderer.how=not").out)
+    assert ["reused: the run of" in output for output in outputs] == [False, True, False]
+    assert len({output.splitlines()[-1] for output in outputs}) == 1
+
+
+def test_two_launches_at_once_run_a_cell_once(tmp_path):
+    arguments = (*FAILING, "+renderer.how=not", f"results_dir={tmp_path / 'r'}")
+    with driver(tmp_path / "a", *arguments) as first, driver(tmp_path / "b", *arguments) as second:
+        outputs = [first.ended().out, second.ended().out]
+    assert len({output.splitlines()[-1] for output in outputs}) == 1
+    assert sorted("reused: the run of" in output for output in outputs) == [False, True]
+    assert len(read_records(tmp_path / "r")[0]) == 1
+
+
+def test_what_had_not_quite_ended_is_not_reused(isolated, tmp_path):
+    """The driver may be killed after a run's last word, and before it wrote what that came to."""
+    isolated(*FAILING, "+renderer.how=not")
+    (path,) = (tmp_path / "r").glob("runs/*/record.json")
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"ended": ""}))
+    _, out, _ = isolated(*FAILING, "+renderer.how=not")
+    assert "reused" not in out
+    assert json.loads(path.read_text())["ended"]
+
+
+@pytest.mark.parametrize("damage", ["", "{", '{"schema": 99}', '{"schema": 1, "asked": null}', "[" * 100_000])
+def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path, damage):
+    isolated(*FAILING, "split=tst")  # fails at once
+    (path,) = (tmp_path / "r").glob("runs/*/record.json")
+    path.write_text(damage)
+    code, out, err = isolated(*FAILING, "split=tst")
+    assert code == 1
+    assert "Traceback" not in out + err
+    assert json.loads(path.read_text())["status"] == "crashed"
+    (aside,) = (tmp_path / "r" / "earlier").iterdir()
+    assert (aside / "record.json").read_text() == damage
+
+
+def test_a_run_that_failed_by_a_limit_is_run_again_under_another(isolated):
+    found = []
+    for limit in (1, 1, 2):
+        record = record_of(isolated(*FAILING, "+renderer.how=loop", f"time_limit={limit}").out)
+        assert f"more than time_limit={limit} s" in record["reason"]
+        found.append((record["status"], record["reused"]))
+    assert found == [("timeout", False), ("timeout", True), ("timeout", False)]
+
+
+def test_code_that_a_package_without_an_init_holds_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "space" / "inner").mkdir(parents=True)
+    module = tmp_path / "space" / "inner" / "mine.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = set()
+    for text in ("a = 1", "a = 2"):
+        module.write_text(text)
+        _package.cache_clear()
+        found.add(_package("space"))
+    assert len(found - {""}) == 2

@@ -1,0 +1,248 @@
+"""Shape priors: that a small one learns, how they are kept, and that the shipped ones belong to this code."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from bench.config import CONF, build, register
+from bench.setup.inputs import prior_settings
+from bench.shape_prior import store as prior_store
+from bench.shape_prior.autodecoder import NetworkSettings, PriorSettings, distance_samples, fit_error, train
+from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe, shipped_records
+from datasets.dataset import Split
+from datasets.extract import extract
+from datasets.families import FAMILIES
+from datasets.mesh import Mesh
+
+CPU = torch.device("cpu")
+SETTINGS = PriorSettings(
+    network=NetworkSettings(layers=3, width=48, code_length=4, skip=1, narrow=False),
+    shapes=3,
+    samples=600,
+    steps=400,
+    shapes_per_step=3,
+    points_per_step=256,
+    learning_rate=5e-3,
+    beta2=0.99,
+    code_sigma=0.1,
+    code_penalty=1e-4,
+    surface_width=0.05,
+    seed=0,
+)
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes from flat to tall; unseen ones lie between those of the training part."""
+
+    name: str = "boxes"
+    widest: float = 0.5
+
+    def mesh(self, split, index):
+        height = [0.2, 0.5, 0.8][index % 3] + (0.0 if split is Split.TRAIN else 0.05)
+        made = trimesh.creation.box((2 * self.widest, 2 * height, 0.6))
+        return Mesh(np.array(made.vertices), np.array(made.faces))
+
+    def identity(self):
+        return {"name": self.name, "widest": self.widest}
+
+
+def silent(phase, done, total, loss=None):
+    """No progress is shown."""
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with a prior that was trained once, and what the call gave."""
+    folder = tmp_path_factory.mktemp("a cache") / "priors"
+    return folder, prior_for(Boxes(), SETTINGS, folder, CPU, silent)
+
+
+def never(*_, **__):
+    raise AssertionError("a prior was trained although there is one")
+
+
+def test_a_prior_learns_its_shapes(kept):
+    _, prior = kept
+    samples = distance_samples(Boxes(), Split.TRAIN, replace(SETTINGS, seed=9), 3, silent)
+    fitted, mean_shape = fit_error(prior.decoder, samples), fit_error(prior.decoder, samples, steps=0)
+    zero = torch.zeros(3, 4)
+    assert mean_shape > 0.05
+    assert fitted < 0.25 * mean_shape
+    with torch.no_grad():
+        own, mean = ((prior.decoder.at(code)(samples.points) - samples.distances).abs() for code in (prior.codes, zero))
+    assert own.mean() < 0.35 * mean.mean()  # anywhere, so that a field that is zero around the surface does not do
+    assert own[samples.distances.abs() < 0.02].mean() < 0.25 * mean_shape
+
+
+def test_samples_are_signed_distances_of_the_mesh():
+    samples = distance_samples(Boxes(), Split.TRAIN, SETTINGS, 2, silent)
+    half = torch.tensor([[0.5, 0.2, 0.3], [0.5, 0.5, 0.3]])
+    beyond = samples.points.abs() - half[:, None]
+    exact = beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0)
+    assert samples.points.shape == (2, 600, 3)
+    assert torch.allclose(samples.distances, exact, atol=1e-5)
+    near = (samples.distances.abs() < 0.03).float().mean()
+    assert 0.5 < near < 0.8  # half of the samples lie close to the surface, a third around it
+
+
+def test_training_follows_its_seed():
+    short = replace(SETTINGS, steps=3, samples=200)
+    samples = distance_samples(Boxes(), Split.TRAIN, short, 3, silent)
+    first, again, other = (train(samples, replace(short, seed=seed), CPU, silent) for seed in (0, 0, 1))
+    assert torch.equal(first.codes, again.codes)
+    assert torch.equal(first.decoder.last.weight, again.decoder.last.weight)
+    assert not torch.equal(first.codes, other.codes)
+
+
+def test_a_prior_is_kept_with_its_record(kept):
+    folder, prior = kept
+    key = prior_key(Boxes(), SETTINGS)
+    assert sorted(path.name for path in folder.glob("[!.]*")) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
+    record = json.loads((folder / f"boxes-{key}.json").read_text())
+    assert record["key"] == key
+    assert record["dataset"] == Boxes().identity()
+    assert record["settings"] == asdict(SETTINGS)
+    assert record["surface_error"]["validation"] < record["surface_error"]["mean_shape"]
+    assert record["parameters"] == sum(p.numel() for p in prior.decoder.parameters())
+    assert prior.codes.shape == (3, 4)
+
+
+@dataclass(frozen=True)
+class OneBox(Boxes):
+    """A box; to ask for an unseen one is a mistake."""
+
+    def mesh(self, split, index):
+        assert split is Split.TRAIN
+        return super().mesh(split, index)
+
+
+def test_a_prior_of_one_shape_is_evaluated_on_that_shape_at_its_code(tmp_path, monkeypatch):
+    monkeypatch.setattr(prior_store, "fit_error", never)
+    settings = replace(SETTINGS, shapes=1, shapes_per_step=1)
+    path = make_prior(OneBox(), settings, tmp_path, CPU, silent)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert set(record["surface_error"]) == {"training"}
+    prior = prior_for(OneBox(), settings, tmp_path, CPU, silent)
+    assert prior.codes.shape == (1, 4)
+    samples = distance_samples(OneBox(), Split.TRAIN, settings, 1, silent)
+    near = samples.distances[0].abs() < 0.02
+    with torch.no_grad():
+        error = (prior.decoder.at(prior.codes[0])(samples.points[0]) - samples.distances[0]).abs()
+    assert record["surface_error"]["training"] == pytest.approx(error[near].mean().item(), rel=1e-4)
+    assert record["surface_error"]["training"] < 0.02
+    assert record["settings"]["shapes"] == 1
+
+
+def test_a_prior_of_one_shape_has_another_key():
+    assert prior_key(Boxes(), SETTINGS) != prior_key(Boxes(), replace(SETTINGS, shapes=1))
+
+
+def test_a_kept_prior_is_loaded_and_not_trained_again(kept, monkeypatch):
+    folder, prior = kept
+    monkeypatch.setattr(prior_store, "train", never)
+    again = prior_for(Boxes(), SETTINGS, folder, CPU, silent)
+    points = torch.rand(100, 3)
+    code = torch.full((4,), 0.1)
+    assert torch.equal(again.decoder.at(code)(points), prior.decoder.at(code)(points))
+    assert torch.equal(again.codes, prior.codes)
+
+
+def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
+    folder, _ = kept
+    others = [
+        (Boxes(widest=0.6), SETTINGS),
+        (Boxes(), replace(SETTINGS, steps=401)),
+        (Boxes(), replace(SETTINGS, seed=1)),
+        (Boxes(), replace(SETTINGS, network=replace(SETTINGS.network, width=47))),
+    ]
+    assert all(find(dataset, settings, folder) is None for dataset, settings in others)
+    assert find(Boxes(), SETTINGS, folder) is not None
+    monkeypatch.setattr(prior_store, "VERSION", prior_store.VERSION + 1)
+    assert find(Boxes(), SETTINGS, folder) is None
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "garbage"])
+def test_a_damaged_prior_is_an_error_with_a_remedy(kept, tmp_path, damage):
+    folder, _ = kept
+    path = find(Boxes(), SETTINGS, folder)
+    data = path.read_bytes()
+    data = {"empty": b"", "cut": data[: len(data) // 2], "garbage": b"\xff" * len(data)}[damage]
+    (tmp_path / path.name).write_bytes(data)
+    with pytest.raises(ValueError, match=rf"the prior .*{path.name} cannot be read .*: delete it, and it is trained"):
+        prior_for(Boxes(), SETTINGS, tmp_path, CPU, silent)
+
+
+def test_training_that_is_cut_short_leaves_no_prior(tmp_path, monkeypatch):
+    def full(path, text):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(prior_store, "write_text", full)
+    monkeypatch.setattr(prior_store, "fit_error", lambda *_, **__: 0.0)
+    short = replace(SETTINGS, steps=1, samples=100)
+    with pytest.raises(OSError, match="No space left"):
+        make_prior(Boxes(), short, tmp_path, CPU, silent)
+    assert find(Boxes(), short, tmp_path) is None
+
+
+@pytest.mark.parametrize("name", ["shapes", "samples", "steps", "shapes_per_step", "points_per_step"])
+def test_settings_that_cannot_be_are_refused(name):
+    with pytest.raises(ValueError, match=f"prior.{name} must be at least 1, not 0"):
+        replace(SETTINGS, **{name: 0})
+
+
+@pytest.fixture(params=sorted(FAMILIES))
+def shipped(request):
+    """A family as configured by default, its prior's settings, and the record of its shipped prior."""
+    register()
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        desk, smoke = (compose("config", [f"dataset={request.param}", f"scale={scale}"]) for scale in ("desk", "smoke"))
+    assert prior_settings(desk) == prior_settings(smoke)
+    dataset, settings = build(desk.dataset, "dataset"), prior_settings(desk)
+    records = [record for record in shipped_records() if record["dataset"]["name"] == request.param]
+    assert len(records) == 1, f"{request.param} has {len(records)} shipped priors"
+    return dataset, settings, records[0]
+
+
+def test_the_shipped_prior_is_that_of_the_default_configuration(shipped, tmp_path, monkeypatch):
+    dataset, settings, record = shipped
+    assert record["key"] == prior_key(dataset, settings)
+    assert record["dataset"] == dataset.identity()
+    assert record["settings"] == asdict(settings)
+    path = find(dataset, settings, tmp_path)
+    assert path == SHIPPED / f"{dataset.name}-{record['key']}.safetensors"
+    assert path.stat().st_size < 1_000_000
+
+    monkeypatch.setattr(prior_store, "train", never)
+    prior = prior_for(dataset, settings, tmp_path, CPU, silent)
+    assert prior.codes.shape == (settings.shapes, settings.network.code_length)
+    assert list(tmp_path.iterdir()) == []
+    mean_shape = extract(prior.decoder.at(torch.zeros(settings.network.code_length)), grid=24, reach=1.05)
+    assert mean_shape is not None
+    assert mean_shape.volume > 0.02
+
+
+def test_the_shipped_prior_was_made_of_the_family_as_it_is_now(shipped):
+    dataset, _, record = shipped
+    assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)
+
+
+def test_the_shipped_prior_fits_shapes_that_it_has_not_seen(shipped):
+    error = shipped[2]["surface_error"]
+    assert error["validation"] < 0.003
+    assert error["training"] < 0.003
+    assert error["mean_shape"] > 5 * error["validation"]
+
+
+def test_every_shipped_file_belongs_to_a_family():
+    keys = {f"{record['dataset']['name']}-{record['key']}" for record in shipped_records()}
+    names = {path.name for path in SHIPPED.iterdir()}
+    assert names == {f"{key}.{suffix}" for key in keys for suffix in ("json", "safetensors")}
+    assert len(keys) == len(FAMILIES)

@@ -1,0 +1,191 @@
+"""The optimisation loop on problems small enough to know the answer."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import pytest
+import torch
+
+from bench.evaluate.evaluate import Evaluation
+from bench.records.record import RunStatus
+from bench.solve.optimise import DIVERGED, History, optimise
+from bench.solve.problem import OptimiserSettings
+from renderers.field import Counts, Meter
+from renderers.fields.analytic import sphere
+
+CPU = torch.device("cpu")
+POINTS = 7  # evaluations that a toy's loss makes
+
+
+@dataclass
+class Toy:
+    """A radius to be found: the field at a point 3 from the origin is to be zero there.
+
+    `spoil` multiplies the loss of the call of that number, from 0, which is the warm-up.
+    """
+
+    spoil: dict[int, float] = field(default_factory=dict)
+    counts: Counts = field(default_factory=Counts)
+    calls: int = 0
+    rays_per_iteration: int = POINTS
+    definitions: dict[str, str] = field(default_factory=dict)
+    tracked: tuple[str, ...] = ()
+    observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
+
+    def __post_init__(self):
+        self.radius = torch.tensor(1.0, requires_grad=True)
+        self.parameters = [self.radius]
+
+    def field(self):
+        return sphere(self.radius.detach())
+
+    def objective(self):
+        return None
+
+    def frame(self):
+        return self.field(), None
+
+    def evaluate(self, inputs):
+        return Evaluation({"radius": self.radius.item()})
+
+    def checkpoint(self, inputs):
+        return {}
+
+    def draw(self, inputs, folder, first, curve, title):
+        pass
+
+    def loss(self, iteration):
+        metered = Meter(sphere(self.radius), self.counts)
+        values = metered(torch.tensor([3.0, 0, 0]).expand(POINTS, 3))
+        square = values.square().mean() * self.spoil.get(self.calls, 1.0)
+        self.calls += 1
+        return {"total": square, "square": square}
+
+
+def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None) -> History:
+    history = History()
+    optimise(problem, OptimiserSettings(iterations, rate, "constant"), CPU, history=history, on_step=on_step)
+    return history
+
+
+def test_it_finds_the_answer():
+    toy = Toy()
+    history = go(toy, 200, rate=0.1)
+    assert toy.radius.item() == pytest.approx(3.0, abs=1e-2)
+    assert (history.status, history.reason) == (RunStatus.OK, "")
+    assert history.curve[0]["total"] == pytest.approx(4.0)
+    assert history.curve[-1]["total"] < 1e-3
+
+
+def test_the_curve_has_a_line_per_iteration_passed_on_at_once():
+    given = []
+    history = go(Toy(), 5, on_step=lambda line: given.append(dict(line)))
+    assert history.curve == given
+    assert [line["iteration"] for line in given] == [0, 1, 2, 3, 4]
+    seconds = [line["seconds"] for line in given]
+    assert seconds == sorted(seconds)
+    assert seconds[0] > 0
+    assert seconds[-1] == pytest.approx(history.seconds["forward"] + history.seconds["backward"])
+    assert all(line["total"] == line["square"] for line in given)
+    assert given[-1]["value_evaluations"] == history.counts.value
+
+
+def test_the_warm_up_is_neither_counted_nor_part_of_the_first_step():
+    toy, gradients = Toy(), []
+    history = go(toy, 4, on_step=lambda line: gradients.append(toy.radius.grad.item()))
+    assert toy.calls == 5
+    assert (history.counts.value, history.counts.gradient) == (4 * POINTS, 4 * POINTS)
+    assert [line["value_evaluations"] for line in history.curve] == [POINTS * n for n in (1, 2, 3, 4)]
+    assert [line["gradient_evaluations"] for line in history.curve] == [POINTS * n for n in (1, 2, 3, 4)]
+    assert history.seconds["warmup"] > 0
+    assert gradients[0] == pytest.approx(-4.0)  # d/dr (3 - r)^2 at 1, not twice that
+
+
+def test_the_time_of_on_step_is_not_counted(clock):
+    class Slow(Toy):
+        def loss(self, iteration):
+            clock.sleep(1.0)
+            return super().loss(iteration)
+
+    history = go(Slow(), 3, on_step=lambda line: clock.sleep(100.0))
+    assert history.seconds == pytest.approx({"warmup": 1.0, "forward": 3.0, "backward": 0.0}, abs=0.01)
+
+
+def test_memory_that_on_step_takes_is_not_that_of_the_loop():
+    history = go(Toy(), 3, on_step=lambda line: torch.ones(2**26))  # 256 MiB
+    if history.peak_memory_bytes is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    assert history.peak_memory_bytes < 2**27
+
+
+def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
+    history = go(Toy(spoil={4: float("nan")}))
+    assert history.status is RunStatus.NAN
+    assert history.reason == "the loss is not a number at iteration 3"
+    assert len(history.curve) == 4
+
+
+def test_a_parameter_that_is_no_number_ends_the_loop():
+    class Cornered(Toy):
+        def loss(self, iteration):
+            self.calls += 1
+            return {"total": (self.radius - 1.0).abs().sqrt()}  # 0 with an infinite slope at the start
+
+    history = go(Cornered())
+    assert history.status is RunStatus.NAN
+    assert history.reason == "a parameter is not a number at iteration 0"
+    assert len(history.curve) == 1
+
+
+@pytest.mark.parametrize(("factor", "diverges"), [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
+def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
+    history = go(Toy(spoil={3: factor}), 5, rate=1e-4)
+    assert history.status is (RunStatus.DIVERGED if diverges else RunStatus.OK)
+    assert len(history.curve) == (3 if diverges else 5)
+    if diverges:
+        assert "the loss rose from 4 to" in history.reason
+        assert "by iteration 2" in history.reason
+
+
+def test_the_warm_up_is_not_the_first_value():
+    assert go(Toy(spoil={0: 1e-6})).status is RunStatus.OK
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_the_course_is_there_when_the_loop_is_cut_short(error):
+    def stop(line):
+        if line["iteration"] == 2:
+            raise error
+
+    history = History()
+    with pytest.raises(error):
+        optimise(Toy(), OptimiserSettings(10, 0.1, "constant"), CPU, history=history, on_step=stop)
+    assert [line["iteration"] for line in history.curve] == [0, 1, 2]
+    assert history.counts.value == 3 * POINTS
+    assert history.seconds["forward"] > 0
+
+
+def test_memory_is_measured_or_unknown():
+    peak = go(Toy(), 2).peak_memory_bytes
+    assert peak is None or peak >= 0
+
+
+def test_a_cosine_falls_from_the_rate_to_nearly_zero():
+    rates = [OptimiserSettings(10, 0.2, "cosine").rate(iteration) for iteration in range(10)]
+    assert rates[0] == 0.2
+    assert rates[5] == pytest.approx(0.1)
+    assert rates == sorted(rates, reverse=True)
+    assert 0 < rates[-1] < 0.01
+    assert {OptimiserSettings(10, 0.2, "constant").rate(iteration) for iteration in range(10)} == {0.2}
+
+
+def test_the_optimiser_takes_the_rate_of_the_iteration():
+    moved = []
+    for schedule in ("constant", "cosine"):
+        toy = Toy()
+        places = [toy.radius.item()]
+        settings = OptimiserSettings(4, 0.05, schedule)
+        optimise(toy, settings, CPU, history=History(), on_step=lambda line, p=places, t=toy: p.append(t.radius.item()))
+        moved.append([b - a for a, b in pairwise(places)])
+    ratios = [cosine / constant for constant, cosine in zip(*moved, strict=True)]
+    assert ratios == pytest.approx([1.0, 0.854, 0.5, 0.146], abs=0.02)

@@ -1,0 +1,64 @@
+"""The adaptive search finds the middle of a logistic curve, with an interval that holds, in half of a grid's trials."""
+
+import numpy as np
+import pytest
+
+from bench.stress.search import Search, SearchSettings
+
+DESK = SearchSettings(levels=33, repeats=5)
+
+
+def searched(settings: SearchSettings, succeeds) -> Search:
+    search = Search(settings)
+    while (level := search.next()) is not None:
+        search.note(level, bool(succeeds(float(search.levels[level]))))
+    return search
+
+
+@pytest.mark.parametrize("middle", [0.05, 0.31, 0.5, 0.77, 0.95])
+def test_a_sharp_breakdown_lies_in_a_short_interval(middle):
+    search = searched(DESK, lambda level: level < middle)
+    found = search.result()
+    assert found.low <= middle <= found.high
+    assert found.low <= found.level <= found.high
+    assert found.high - found.low < 0.08
+    assert len(search.trials) < 25
+
+
+@pytest.mark.parametrize(("width", "least"), [(0.02, 0.9), (0.08, 0.8)])
+def test_the_interval_of_a_noisy_breakdown_holds(width, least):
+    generator = np.random.default_rng(1)
+    holds = 0
+    for _ in range(40):
+        middle = generator.uniform(0.1, 0.9)
+        search = searched(
+            DESK, lambda level, m=middle: generator.random() < 1 / (1 + np.exp(np.clip((level - m) / width, -50, 50)))
+        )
+        found = search.result()
+        holds += found.low <= middle <= found.high
+        assert len(search.trials) <= DESK.most
+    assert holds / 40 >= least
+
+
+def test_the_search_takes_half_of_the_grid_at_most():
+    coin = np.random.default_rng(0)
+    search = searched(DESK, lambda level: coin.random() < 0.5)
+    assert len(search.trials) <= DESK.grid / 2
+    assert DESK.grid == 165
+
+
+@pytest.mark.parametrize(("succeeds", "end"), [(True, 32), (False, 0)])
+def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
+    search = searched(DESK, lambda level: succeeds)
+    found = search.result()
+    assert found.low > 1 if succeeds else found.high < 0
+    successes, trials = search.counts(end)
+    assert trials >= DESK.repeats
+    assert successes == (trials if succeeds else 0)
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="levels must be at least 3, not 2"):
+        SearchSettings(2, 5)
+    with pytest.raises(ValueError, match="repeats must be at least 2, not 1"):
+        SearchSettings(9, 1)

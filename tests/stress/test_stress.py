@@ -1,0 +1,195 @@
+"""Scenes of the atlas: closed-form truth, what counts as success, distortions, and what is done to a fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from bench.config import CONF, build, load
+from bench.machine.limits import Limits
+from bench.solve.problem import Unsupported
+from bench.stress.axes import Stress, Sweep
+from bench.stress.fit import FITS, FitTrial, judge_fit
+from bench.stress.gradient import judge_gradient
+from bench.stress.rendering import judge_rendering, truth
+from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
+from datasets.stress import SCENES
+from datasets.stress.solids import box, half_space, rod, sphere_solid
+from renderers import reference
+from renderers.camera import Rays
+from renderers.rendering import Status
+from tests.tiny import Blind
+
+CPU = torch.device("cpu")
+CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
+LIMITS = Limits(60, 8)
+FIT = FitSettings(24, 60, 0.03, 10.0, 10.0, 0.1)
+NAMES = sorted(path.stem for path in (CONF / "stress").glob("*.yaml") if path.stem != "none")
+
+
+def stress_named(name: str) -> Stress:
+    return build(OmegaConf.load(CONF / f"stress/{name}.yaml"), "task.stress", target="bench.stress.axes.Stress")
+
+
+def conditions(resolution: int = 32) -> Conditions:
+    return Conditions(resolution, FIT, CRITERIA, LIMITS, CPU)
+
+
+def drawn(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def random_rays(n: int, seed: int) -> Rays:
+    draw = torch.Generator().manual_seed(seed)
+    origins = 1.5 * torch.nn.functional.normalize(torch.randn(n, 3, generator=draw, dtype=torch.float64), dim=-1)
+    targets = 0.6 * torch.rand(n, 3, generator=draw, dtype=torch.float64) - 0.3
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
+
+
+SOLIDS = {
+    "ball": sphere_solid(0.4),
+    "box": box((0.3, 0.2, 0.4)),
+    "half space": half_space((0.0, 2.0, 0.0), 0.1),
+    "rod": rod(0.2, 0.5),
+    "union": sphere_solid(0.3).moved((0.2, 0.0, 0.0)) | box((0.2,) * 3),
+    "difference": box((0.4,) * 3) - sphere_solid(0.5),
+    "shell without a corner": (sphere_solid(0.5) - sphere_solid(0.4)) - box((0.5,) * 3).moved((0.5, 0.5, 0.5)),
+    "turned": (rod(0.1, 0.4) | rod(0.1, 0.4).moved((0.3, 0, 0))).turned(
+        torch.linalg.matrix_exp(torch.tensor([[0, 0.3, 0.1], [-0.3, 0, 0.5], [-0.1, -0.5, 0]], dtype=torch.float64))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_the_closed_form_agrees_with_the_reference_tracer(name):
+    solid, rays = SOLIDS[name], random_rays(2000, 0)
+    first = solid.trace(rays)
+    judged = reference.trace(solid.field, rays, lipschitz=1.0, least_step=2e-4, radius=1.0)
+    assert (first.hit != judged.hit).sum() <= 2  # rays that touch an edge
+    both = first.hit & judged.hit
+    assert both.sum() > 100
+    assert (first.distance - judged.distance)[both].abs().max() < 1e-5
+    assert torch.equal(first.inside, judged.status == Status.STARTED_INSIDE)
+
+
+def test_a_ray_that_begins_inside_has_no_first_hit():
+    rays = Rays(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    first = sphere_solid(0.4).trace(rays)
+    assert bool(first.inside) and not bool(first.hit)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if stress_named(name).measure != "fit"])
+def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
+    stress = stress_named(name)
+    renderer = load("renderer", "dist" if stress.setting == "alpha" else "idr")
+    if stress.setting == "n_ray_samples":
+        renderer = load("renderer", "dvr")
+    outcomes = [stress.trial(renderer, 0.0, repeat, conditions(48)) for repeat in range(3)]
+    assert sum(outcome.success for outcome in outcomes) >= 2, [(o.failure, o.numbers) for o in outcomes]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_stress_has_the_same_trial_for_every_renderer_and_another_each_time(name):
+    stress = stress_named(name)
+    if stress.measure == "fit":
+        assert stress.scene in FITS
+        return
+    severity = stress.sweep.severity(0.3)
+    one, same, other = (SCENES[stress.scene](severity, drawn(seed), 24) for seed in (0, 0, 1))
+    assert torch.equal(one.camera.world_to_camera, same.camera.world_to_camera)
+    first, again = truth(one)[0], truth(same)[0]
+    assert torch.equal(first.hit, again.hit)
+    if stress.scene not in ("grazing_plane", "gap"):
+        assert not torch.equal(one.camera.world_to_camera, other.camera.world_to_camera)
+
+
+@pytest.mark.parametrize("name", ["gap", "grazing_plane", "empty_scene", "bumps", "ripples"])
+def test_severe_is_worse_than_mild(name):
+    stress, renderer = stress_named(name), load("renderer", "idr")
+    assert stress.trial(renderer, 0.0, 0, conditions()).success
+    assert not stress.trial(renderer, 1.0, 0, conditions()).success
+
+
+def test_pixels_are_counted_by_kind_of_error():
+    exam = SCENES["cube"](1.0, drawn(), 32)
+    good = judge_rendering(exam, load("renderer", "idr"), conditions())
+    assert good.success and good.numbers["hits"] > 200
+    short = judge_rendering(exam, load("renderer", "idr", steps=3), conditions())
+    assert short.failure is Failure.LOST
+    assert short.numbers["lost"] == (short.images["kinds"] == 2).sum() > 200
+    wide = judge_rendering(exam, load("renderer", "idr", epsilon=0.05), conditions())
+    assert wide.failure is Failure.FALSE
+    assert wide.numbers["false"] == (wide.images["kinds"] == 3).sum() > 20
+
+
+def test_the_footprint_is_a_pixel_at_the_true_distance():
+    exam = SCENES["near_camera"](1.0, drawn(), 33)
+    first, footprint = truth(exam)
+    middle = 33 * 16 + 16  # the ray through the ball's middle meets it at right angles
+    assert first.distance[middle] == pytest.approx(1.0, abs=1e-3)
+    assert footprint[middle] == pytest.approx(1.0 / float(exam.camera.intrinsics[0, 0]), rel=1e-3)
+
+
+def test_gradients_are_those_of_the_closed_form():
+    exam = SCENES["grazing_plane"](30.0, drawn(), 24)
+    exact = judge_gradient(exam, load("renderer", "dvr"), conditions())
+    assert exact.success
+    assert exact.numbers["gradient_cosine"] == pytest.approx(1, abs=1e-6)
+    biased = judge_gradient(exam, load("renderer", "dist"), conditions())
+    assert biased.failure is Failure.SCALE
+    assert biased.numbers["gradient_scale"] == pytest.approx(1.5 * np.sin(np.radians(30)), rel=0.05)  # alpha K cos
+
+
+def test_a_renderer_without_a_gradient_is_unsupported():
+    blind = Blind()
+    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
+        stress_named("grazing_gradient").trial(blind, 0.0, 0, conditions())
+    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
+        stress_named("depth_noise").trial(blind, 0.0, 0, conditions())
+
+
+def test_a_severity_may_be_a_setting_of_the_renderer():
+    epsilon = stress_named("epsilon")
+    assert epsilon.stressed(load("renderer", "idr"), 0.01).epsilon == 0.01
+    assert stress_named("few_steps").stressed(load("renderer", "idr"), 12.4).steps == 12
+    with pytest.raises(Unsupported, match="DVR has no epsilon, or it is null: choose another"):
+        epsilon.stressed(load("renderer", "dvr"), 0.01)
+    with pytest.raises(Unsupported, match="DVR has no n_gradient_samples"):
+        stress_named("gradient_samples").stressed(load("renderer", "dvr"), 3.0)
+    with pytest.raises(Unsupported, match="DIST has no n_ray_samples"):
+        stress_named("few_samples").stressed(load("renderer", "dist"), 3.0)
+    with pytest.raises(Unsupported, match="Naive has no n_gradient_samples, or it is null"):  # its gradient is unrolled
+        stress_named("gradient_samples").stressed(load("renderer", "naive"), 3.0)
+    practical = load("renderer", "naive", gradient="practical", n_gradient_samples=1)
+    assert stress_named("gradient_samples").stressed(practical, 2.6).n_gradient_samples == 3
+
+
+@pytest.mark.parametrize("scene", ["depth_noise", "wrong_pose"])
+def test_a_disturbed_fit_ends_further_off(scene):
+    renderer = load("renderer", "dist")
+    outcomes = [
+        judge_fit(FitTrial(scene, FIT, severity, drawn()), renderer, conditions())
+        for severity in (1e-6, 0.5 if scene != "wrong_pose" else 60.0)
+    ]
+    assert outcomes[0].success
+    assert outcomes[1].numbers["surface_error"] > outcomes[0].numbers["surface_error"]
+
+
+def test_a_trial_that_takes_too_long_is_a_failure_of_that_kind():
+    held = replace(conditions(), limits=Limits(1e-9, 8))
+    assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
+
+
+def test_sweeps_and_stresses_are_checked():
+    assert Sweep(0.1, 0.001, log=True, unit="m").severity(0.5) == pytest.approx(0.01)
+    assert Sweep(2.0, 4.0, log=False, unit="m").severity(0.25) == 2.5
+    with pytest.raises(ValueError, match=r"log needs positive ends: set log=false"):
+        Sweep(0.0, 1.0, log=True, unit="m")
+    with pytest.raises(ValueError, match="must have two finite ends that differ"):
+        Sweep(1.0, 1.0, log=False, unit="m")
+    with pytest.raises(ValueError, match=r"task\.stress\.scene must be one of"):
+        Stress("nowhere", "rendering", "viewing", Sweep(1.0, 2.0, log=False, unit="m"))
+    with pytest.raises(ValueError, match=r"task\.stress\.measure must be one of"):
+        Stress("wires", "speed", "viewing", Sweep(1.0, 2.0, log=False, unit="m"))

@@ -1,0 +1,343 @@
+"""What a renderer costs on one view: counts, clock, limits and errors, on networks of a few neurons."""
+
+import json
+import time
+import weakref
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from math import isnan
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import imread
+
+from bench.config import load
+from bench.evaluate.reference import Reference
+from bench.machine import limits
+from bench.machine.limits import Limits
+from bench.records.files import to_json
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.solve.problem import Unsupported
+from bench.tasks import ablation
+from bench.tasks.ablation import DEFINITIONS, SMALLER, WARM_UP, Ablation
+from renderers.camera import Camera, Rays
+from renderers.field import Field, Kind, Meter
+from renderers.rendering import Capabilities, Renderer, Rendering, Status
+from tests.tiny import PEAK, ball_prior, camera_of, run_of
+
+SETTINGS = Ablation(repeats=2, limits=Limits(seconds=60, memory=8), smallest=2, wrong=0.02)
+PRIOR = ball_prior()
+SIZE = 16
+ERRORS = ("rays", "hits", "lost", "false", "wrong", "depth_error_median", "depth_error_p99", "depth_error_max")
+
+
+def view(size: int) -> Camera:
+    """From a side and from above, so that the axes of world, camera and picture differ."""
+    return camera_of(size, angles=(70.0, 20.0))
+
+
+def measured(folder: Any, renderer: Any, settings: Ablation = SETTINGS, size: int = SIZE) -> RunContext:
+    """A run in which the task was executed."""
+    run = run_of(folder, renderer, PRIOR, view(size))
+    settings.execute(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory) -> RunContext:
+    return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"))
+
+
+def test_it_ends_well_with_all_its_files(dist):
+    assert (dist.record.status, dist.record.reason) == (RunStatus.OK, "")
+    assert {path.name for path in dist.folder.iterdir()} == {"cache", "images.npz", "summary.png"}
+    assert imread(dist.folder / "summary.png")[..., :3].std() > 0.02
+    json.loads(to_json(dist.record.metrics), parse_constant=pytest.fail)
+
+
+def defined(name: str, definition: str) -> bool:
+    """Whether a definition is of a number: it may be of several, or of all that begin alike."""
+    return any(name == part or name.startswith(f"{part}_") for part in definition.split(", "))
+
+
+def test_every_number_has_a_definition_and_every_definition_a_number(dist):
+    record = dist.record
+    numbers = {*record.metrics, *(f"evaluations.{name}" for name in record.evaluations), "seconds.total"}
+    assert record.definitions == DEFINITIONS
+    assert [name for name in numbers if sum(defined(name, key) for key in DEFINITIONS) != 1] == []
+    assert [part for key in DEFINITIONS for part in key.split(", ") if not any(defined(n, part) for n in numbers)] == []
+    assert all(len(text) > 15 for text in DEFINITIONS.values())
+
+
+def sampled_hit() -> torch.Tensor:
+    """By dense sampling: whether a ray meets a value below zero."""
+    rays, t = view(SIZE).double().rays(), torch.linspace(1.4, 3.6, 4000, dtype=torch.float64)
+    points = rays.origins[..., None, :] + t[:, None] * rays.directions[..., None, :]
+    with torch.no_grad():
+        values = deepcopy(PRIOR.decoder).double().at(PRIOR.codes[0].double())(points)
+    return ((values <= 0) & (points.norm(dim=-1) < 1)).any(-1)
+
+
+REFERENCE_HIT = sampled_hit()
+CAN = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=False)
+
+
+def by_hand(renderer: Renderer, *, gradient: bool) -> Meter:
+    """A Meter that has seen one rendering, or one step, at the first code."""
+    code = PRIOR.codes[0].clone().requires_grad_(gradient)
+    meter, rays = Meter(PRIOR.decoder.at(code)), view(SIZE).rays()
+    with torch.set_grad_enabled(gradient):
+        rendering = renderer.render(meter, rays)
+        if gradient:
+            loss = renderer.silhouette_loss(meter, rays, rendering, REFERENCE_HIT)
+            (rendering.distance[rendering.hit].sum() + loss).backward()
+    return meter
+
+
+@pytest.mark.parametrize("name", ["dist", "naive", "idr", "dvr"])
+def test_counts_are_those_of_a_meter(name, tmp_path):
+    renderer = load("renderer", name)
+    record = measured(tmp_path, renderer).record  # counts are of one of its two repeats
+    forward, step = by_hand(renderer, gradient=False), by_hand(renderer, gradient=True)
+    assert record.metrics["queries"] == forward.counts.value > 0
+    assert record.metrics["step_queries"] == record.evaluations["value"] == step.counts.value > 0
+    assert record.metrics["step_gradients"] == record.evaluations["gradient"] == step.counts.gradient > 0
+    assert record.evaluations["per_ray"] == forward.counts.value / SIZE**2
+
+
+def test_times_and_rates_agree_with_each_other(dist):
+    metrics = dist.record.metrics
+    assert metrics["repeats"] == 2
+    for name in ("forward", "backward", "step"):
+        low, middle, high = (metrics[f"{name}_seconds{end}"] for end in ("_low", "", "_high"))
+        assert 0 < low <= middle <= high
+    assert metrics["backward_seconds"] < metrics["step_seconds"]
+    assert dist.record.seconds["forward"] == metrics["forward_seconds"]
+    weights = 3 * 128 + 128  # the code is folded into the biases
+    peak = dist.record.environment["gemm_peak_flops"]
+    step = 2 * weights * (metrics["step_queries"] + metrics["step_gradients"])
+    forward = 2 * weights * metrics["queries"]
+    assert metrics["forward_gemm"] == pytest.approx(forward / metrics["forward_seconds"] / peak)
+    assert metrics["step_gemm"] == pytest.approx(step / metrics["step_seconds"] / peak)
+    assert dist.record.peak_memory_bytes == metrics.get("peak_memory_bytes")
+
+
+@pytest.mark.parametrize(("after", "best"), [(0.5 * PEAK, PEAK), (2 * PEAK, 2 * PEAK)])
+def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(tmp_path, monkeypatch, after, best):
+    monkeypatch.setattr(ablation, "gemm_peak", lambda device: after)
+    record = measured(tmp_path, Fake(), size=4).record
+    metrics, weights = record.metrics, 4 * 128
+    assert record.environment["gemm_peak_flops"] == best
+    assert metrics["forward_gemm"] == pytest.approx(2 * weights * 16 / metrics["forward_seconds"] / best)
+
+
+def test_costs_are_medians_with_least_and_largest():
+    clocked = ablation.Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], ablation.Counts(10, 4), 77, 600)
+    forward = ablation.Clocked([2.0], [0.0], ablation.Counts(5, 0), None, None)
+    costs = ablation.Measured(None, forward, clocked).costs(100.0)  # type: ignore[arg-type]
+    assert costs == {
+        "queries": 5, "step_queries": 10, "step_gradients": 4, "repeats": 3, "peak_memory_bytes": 77,
+        "forward_seconds": 2.0, "forward_seconds_low": 2.0, "forward_seconds_high": 2.0,
+        "step_seconds": 3.0, "step_seconds_low": 1.0, "step_seconds_high": 8.0, "step_gemm": 600 / 3.0 / 100.0,
+        "backward_seconds": 0.5, "backward_seconds_low": 0.25, "backward_seconds_high": 0.75,
+    }  # fmt: skip
+    assert median([3.0, 1.0, 8.0]) == 3.0
+
+
+def test_the_renderer_is_near_the_reference(dist):
+    metrics = dist.record.metrics
+    assert metrics["size"] == SIZE
+    assert metrics["rays"] == SIZE**2
+    assert metrics["hits"] == int(REFERENCE_HIT.sum()) > 20
+    assert metrics["lost"] + metrics["false"] <= 4
+    assert metrics["wrong"] == 0
+    assert 0 < metrics["depth_error_median"] <= metrics["depth_error_p99"] <= metrics["depth_error_max"] < 1e-3
+
+
+def test_the_images_are_those_of_the_renderer_and_of_the_reference(dist):
+    images = np.load(dist.folder / "images.npz")
+    assert {name: (images[name].dtype, images[name].shape) for name in images} == {
+        "normals": (np.float16, (SIZE, SIZE, 3)),
+        "reference_normals": (np.float16, (SIZE, SIZE, 3)),
+        "hit": (np.bool_, (SIZE, SIZE)),
+        "reference_hit": (np.bool_, (SIZE, SIZE)),
+        "depth_error": (np.float64, (SIZE, SIZE)),
+    }
+    hit, true, metrics = images["hit"], images["reference_hit"], dist.record.metrics
+    assert true.sum() == metrics["hits"]
+    assert (true & ~hit).sum() == metrics["lost"]
+    assert (np.isfinite(images["depth_error"]) == (hit & true)).all()
+    assert np.nanmax(images["depth_error"]) == metrics["depth_error_max"]
+    for name, where in (("normals", hit), ("reference_normals", true)):
+        lengths = np.linalg.norm(images[name].astype(float), axis=-1)
+        assert np.allclose(lengths[where], 1, atol=2e-3)
+        assert (lengths[~where] == 0).all()
+    right, up, towards = images["reference_normals"].astype(float)[true].T
+    rows, columns = np.nonzero(true)
+    assert (towards > 0).all()
+    assert np.corrcoef(right, columns)[0, 1] > 0.9
+    assert np.corrcoef(up, rows)[0, 1] < -0.9
+    differ = np.abs(images["normals"] - images["reference_normals"])[hit & true].max(axis=-1)
+    assert (differ < 0.01).mean() > 0.9  # others lie beside an edge of the polyhedron
+
+
+@dataclass
+class Fake:
+    """Hits where it is told, at known distances, with a gradient of one value of the field a ray."""
+
+    hit: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
+    distance: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
+    capabilities: Capabilities = CAN
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        values = field(rays.at(torch.full(rays.shape, 2.5)))
+        known = rays.shape == self.hit.shape  # all but the warm-up
+        hit = self.hit if known else torch.ones(rays.shape, dtype=torch.bool)
+        distance = self.distance if known else torch.ones(rays.shape)
+        status = torch.where(hit, Status.HIT, Status.MISS).to(torch.int8)
+        return Rendering(
+            distance + values - values.detach(), status, rays.at(distance), torch.zeros(rays.shape), values
+        )
+
+    def silhouette_loss(self, field: Field, rays: Rays, rendering: Rendering, mask: torch.Tensor) -> torch.Tensor:
+        return rendering.closest.sum() * 0
+
+
+def test_lost_false_and_wrong_are_counted_against_the_reference(tmp_path, monkeypatch):
+    cosine = camera_of(4).double().depth(torch.ones(4, 4).double())
+    true, found, error = torch.zeros(4, 4).bool(), torch.zeros(4, 4).bool(), torch.zeros(4, 4).double()
+    true[0], found[1] = True, True  # 4 lost, 4 false
+    true[2:], found[2:] = True, True
+    error[2], error[3, 0], error[3, 1] = 0.01, 0.019, 0.021
+    error[3, 2:] = torch.tensor([-0.5, 0.0])
+    reference = Reference(2.0 * true / cosine, torch.zeros(4, 4, 3).double(), true)
+    monkeypatch.setattr(ablation, "reference_for", lambda *_: reference)
+    metrics = measured(tmp_path, Fake(found, ((2.0 + error) / cosine).float()), size=4).record.metrics
+    assert {name: metrics[name] for name in ("rays", "hits", "lost", "false", "wrong")} == {
+        "rays": 16, "hits": 12, "lost": 4, "false": 4, "wrong": 2,
+    }  # fmt: skip
+    assert metrics["depth_error_median"] == pytest.approx(0.01, abs=1e-6)  # of depths, not of distances
+    assert metrics["depth_error_max"] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_where_nothing_is_hit_there_is_no_depth_error(tmp_path, monkeypatch):
+    nothing = Reference(torch.zeros(4, 4).double(), torch.zeros(4, 4, 3).double(), torch.zeros(4, 4).bool())
+    monkeypatch.setattr(ablation, "reference_for", lambda *_: nothing)
+    run = measured(tmp_path, Fake(torch.zeros(4, 4).bool(), torch.ones(4, 4)), size=4)
+    assert run.record.status is RunStatus.OK
+    assert {name: run.record.metrics.get(name) for name in ERRORS} == {
+        "rays": 16, "hits": 0, "lost": 0, "false": 0, "wrong": 0,
+        "depth_error_median": None, "depth_error_p99": None, "depth_error_max": None,
+    }  # fmt: skip
+    assert np.isnan(np.load(run.folder / "images.npz")["depth_error"]).all()
+
+
+@dataclass
+class Slow(Fake):
+    """Takes a while for each rendering with more rays than some, and asks the field again after it."""
+
+    above: int = 0
+    seconds: float = 0.0
+    rendered: list[int] = field(default_factory=list)
+    held: list[Any] = field(default_factory=list)  # weak references to what each rendering made
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        made = torch.ones(1000)
+        assert all(reference() is None for reference in self.held)
+        self.held.append(weakref.ref(made))
+        self.rendered.append(rays.shape.numel())
+        if rays.shape.numel() > self.above:
+            time.sleep(self.seconds)
+        return super().render(field, rays)
+
+
+def test_where_the_time_is_up_a_smaller_image_is_measured(clock, tmp_path):
+    slow = Slow(above=16 * 16 - 1, seconds=0.5)
+    run = measured(tmp_path, slow, replace(SETTINGS, limits=Limits(0.4, 8)))
+    side = SIZE // SMALLER
+    assert run.record.status is RunStatus.TIMEOUT
+    assert run.record.reason == f"more than 0.4 s in a step at 16 x 16; it finishes at {side} x {side}"
+    assert run.record.metrics["size"] == side
+    assert run.record.metrics["rays"] == side**2
+    assert np.load(run.folder / "images.npz")["hit"].shape == (side, side)
+    # Each size begins with a warm-up. What is too slow once is not tried again.
+    assert slow.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
+
+
+def test_where_the_memory_is_up_a_smaller_image_is_measured(tmp_path, monkeypatch):
+    growths = iter([2**34])
+    monkeypatch.setattr(limits.MemoryPeak, "growth", lambda self: next(growths, 12345))
+    run = measured(tmp_path, Slow(), replace(SETTINGS, limits=Limits(60, 15.5)))
+    side = SIZE // SMALLER
+    assert run.record.status is RunStatus.OOM
+    assert run.record.reason == f"more than 15.5 GiB of memory in a step at 16 x 16; it finishes at {side} x {side}"
+    assert run.record.peak_memory_bytes == run.record.metrics["peak_memory_bytes"] == 12345
+
+
+def test_a_limit_says_whether_a_step_or_a_rendering_reached_it(tmp_path):
+    class SlowForward(Slow):
+        def render(self, field: Field, rays: Rays) -> Rendering:
+            self.seconds = 0.0 if torch.is_grad_enabled() else 0.5
+            return super().render(field, rays)
+
+    run = measured(tmp_path, SlowForward(above=16 * 16 - 1), replace(SETTINGS, limits=Limits(0.4, 8)))
+    assert run.record.reason.startswith("more than 0.4 s in a rendering at 16 x 16; ")
+
+
+@pytest.mark.parametrize("smallest", [SIZE // SMALLER + 1, SIZE, 1])
+def test_where_no_size_finishes_there_are_no_numbers(clock, tmp_path, smallest):
+    slow = Slow(above=0, seconds=0.06)
+    run = measured(tmp_path, slow, replace(SETTINGS, limits=Limits(0.05, 8), smallest=smallest))
+    assert run.record.status is RunStatus.TIMEOUT
+    assert run.record.reason == "more than 0.05 s in a step at 16 x 16; it finishes at no smaller size"
+    assert run.record.metrics == {}
+    assert not (run.folder / "images.npz").exists()
+
+
+def test_an_asked_size_below_the_smallest_is_measured(tmp_path):
+    run = measured(tmp_path, Fake(), replace(SETTINGS, smallest=8), size=4)
+    assert run.record.status is RunStatus.OK
+    assert run.record.metrics["size"] == 4
+
+
+@pytest.mark.parametrize(("seconds", "times"), [(0.0, 5), (0.12, 1)])
+def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(clock, tmp_path, seconds, times):
+    slow = Slow(above=WARM_UP**2, seconds=seconds)
+    run = measured(tmp_path, slow, replace(SETTINGS, repeats=5, limits=Limits(0.4, 8)))
+    assert run.record.status is RunStatus.OK
+    assert run.record.metrics["repeats"] == times
+    assert slow.rendered == [WARM_UP**2] + [SIZE**2] * 2 * times
+
+
+def test_the_warm_up_is_neither_timed_nor_counted(tmp_path):
+    slow = Slow(above=WARM_UP**2 - 1, seconds=0.0)
+    run = measured(tmp_path, slow, replace(SETTINGS, repeats=1))
+    assert run.record.metrics["step_queries"] == run.record.metrics["queries"] == SIZE**2
+
+
+def test_renderers_that_cannot_are_unsupported(tmp_path):
+    blind = Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True))
+    with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
+        measured(tmp_path, blind)
+    picky = Fake(capabilities=Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True))
+    with pytest.raises(Unsupported, match="Fake needs a level field, not a distance field"):
+        measured(tmp_path, picky)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"repeats": 0}, r"task\.repeats must be at least 1, not 0"),
+        ({"smallest": 0}, r"task\.smallest must be at least 1, not 0"),
+        ({"wrong": 0.0}, r"task\.wrong must be positive, not 0"),
+        ({"wrong": float("nan")}, r"task\.wrong must be positive, not nan"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SETTINGS, **changed)
+    assert not isnan(SETTINGS.wrong)

@@ -1,0 +1,248 @@
+"""How true gradients are said to be, where the answer is known: exact rules, the bias of DIST, and what is left out."""
+
+from dataclasses import dataclass, replace
+from math import cos, radians, sqrt
+from typing import Any
+
+import pytest
+import torch
+
+from bench.config import load
+from bench.evaluate.reference import Reference, in_float64, make_reference
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunContext
+from bench.shape_prior.autodecoder import Prior
+from bench.solve.problem import Unsupported
+from bench.tasks.gradients import BANDS, DEFINITIONS, OTHER_SURFACE, Gradients, Subject, _bands, _draw, _outline
+from renderers.boundary import BrokenContract
+from renderers.camera import Camera, Rays
+from renderers.field import Counts, Kind
+from renderers.rendering import Capabilities, Renderer, Rendering
+from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
+
+SETTINGS = Gradients(pixels=12, directions=4, outline=10, outline_directions=2, outline_step=2e-3, supersampling=4)
+PRIOR = ball_prior()
+SIZE = 24
+ALPHA = 1.5
+EXACT = {
+    "idr": load("renderer", "idr", epsilon=1e-10, steps=400),
+    "dvr": load("renderer", "dvr", n_ray_samples=400, refinement_steps=12),
+}
+HITS = ("frontal", "oblique", "grazing")
+
+
+def judged(folder: Any, renderer: Any, prior: Prior = PRIOR, camera: Camera | None = None) -> RunContext:
+    run = run_of(folder, renderer, prior, camera or camera_of(SIZE, angles=(70.0, 20.0)))
+    SETTINGS.execute(run)
+    return run
+
+
+@pytest.fixture(scope="module", params=EXACT)
+def exact(request, tmp_path_factory) -> RunContext:
+    return judged(tmp_path_factory.mktemp("run"), EXACT[request.param])
+
+
+def test_an_exact_rule_is_found_exact(exact):
+    metrics = exact.record.metrics
+    assert exact.record.status is RunStatus.OK
+    for band in HITS:
+        assert metrics[f"{band}.pixels"] + metrics[f"{band}.excluded"] == SETTINGS.pixels
+        assert metrics[f"{band}.pixels"] >= SETTINGS.pixels - 3
+        for of in ("code", "camera"):
+            assert metrics[f"{band}.{of}_cosine"] == pytest.approx(1, abs=1e-9)
+            assert metrics[f"{band}.{of}_pooled_cosine"] == pytest.approx(1, abs=1e-9)
+            assert metrics[f"{band}.{of}_scale"] == pytest.approx(1, abs=1e-6)
+            assert metrics[f"{band}.{of}_median_error"] < 1e-6
+            assert metrics[f"{band}.{of}_p99_error"] < 1e-5
+
+
+def test_the_gradient_of_hits_is_not_that_of_the_image_at_the_outline(exact):
+    metrics = exact.record.metrics
+    assert metrics["silhouette.pixels"] == SETTINGS.outline
+    assert 0 < metrics["silhouette.image_cosine"] < 0.9
+    assert 0 < metrics["silhouette.image_scale"] < 0.9
+
+
+def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
+    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5).double()
+    numbers = {}
+    for name, renderer in (("idr", EXACT["idr"]), ("dist", load("renderer", "dist", epsilon=1e-9, steps=600))):
+        subject = Subject(renderer, prior.decoder, prior.codes[0], camera, Counts())
+        numbers[name] = SETTINGS._evaluate_outline(subject, torch.arange(5, 40), torch.eye(3).double())
+    assert numbers["idr"]["image_cosine"] == pytest.approx(1, abs=1e-6)
+    assert numbers["idr"]["image_scale"] == pytest.approx(1, abs=1e-3)
+    assert numbers["dist"]["image_cosine"] == pytest.approx(1, abs=1e-4)
+    assert numbers["dist"]["image_scale"] == pytest.approx(ALPHA * cos(radians(50)), rel=0.03)
+
+
+def test_every_number_has_a_definition_and_every_definition_a_number(exact):
+    assert exact.record.definitions == DEFINITIONS
+    names = {name.partition(".")[::2] for name in exact.record.metrics}
+    defined = [part for key in DEFINITIONS for part in key.split(", ")]
+    assert {band for band, _ in names} == {*BANDS, "silhouette"}
+    assert all(band in DEFINITIONS["BAND"] for band, _ in names)
+    assert {number for _, number in names} == {*defined} - {"BAND"}
+    assert len(defined) == len(set(defined))
+
+
+def test_evaluations_are_counted(exact):
+    evaluations = exact.record.evaluations
+    assert evaluations["value"] > 20 * evaluations["gradient"] > 0
+    assert exact.record.metrics["frontal.pixels"] <= evaluations["gradient"] <= 200
+
+
+def plane_prior(angle: float, slope: float) -> Prior:
+    """A plane through the origin, seen at this angle in degrees, whose field rises by `slope` a scene unit."""
+    normal = slope * torch.tensor([sqrt(1 - cos(radians(angle)) ** 2), 0.0, cos(radians(angle))])
+    weights = slope * torch.tensor([0.3, -0.2, 0.5])
+    return Prior(plane_decoder(normal.tolist(), weights.tolist(), 0.0), torch.zeros(1, 3).double())
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.8])
+@pytest.mark.parametrize(("angle", "band"), [(10.0, "frontal"), (50.0, "oblique"), (80.0, "grazing")])
+def test_the_scale_of_dist_is_alpha_times_the_cosine_times_the_slope(tmp_path, angle, band, slope):
+    dist = load("renderer", "dist", alpha=ALPHA, extra_step_cap=None, epsilon=1e-9, steps=600)
+    metrics = judged(tmp_path, dist, plane_prior(angle, slope), camera_of(8, field_of_view=0.5)).record.metrics
+    assert metrics[f"{band}.pixels"] == SETTINGS.pixels
+    for of in ("code", "camera"):
+        expected = ALPHA * cos(radians(angle)) * slope
+        assert metrics[f"{band}.{of}_scale"] == pytest.approx(expected, rel=0.03)  # the angle differs by pixel
+        assert metrics[f"{band}.{of}_median_error"] == pytest.approx(abs(1 - expected), abs=0.02)
+        assert metrics[f"{band}.{of}_cosine"] == pytest.approx(1, abs=1e-6)
+
+
+def test_where_a_band_is_empty_it_says_so(tmp_path):
+    """All is hit, at one angle: there is no outline either."""
+    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5)
+    metrics = judged(tmp_path, EXACT["idr"], prior, camera).record.metrics
+    for band in ("frontal", "grazing"):
+        assert {name: value for name, value in metrics.items() if name.startswith(band)} == {
+            f"{band}.pixels": 0, f"{band}.excluded": 0,
+        }  # fmt: skip
+    assert {name: value for name, value in metrics.items() if name.startswith("silhouette")} == {"silhouette.pixels": 0}
+    assert metrics["oblique.pixels"] == SETTINGS.pixels
+
+
+@dataclass
+class Changed:
+    """A renderer that answers as another one does, but for what is changed."""
+
+    inner: Renderer
+    capabilities: Capabilities
+    shift: float = 0.0  # of the distance on every other ray
+
+    def render(self, field: Any, rays: Rays) -> Rendering:
+        found = self.inner.render(field, rays)
+        every_other = torch.arange(rays.shape.numel()) % 2
+        return replace(found, distance=found.distance + self.shift * every_other)
+
+    def silhouette_loss(self, *arguments: Any) -> Any:
+        return self.inner.silhouette_loss(*arguments)
+
+
+def test_a_renderer_without_a_gradient_for_rays_has_no_camera_numbers(tmp_path):
+    able = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=False)
+    metrics = judged(tmp_path, Changed(EXACT["idr"], able)).record.metrics
+    assert "oblique.code_cosine" in metrics
+    assert not [name for name in metrics if "camera" in name]
+
+
+def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_path):
+    metrics = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, 1.1 * OTHER_SURFACE)).record.metrics
+    for band in HITS:
+        assert metrics[f"{band}.pixels"] <= SETTINGS.pixels / 2 <= metrics[f"{band}.excluded"]
+        assert metrics[f"{band}.pixels"] + metrics[f"{band}.excluded"] == SETTINGS.pixels
+        assert metrics[f"{band}.code_median_error"] < 1e-6
+
+
+def test_where_no_pixel_of_a_band_counts_it_has_no_other_numbers(tmp_path):
+    nowhere = load("renderer", "idr", steps=1)
+    metrics = judged(tmp_path, nowhere).record.metrics
+    assert metrics["oblique.pixels"] == 0
+    assert metrics["oblique.excluded"] == SETTINGS.pixels
+    assert "oblique.code_cosine" not in metrics
+    assert metrics["silhouette.image_scale"] == 0
+
+
+def test_renderers_that_cannot_are_unsupported(tmp_path):
+    inner = EXACT["idr"]
+    with pytest.raises(Unsupported, match="Changed has no gradient towards the field"):
+        judged(tmp_path, Changed(inner, Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
+    with pytest.raises(Unsupported, match="Changed needs a level field, not a distance field"):
+        judged(tmp_path, Changed(inner, Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True)))
+
+
+def test_a_gradient_towards_the_code_that_is_claimed_and_lacking_is_told(tmp_path):
+    class TowardsRaysOnly(Changed):
+        def render(self, field: Any, rays: Rays) -> Rendering:
+            found = super().render(field, rays)
+            return replace(found, distance=found.distance.detach() + 0 * rays.origins.sum(-1))
+
+    with pytest.raises(BrokenContract, match=r"capabilities\.field_gradient is True, but the distances of its hits"):
+        judged(tmp_path, TowardsRaysOnly(EXACT["idr"], EXACT["idr"].capabilities))
+
+
+def test_bands_are_of_the_angle_between_ray_and_inward_normal():
+    camera = camera_of(6).resized(3, 3).double()
+    angles = torch.tensor([[0.0, 29.9, 30.1], [69.9, 70.1, 89.9], [90.1, 10.0, 120.0]], dtype=torch.float64).deg2rad()
+    directions = camera.rays().directions
+    aside = torch.nn.functional.normalize(
+        torch.linalg.cross(directions, torch.tensor([0.0, 1.0, 0.0]).double().expand(3, 3, 3)), dim=-1
+    )
+    normals = -angles.cos()[..., None] * directions + angles.sin()[..., None] * aside
+    normals[0, 0] *= 1 + 1e-15  # as rounding may leave it
+    hit = torch.ones(3, 3, dtype=torch.bool)
+    hit[2, 1] = False
+    found = _bands(Reference(torch.ones(3, 3).double(), normals, hit), camera)
+    assert {band: pixels.tolist() for band, pixels in found.items()} == {
+        "frontal": [0, 1], "oblique": [2, 3], "grazing": [4, 5],
+    }  # fmt: skip
+
+
+def test_the_outline_is_beside_the_outline():
+    hit = torch.zeros(5, 6, dtype=torch.bool)
+    hit[:, 3:] = True
+    assert _outline(hit).tolist() == [6 * row + column for row in range(5) for column in (2, 3)]
+    assert _outline(torch.ones(5, 6).bool()).tolist() == []
+    assert _outline(torch.zeros(5, 6).bool()).tolist() == []
+
+
+def test_pixels_are_drawn_without_repetition_and_by_the_seed():
+    pixels = torch.arange(100, 200)
+    drawn = [_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1)]
+    assert drawn[0] == drawn[1] != drawn[2]
+    assert len(set(drawn[0])) == 30
+    assert drawn[0] == sorted(drawn[0])
+    assert set(drawn[0]) <= set(range(100, 200))
+    assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()
+
+
+def test_numbers_of_a_run_follow_its_seed(tmp_path):
+    def numbers(folder: Any, seed: int) -> dict[str, float]:
+        run = run_of(folder, EXACT["idr"], PRIOR, camera_of(SIZE), seed=seed)
+        SETTINGS.execute(run)
+        return run.record.metrics
+
+    first, again, other = numbers(tmp_path, 0), numbers(tmp_path, 0), numbers(tmp_path, 1)
+    assert first == again != other
+
+
+def test_the_reference_of_a_plane_is_that_plane():
+    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5)
+    twin = in_float64(prior)
+    reference = make_reference(twin.decoder.at(twin.codes[0]), camera)
+    normal = torch.tensor([sqrt(1 - cos(radians(50.0)) ** 2), 0.0, cos(radians(50.0))]).double()
+    rays = camera.double().rays()
+    assert torch.allclose(reference.distance, -(rays.origins @ normal) / (rays.directions @ normal), rtol=1e-7)
+    assert torch.allclose(reference.normals, normal.expand(8, 8, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["pixels", "directions", "outline", "outline_directions", "supersampling"])
+def test_counts_that_cannot_be_are_refused(name):
+    with pytest.raises(ValueError, match=rf"task\.{name} must be at least 1, not 0"):
+        replace(SETTINGS, **{name: 0})
+
+
+def test_a_step_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"task\.outline_step must be positive, not -0\.1"):
+        replace(SETTINGS, outline_step=-0.1)

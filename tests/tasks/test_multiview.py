@@ -1,0 +1,156 @@
+"""Shape from many views of a ball, by a prior of balls."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.solve.latent_code import CodePenalty
+from bench.solve.optimise import History, optimise
+from bench.solve.problem import NotReached, OptimiserSettings, Unsupported
+from bench.tasks.multiview import Multiview
+from bench.tasks.photographs import GivenPhotographs, blurred
+from datasets.mesh import Mesh
+from datasets.scene import Scene, see
+from datasets.truth import Truth
+from renderers.fields.analytic import sphere
+from tests.datasets.test_photographs import PLAINLY
+from tests.tiny import CPU, Blind, altered, ball_prior, camera_of
+
+RENDERER = load("renderer", "dist")
+CAMERA = camera_of(32, angles=(0.0, 20.0))
+PRIOR = ball_prior(radius=0.5)
+SETTINGS = Multiview(
+    images=PLAINLY, focal=1.0, views_per_step=4, neighbour=1, visible=1e-3, photometric_weight=5.0,
+    code=CodePenalty(0.0, "sum"), start_scale=0.0, starts=1, trial=3, coarse_blur=0.0,
+    scale=1.0, degrees=0.0, shift=0.0, optimiser=OptimiserSettings(30, 0.01, "constant"),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A ball of radius 0.5, the prior's mean shape."""
+    made = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    return Scene("ball", mesh, see(Truth(mesh), CAMERA))
+
+
+def problem_of(scene, **changed):
+    return replace(SETTINGS, **changed).problem(scene, PRIOR, RENDERER, seed=0, device=CPU)
+
+
+def given(scene, **changed) -> GivenPhotographs:
+    settings = replace(SETTINGS, **changed)
+    return GivenPhotographs(settings, RENDERER, settings.images.take(Truth(scene.mesh), CAMERA, seed=0), CPU)
+
+
+def test_the_truth_costs_least(scene):
+    photographs = given(scene)
+    losses = [photographs.compare(sphere(radius), 0)["photometric"].item() for radius in (0.35, 0.45, 0.5, 0.55, 0.65)]
+    assert losses.index(min(losses)) == 2
+    assert losses[2] < 0.5 * min(losses[0], losses[4])
+
+
+def test_views_move_on_and_are_spread_evenly(scene):
+    photographs = given(scene)
+    assert photographs.pairs(0) == [(0, 1), (2, 3), (4, 5), (6, 7)]
+    assert photographs.pairs(3) == [(3, 4), (5, 6), (7, 0), (1, 2)]
+    assert given(scene, views_per_step=99, neighbour=2).pairs(0) == [(i, (i + 2) % 8) for i in range(8)]
+
+
+def test_it_finds_the_ball(scene):
+    problem = problem_of(scene)
+    problem.code.data += torch.tensor([0.0, 0.05, 0.0, 0.15])  # higher and larger
+    optimise(problem, OptimiserSettings(45, 0.04, "cosine"), CPU, history=History(), on_step=lambda line: None)
+    assert problem.code.detach().norm().item() < 0.01  # of 0.16
+    assert problem.counts.value > 0
+
+
+def test_random_starts_differ_and_share_the_budget(scene):
+    problem = problem_of(scene, starts=3, start_scale=1.0)
+    assert len(problem.parameters) == 3
+    assert not torch.equal(problem.codes[0], problem.codes[1])
+    before = [code.detach().clone() for code in problem.codes]
+    history = History()
+    optimise(problem, OptimiserSettings(14, 0.01, "constant"), CPU, history=history, on_step=lambda line: None)
+    kept = problem.starts.best()
+    assert torch.equal(problem.code, problem.codes[kept])
+    moved = [(code.detach() - old).norm().item() for code, old in zip(problem.codes, before, strict=True)]
+    assert all(distance > 0 for distance in moved)
+    ends = [np.mean([line["total"] for line in history.curve[start:9:3]]) for start in range(3)]
+    assert kept == int(np.argmin(ends))
+
+
+def test_a_misplaced_ball_is_put_back(scene):
+    problem = problem_of(scene, shift=0.1, scale=1.1, degrees=5.0)
+    first = problem.similarity.clone()
+    assert first[:3].norm().item() == pytest.approx(0.1)
+    assert first[6].exp().item() == pytest.approx(1.1)
+    problem.codes[0].requires_grad_(False)  # a ball that moves could be put back by its code as well
+    optimise(problem, OptimiserSettings(36, 0.015, "cosine"), CPU, history=History(), on_step=lambda line: None)
+    assert problem.similarity[:3].norm() < 0.3 * first[:3].norm()
+    assert problem.similarity[6].abs() < 0.3 * first[6]
+    assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
+
+
+def test_a_longer_focal_length_shows_a_larger_ball(scene):
+    near, far = given(scene, focal=1.0), given(scene, focal=1.0)
+    zoomed = problem_of(scene, focal=1.2).compare.__self__
+    assert near.cameras[0].intrinsics[0, 0] * 1.2 == pytest.approx(zoomed.cameras[0].intrinsics[0, 0].item())
+    assert torch.equal(near.colours, far.colours)
+
+
+def test_coarse_images_come_first(scene):
+    photographs = given(scene, coarse_blur=0.0625)
+    roughness = [photographs._blurred(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
+    assert roughness[0] < roughness[1] < roughness[2] == roughness[3]
+    assert torch.equal(photographs._blurred(15), photographs.colours)
+
+
+def test_blurring_keeps_what_is_constant_and_the_mean():
+    flat = torch.full((2, 9, 7, 3), 0.3)
+    assert torch.allclose(blurred(flat, 1.5), flat, atol=1e-6)
+    spot = torch.zeros(1, 21, 21, 3)
+    spot[0, 10, 10] = 1.0
+    soft = blurred(spot, 1.5)
+    assert soft.sum().item() == pytest.approx(3.0, rel=1e-4)
+    variance = (soft[0, :, :, 0].sum(1) * (torch.arange(21) - 10) ** 2).sum().item()
+    assert variance == pytest.approx(1.5**2, rel=0.05)
+    assert blurred(torch.rand(1, 2, 2, 3), 5.0).isfinite().all()  # wider than the image
+
+
+def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
+    with pytest.raises(NotReached, match="no point of the shape is seen by two neighbouring views"):
+        level = replace(PLAINLY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
+        GivenPhotographs(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
+    with pytest.raises(NotReached):
+        given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
+
+
+def test_a_renderer_without_a_gradient_is_unsupported(scene):
+    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
+        SETTINGS.problem(scene, PRIOR, Blind(), seed=0, device=CPU)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"views_per_step": 0}, "views_per_step must be at least 1"),
+        ({"neighbour": 0}, "neighbour must be at least 1"),
+        ({"neighbour": 8}, "neighbour=8 compares each of 8 views with itself"),
+        ({"visible": 0.0}, "visible must be positive"),
+        ({"focal": 0.0}, "focal must be positive"),
+        ({"scale": -1.0}, "scale must be positive"),
+        ({"scale": 1.5}, "scale must lie between 0.8 and 1.25"),
+        ({"shift": 0.5}, "shift be 0.2 at most"),
+        ({"start_scale": -1.0}, "start_scale must be at least 0"),
+        ({"starts": 10}, "iterations must be more than"),
+        ({"code.average": "max"}, "task.code.average must be one of"),
+    ],
+)
+def test_what_cannot_be_is_told(changed, message):
+    with pytest.raises(ValueError, match=message):
+        altered(SETTINGS, changed)

@@ -1,0 +1,236 @@
+"""Camera poses of known shapes: how far off a start is, and that the way back is found."""
+
+import json
+from dataclasses import replace
+from math import radians
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.records.record import RunStatus
+from bench.solve.optimise import History, optimise
+from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.tasks.pose import Pose, PoseProblem, PoseStart, known_shape, pose_error
+from bench.tasks.pose_icp import PoseICP, world_points
+from datasets.mesh import Mesh
+from datasets.scene import Scene, see
+from datasets.truth import Truth
+from renderers.boundary import BrokenContract
+from renderers.fields.analytic import box
+from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of
+
+SIZES = (0.5, 0.35, 0.2)
+CAMERA = camera_of(24, angles=(30.0, 20.0))
+START = PoseStart(degrees=20.0, shift=0.1, starts=3, spread=40.0, success_degrees=5.0, success_distance=0.05)
+SETTINGS = Pose(
+    degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05, trial=5,
+    shape="formula", grid=32, depth_weight=10.0, silhouette_weight=10.0, normal_weight=0.0,
+    optimiser=OptimiserSettings(60, 0.02, "cosine"),
+)  # fmt: skip
+ICP = PoseICP(
+    degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05,
+    method="point_to_plane", points=4000, reach=(0.3, 0.05), iterations=50,
+)  # fmt: skip
+DIST = load("renderer", "dist")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A box with three unlike sides."""
+    made = trimesh.creation.box(2 * np.array(SIZES))
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    return Scene("box", mesh, see(Truth(mesh), CAMERA), lambda: box(SIZES))
+
+
+@pytest.fixture
+def run(tmp_path, scene):
+    return run_of(tmp_path, DIST, ball_prior(), CAMERA, make_scene=lambda: scene)
+
+
+def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
+    settings = replace(SETTINGS, **changed)
+    return PoseProblem(settings, renderer, box(SIZES), scene.view, settings.start.cameras(CAMERA, 0), CPU)
+
+
+def test_a_renderer_that_claims_a_gradient_towards_rays_and_lacks_it_is_told(scene, tmp_path):
+    class Detached(type(DIST)):
+        """Its distances are constants."""
+
+        def render(self, field, rays):
+            found = super().render(field, rays)
+            return replace(found, distance=found.distance.detach())
+
+    run = run_of(tmp_path, Detached(**vars(DIST)), ball_prior(), CAMERA, make_scene=lambda: scene)
+    with pytest.raises(BrokenContract, match=r"Detached\.capabilities\.ray_gradient is True, .* towards the rays"):
+        SETTINGS.execute(run)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
+def test_the_error_of_a_turn_is_its_angle(angle):
+    axis = torch.tensor([0.6, 0.0, 0.8])
+    turned = CAMERA.with_object_moved(torch.cat([torch.zeros(3), radians(angle) * axis]))
+    rotation, translation = pose_error(turned, CAMERA)
+    assert rotation == pytest.approx(angle, abs=1e-3)
+    assert translation == pytest.approx(0.0, abs=1e-6)  # about the object's origin
+
+
+def test_the_error_of_a_shift_is_its_length():
+    moved = CAMERA.with_object_moved(torch.tensor([0.0, 0.3, 0.4, 0, 0, 0]))
+    assert pose_error(moved, CAMERA) == pytest.approx((0.0, 0.5), abs=1e-3)
+
+
+def test_the_first_start_is_off_by_what_is_asked_and_others_are_turned_from_it():
+    given, *others = START.cameras(CAMERA, seed=4)
+    rotation, _ = pose_error(given, CAMERA)
+    assert rotation == pytest.approx(20.0, abs=1e-2)
+    steep, shift = pose_error(replace(START, degrees=170.0).cameras(CAMERA, seed=4)[0], CAMERA)
+    assert (steep, shift) == pytest.approx((170.0, 0.1), abs=1e-2)
+    assert len(others) == 2
+    for other in others:
+        rotation, translation = pose_error(other, given)
+        assert 0 < rotation <= 40.0
+        assert translation == pytest.approx(0.0, abs=1e-5)
+    again = START.cameras(CAMERA, seed=4)
+    assert torch.equal(again[2].world_to_camera, others[1].world_to_camera)
+    alone = replace(START, starts=1).cameras(CAMERA, seed=4)
+    assert torch.equal(alone[0].world_to_camera, given.world_to_camera)  # more starts change nothing of the first
+
+
+def test_success_needs_both_errors_to_be_small():
+    near = CAMERA.with_object_moved(torch.tensor([0.03, 0, 0, 0, 0, radians(4.0)]))
+    turned = CAMERA.with_object_moved(torch.tensor([0.03, 0, 0, 0, 0, radians(6.0)]))
+    far = CAMERA.with_object_moved(torch.tensor([0.06, 0, 0, 0, 0, radians(4.0)]))
+    assert [START.metrics(camera, CAMERA)["success"] for camera in (near, turned, far)] == [1.0, 0.0, 0.0]
+
+
+def test_the_true_pose_costs_nearly_nothing(scene):
+    terms = problem_of(scene, degrees=0.0, shift=0.0, normal_weight=1.0).loss(0)
+    off = problem_of(scene, normal_weight=1.0).loss(0)
+    assert terms["depth"] < 0.1 * off["depth"]
+    assert terms["normals"] < 0.1 * off["normals"]
+    assert terms["total"] < 0.3 * off["total"]  # a pixel at an edge is off by a part of it
+
+
+@pytest.mark.parametrize("name", ["dist", "dvr", "idr"])
+def test_gradients_of_the_loss_point_back(scene, name):
+    """Towards the truth the loss falls: along the twist that the start was moved by, against it."""
+    problem = problem_of(scene, load("renderer", name), starts=1)
+    problem.loss(0)["total"].backward()
+    gradient = problem.parameters[0].grad
+    assert gradient.isfinite().all()
+    back = torch.linalg.inv(problem.cameras[0].world_to_camera) @ CAMERA.world_to_camera
+    turn = torch.tensor([back[2, 1] - back[1, 2], back[0, 2] - back[2, 0], back[1, 0] - back[0, 1]]) / 2
+    assert torch.cat([back[:3, 3], turn]) @ gradient < 0
+
+
+def test_it_finds_the_pose_and_leaves_a_record(run):
+    SETTINGS.execute(run)
+    record = run.record
+    assert record.status is RunStatus.OK, record.reason
+    assert record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
+    assert record.metrics["rotation_error_deg"] < 3.0
+    assert record.metrics["success"] == 1.0
+    assert record.metrics["mask_iou"] > 0.93
+    assert set(record.metrics) <= set(record.definitions)
+    assert record.evaluations["value"] > 0 and record.evaluations["gradient"] > 0
+    lines = [json.loads(line) for line in (run.folder / "curve.jsonl").read_text().splitlines()]
+    assert len(lines) == 60
+    assert {"depth", "silhouette", "total"} <= set(lines[0])
+    assert (run.folder / "strip.png").stat().st_size > 1000
+
+
+def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
+    optimiser = OptimiserSettings(iterations, 0.1, "cosine")
+    settings = replace(SETTINGS, degrees=90.0, optimiser=optimiser, **changed)
+    problem = PoseProblem(settings, DIST, box(SIZES), scene.view, settings.start.cameras(CAMERA, seed), CPU)
+    history = History()
+    optimise(problem, settings.optimiser, CPU, history=history, on_step=lambda line: None)
+    return history.curve[-1]["total"]
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_restarts_find_what_one_start_misses(scene, seed):
+    """Judged by the loss: a box looks the same from four sides."""
+    assert final_loss(scene, seed, starts=8, trial=6, iterations=140) < 0.1 < final_loss(scene, seed)
+
+
+@pytest.mark.parametrize(("shape", "tolerance"), [("grid", 0.02), ("formula", 1e-6)])
+def test_a_known_shape_is_the_scenes(run, shape, tolerance):
+    known = known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
+    assert (known(points) - box(SIZES)(points)).abs().max() < tolerance
+
+
+def test_a_known_shape_may_be_a_network(run):
+    known = known_shape(replace(SETTINGS, shape="prior"), run.inputs)
+    expected = run.inputs.prior.decoder.at(run.inputs.prior.codes[0])
+    points = torch.rand(10, 3)
+    assert torch.equal(known(points), expected(points))
+
+
+def test_a_shape_without_a_formula_is_told(run):
+    inputs = replace(run.inputs, make_scene=lambda: replace(run.inputs.scene, formula=None))
+    with pytest.raises(ValueError, match=r"box has no formula: set task\.shape=grid"):
+        known_shape(SETTINGS, inputs)
+
+
+def test_a_renderer_without_a_gradient_towards_rays_is_unsupported(run):
+    blind = replace(run, inputs=replace(run.inputs, renderer=Blind()))
+    with pytest.raises(Unsupported, match="Blind has no gradient towards rays"):
+        SETTINGS.execute(blind)
+
+
+def test_a_start_that_sees_nothing_is_not_ok_without_having_found_it(run):
+    replace(SETTINGS, shift=6.0, optimiser=OptimiserSettings(5, 0.02, "cosine")).execute(run)
+    assert run.record.metrics["success"] == 0.0
+    assert all(np.isfinite(run.record.metrics[name]) for name in ("rotation_error_deg", "translation_error"))
+
+
+@pytest.mark.parametrize("method", ["point_to_point", "point_to_plane"])
+def test_closest_points_find_a_near_pose(run, method):
+    replace(ICP, method=method).execute(run)
+    assert run.record.status is RunStatus.OK
+    assert run.record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
+    assert run.record.metrics["rotation_error_deg"] < 4.0
+    assert run.record.evaluations["value"] == 0
+    assert run.record.seconds["forward"] > 0
+
+
+def test_closest_points_start_where_the_renderers_do():
+    mine, theirs = (settings.start.cameras(CAMERA, 7)[0].world_to_camera for settings in (ICP, SETTINGS))
+    assert torch.equal(mine, theirs)
+
+
+def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
+    points = world_points(scene.view, CAMERA)
+    assert len(points) == int(scene.view.mask.sum())
+    assert box(SIZES)(points).abs().max() < 1e-4
+
+
+def test_points_that_never_come_near_are_told(run):
+    replace(ICP, shift=3.0, reach=(1e-3,)).execute(run)
+    assert run.record.status is RunStatus.NOT_REACHED
+    assert run.record.metrics["success"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "changed", "message"),
+    [
+        (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
+        (SETTINGS, {"shift": -1.0}, r"task\.shift must be at least 0"),
+        (SETTINGS, {"starts": 0}, r"task\.starts must be at least 1"),
+        (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
+        (SETTINGS, {"shape": "voxels"}, r"task\.shape must be one of grid, prior, formula"),
+        (SETTINGS, {"success_degrees": 0.0}, r"task\.success_degrees must be positive"),
+        (ICP, {"method": "fpfh"}, r"task\.method must be one of point_to_point, point_to_plane"),
+        (ICP, {"reach": (0.1, 0.0)}, r"task\.reach must be positive"),
+        (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
+        (ICP, {"spread": -1.0}, r"task\.spread must lie between 0 and 180"),
+    ],
+)
+def test_what_cannot_be_is_told(settings, changed, message):
+    with pytest.raises(ValueError, match=message):
+        replace(settings, **changed)

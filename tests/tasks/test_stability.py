@@ -1,0 +1,195 @@
+"""Breakdowns that theory knows are found, planted faults move them, and a user's renderer is in the atlas."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import renderers.dvr
+from bench.config import load
+from bench.machine.limits import Limits
+from bench.records.record import RunStatus
+from bench.solve.problem import Unsupported
+from bench.stress.search import SearchSettings
+from bench.tasks.stability import Stability
+from renderers import IDR, gradients
+from renderers.march import Stepping
+from tests.stress.test_stress import CRITERIA, FIT, stress_named
+from tests.tiny import ball_prior, camera_of, run_of
+
+SEARCH = SearchSettings(levels=17, repeats=3)
+SHORT = replace(FIT, resolution=12, iterations=5)
+AGGRESSIVE = {"coarse_to_fine": False, "careful_split": False, "extra_step_cap": None}
+
+
+def run(folder: Path, stress: str, renderer, *, resolution: int = 24) -> dict:
+    """The record's metrics of a search, beside "status"."""
+    folder.mkdir(exist_ok=True)
+    run = run_of(folder, renderer, ball_prior(), camera_of(8))
+    small = SearchSettings(levels=5, repeats=2)
+    Stability(stress_named(stress), SEARCH, small, CRITERIA, SHORT, resolution, Limits(60, 8)).execute(run)
+    assert run.record.status is RunStatus.OK
+    return run.record.metrics
+
+
+def within(stress: str, metrics: dict, severity: float) -> bool:
+    """Whether a severity lies in the interval of a breakdown."""
+    sweep = stress_named(stress).sweep
+    level = np.log(severity / sweep.mild) / np.log(sweep.severe / sweep.mild)
+    return metrics["level_low"] <= level <= metrics["level_high"]
+
+
+CAPPED = load("renderer", "dist", **AGGRESSIVE | {"extra_step_cap": 0.01})
+PLAIN = load("renderer", "dist", **AGGRESSIVE, alpha=1.0)
+CLAMPED = load("renderer", "dist", **AGGRESSIVE, step_clamp=0.1)
+CLOSED_FORM = {  # axis and reason: renderer, and where it must break
+    ("thin_plate", "a capped step overshoots by its cap"): (CAPPED, 0.01),
+    ("thin_plate", "a clamped step by alpha - 1 times the clamp"): (CLAMPED, 0.05),
+    ("thin_plate", "samples are 2 / (n - 1) apart"): (load("renderer", "dvr", n_ray_samples=64, doublings=[]), 2 / 63),
+    ("grazing_gradient", "DIST's scale is alpha sin(theta)"): (PLAIN, np.degrees(np.arcsin(0.9))),
+    ("empty_scene", "what is nearer than epsilon is hit"): (load("renderer", "idr"), 5e-5),
+    ("camera_inside", "what is nearer than epsilon is hit"): (load("renderer", "idr", epsilon=1e-3), 1e-3),
+}
+
+
+@pytest.mark.parametrize("case", CLOSED_FORM, ids=lambda case: f"{case[0]}: {case[1]}")
+def test_the_breakdown_is_that_of_the_closed_form(tmp_path, case):
+    renderer, severity = CLOSED_FORM[case]
+    metrics = run(tmp_path, case[0], renderer)
+    assert within(case[0], metrics, severity)
+    assert metrics["predicted"] == pytest.approx(severity)
+    assert metrics["trials"] <= metrics["grid_trials"] / 2
+
+
+def test_the_grazing_plane_breaks_where_eq_8_runs_out_of_steps(tmp_path):
+    metrics = run(tmp_path, "grazing_plane", load("renderer", "idr"))
+    assert metrics["predicted_1"] == pytest.approx(10.35, abs=0.05)  # DIST, Eq. 8: k = 50, alpha = 1, d = 1
+    assert within("grazing_plane", metrics, metrics["predicted"])
+
+
+def test_aggressive_marching_has_gradients_too_long_from_the_front_on(tmp_path):
+    metrics = run(tmp_path, "grazing_gradient", load("renderer", "dist"))
+    assert metrics["level"] < 0 and metrics["mild_successes"] == 0
+    assert metrics["predicted"] == 90
+
+
+def test_an_exception_of_a_trial_is_a_failure_and_the_search_continues(tmp_path):
+    class Fragile(IDR):
+        def render(self, field, rays):
+            if float(rays.origins.norm(dim=-1).max()) > 50:
+                raise RuntimeError("too far")
+            return super().render(field, rays)
+
+    metrics = run(tmp_path, "far_camera", Fragile(**vars(load("renderer", "idr"))))
+    assert within("far_camera", metrics, 50.0)
+    assert metrics["failed_crashed"] >= 3
+    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert {line["message"] for line in lines if not line["success"]} == {"RuntimeError: too far"}
+
+
+def test_a_renderer_that_always_raises_has_crashed(tmp_path):
+    class Broken(IDR):
+        def render(self, field, rays):
+            raise RuntimeError("no more")
+
+    run = run_of(tmp_path, Broken(**vars(load("renderer", "idr"))), ball_prior(), camera_of(8))
+    Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, SHORT, 16, Limits(60, 8)).execute(run)
+    assert run.record.status is RunStatus.CRASHED
+    assert run.record.reason == "every trial raised an error: RuntimeError: no more"
+    assert "trials raised an error, the last: RuntimeError: no more" in run.record.notes[0]
+
+
+def test_success_that_rises_with_severity_is_noted(tmp_path):
+    stress = stress_named("gap")
+    turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
+    run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
+    Stability(turned, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(60, 8)).execute(run)
+    assert any(note.startswith("success does not fall with severity") for note in run.record.notes)
+
+
+def test_a_flipped_sign_in_the_clamp_shows_as_that(tmp_path, monkeypatch):
+    before = run(tmp_path / "right", "grazing_gradient", load("renderer", "dvr", n_ray_samples=32, doublings=[]))
+    assert before["level"] > 0.7
+
+    def flipped(field, rays, distance, **settings):
+        right = gradients.implicit(field, rays, distance, **settings)
+        return 2 * right.detach() - right  # as a slope of the other sign has it
+
+    monkeypatch.setattr(renderers.dvr, "implicit", flipped)
+    after = run(tmp_path / "wrong", "grazing_gradient", load("renderer", "dvr", n_ray_samples=32, doublings=[]))
+    assert after["level"] < 0
+    assert after["failed_gradient_sign"] == after["trials"]
+
+
+def test_a_doubled_step_breaks_a_plate_that_sphere_tracing_never_misses(tmp_path, monkeypatch):
+    assert run(tmp_path / "right", "thin_plate", load("renderer", "idr"))["level"] > 1
+    monkeypatch.setattr(Stepping, "length", lambda self, value: 2 * value)
+    after = run(tmp_path / "wrong", "thin_plate", load("renderer", "idr"))
+    assert after["level"] < 0 and after["failed_lost"] == after["trials"]
+
+
+def test_a_threshold_ten_times_too_large_moves_the_empty_scene_by_as_much(tmp_path):
+    right = run(tmp_path / "right", "empty_scene", load("renderer", "idr", epsilon=5e-5))
+    wrong = run(tmp_path / "wrong", "empty_scene", load("renderer", "idr", epsilon=5e-4))
+    assert wrong["breakdown"] / right["breakdown"] == pytest.approx(10, rel=0.6)
+    assert within("empty_scene", wrong, 5e-4) and not within("empty_scene", wrong, 5e-5)
+
+
+@pytest.mark.parametrize(
+    ("guard", "stress"),
+    [
+        ({"extra_step_cap": 0.01}, "thin_plate"),
+        ({"step_back": True}, "thin_plate"),
+        ({"least_step": 1e-3}, "grazing_plane"),
+        ({"slope_samples": 2000}, "strong_distance"),
+    ],
+    ids=str,
+)
+def test_a_guard_moves_its_breakdown(tmp_path, guard, stress):
+    bare = run(tmp_path / "bare", stress, load("renderer", "dist", **AGGRESSIVE))
+    guarded = run(tmp_path / "guarded", stress, load("renderer", "dist", **AGGRESSIVE | guard))
+    assert guarded["level"] > bare["level"] + 0.03
+
+
+def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
+    metrics = run(tmp_path, "empty_scene", load("renderer", "idr", epsilon=1e-3))
+    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert len(lines) == metrics["trials"]
+    assert sum(not line["success"] for line in lines) == metrics["failed_false"] > 0
+    mildest = min(line["level"] for line in lines if not line["success"])
+    with np.load(tmp_path / "images.npz") as images:
+        assert images["kinds"].shape == images["true_distance"].shape == (24, 24)
+        assert (images["kinds"] == 3).sum() > 0
+        assert images["severity"] == pytest.approx(next(x["severity"] for x in lines if x["level"] == mildest))
+    assert (tmp_path / "failure.png").stat().st_size > 5000
+
+
+class Mine(IDR):
+    """A user's renderer without settings of its own."""
+
+
+def test_a_users_renderer_is_tested_like_all(tmp_path):
+    mine = Mine(**vars(load("renderer", "idr")))
+    theirs = run(tmp_path / "idr", "empty_scene", load("renderer", "idr"))
+    assert run(tmp_path / "mine", "empty_scene", mine) == theirs
+
+
+def test_a_missing_setting_is_an_error_before_the_first_trial(tmp_path):
+    with pytest.raises(Unsupported, match="IDR has no alpha, or it is null: choose another renderer"):
+        run(tmp_path, "alpha", load("renderer", "idr"))
+
+
+def test_a_task_without_a_stress_names_the_remedy():
+    with pytest.raises(ValueError, match="set stress=thin_plate"):
+        Stability(None, SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(60, 8))
+    with pytest.raises(ValueError, match=r"task\.resolution must be at least 8, not 4"):
+        replace(Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(60, 8)), resolution=4)
+
+
+def test_a_fit_is_searched_with_its_own_settings(tmp_path):
+    torch.manual_seed(0)
+    metrics = run(tmp_path, "missing_depth", load("renderer", "dist"))
+    assert metrics["grid_trials"] == 10 and metrics["trials"] <= 5
