@@ -2,7 +2,6 @@
 
 import os
 import re
-import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, check_names, nearest, register, renamed
 from bench.records.rows import register_rows
+from bench.run.signals import catch_signals, stopped_by
 from bench.run.sweep import Refused, Sweep
 
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
@@ -45,14 +45,14 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
             raised.append(error)
 
-    signal.signal(signal.SIGTERM, _stop)  # as Ctrl-C: the record says what happened
+    catch_signals()
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         _call(program)
         if raised:
             raise raised[0]
     except KeyboardInterrupt as error:
-        return _tell(str(error) or "stopped by Ctrl-C", INTERRUPTED)
+        return _tell(stopped_by(error), INTERRUPTED)
     except OverrideParseException as error:
         return _tell(
             f"cannot read {error.override!r}: write key=value, and quote a value with special characters as "
@@ -80,15 +80,13 @@ def unwritten(error: OSError) -> str:
 
 
 def _call(program: Callable[[], None]) -> None:
-    """Calls it; where a sweep was refused, raises why."""
+    """Calls it; where a sweep was refused, raises why, and KeyboardInterrupt also where that became another error."""
     try:
         program()
-    except Refused as refused:
-        raise refused.why from None
-
-
-def _stop(number: int, frame: object) -> None:
-    raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
+    except (Refused, Exception) as error:
+        if stopped := stopped_by(error):
+            raise KeyboardInterrupt(stopped) from error
+        raise error.why if isinstance(error, Refused) else error from None
 
 
 def _tell(message: str, code: int = FAILED) -> int:

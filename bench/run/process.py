@@ -14,6 +14,7 @@ import psutil
 
 from bench.records.record import RunStatus
 from bench.run.messages import Ended, Job, Message, Started, Step
+from bench.run.signals import raise_if_stopped, signals_delayed
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -68,15 +69,17 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
     process = context.Process(target=_enter, args=(job, childs, alive))
     with channel, ours:
-        process.start()
-        childs.close()
-        alive.close()
         try:
+            with signals_delayed():  # a request that breaks off would end the fork server
+                process.start()
+                childs.close()
+                alive.close()
             ending = _watch(process, channel, limits, receive)
             process.join(GRACE if ending is None else 0.0)
             return ending
         finally:
-            _end(process, channel, receive)
+            if process.pid is not None:
+                _end(process, channel, receive)
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:
@@ -93,11 +96,13 @@ def _watch(
     with suppress(psutil.NoSuchProcess):
         memory = psutil.Process(process.pid)
     while True:
+        raise_if_stopped()
         wait([channel, process.sentinel], timeout=INTERVAL)
         alive = process.is_alive()  # before the messages are read, so that none can arrive after the last read
         while channel.poll():
             try:
-                message = channel.recv()
+                with signals_delayed():  # what is left of a message would be taken for the next one
+                    message = channel.recv()
             except (EOFError, OSError):
                 return _died(process)
             if isinstance(message, Ended):

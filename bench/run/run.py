@@ -19,6 +19,7 @@ from bench.records.record import Record, RunStatus, now, read_record
 from bench.run.command import unwritten
 from bench.run.messages import Job, Message, Notice, Step
 from bench.run.process import RunLimits, run_isolated
+from bench.run.signals import stopped_by
 from bench.run.summary import show
 from bench.trackers import Tracker
 
@@ -99,19 +100,18 @@ def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
 def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
     """Runs a configuration; its record says that it is under way, and at the end how it ended."""
     record.write(folder)
-    started, interrupted, tracker = time.perf_counter(), False, None
+    started, stopped, tracker = time.perf_counter(), "", None
     try:
         limits = RunLimits(config.time_limit, config.memory_limit)
         tracker = build(config.tracker, "tracker", list(config.packages))
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
         with run_progress(record.name) as progress:
             _carry_out(Job(config, folder, record), limits, progress)
-    except KeyboardInterrupt as error:
-        who = str(error) or "stopped by Ctrl-C"
-        record.status, record.reason = RunStatus.KILLED, f"{who}; the same command starts it anew"
-        interrupted = True
-    except Exception as error:  # noqa: BLE001 - an error of the harness: a full disk, an invalid limit
+    except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit
+        stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
+        if stopped:
+            record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:
         record.seconds["total"] = time.perf_counter() - started
         record.ended = now()
@@ -121,7 +121,7 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
         record.write(folder)
     if tracker is not None:
         _export(tracker, folder, record)
-    if interrupted:
+    if stopped:
         raise Interrupted(folder, record)
     return record
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -208,6 +209,22 @@ def test_a_sweep_that_is_stopped_says_what_it_came_to(tmp_path):
     assert "3 planned: 2 not_run, 1 killed" in out
     assert Path(out.splitlines()[-1]) == next(tmp_path.glob("sweeps/*/plan.json")).parent
     assert (tmp_path / "index.html").is_file()
+
+
+@pytest.mark.parametrize("error", [AttributeError("a list was half made"), None], ids=["replaced", "swallowed"])
+def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrupt(tmp_path, monkeypatch, error):
+    def interrupted(text: str) -> None:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if error is not None:
+                raise error from None
+
+    monkeypatch.setattr("bench.run.run.run_progress", lambda name: nullcontext(interrupted(name)))
+    code, out, err = command("-m", *FAILING, "+renderer.how=not", "seed=0,1,2", f"results_dir={tmp_path}")
+    assert code == 130
+    assert "3 planned: 2 not_run, 1 killed" in out
+    assert err.strip() == "error: killed: stopped by Ctrl-C; the same command starts it anew"
 
 
 def test_a_cell_that_cannot_be_composed_stops_the_sweep_before_it_starts(isolated, tmp_path):
