@@ -86,7 +86,9 @@ def _call(program: Callable[[], None]) -> None:
     except (Refused, Exception) as error:
         if stopped := stopped_by(error):
             raise KeyboardInterrupt(stopped) from error
-        raise error.why if isinstance(error, Refused) else error from None
+        if isinstance(error, Refused):
+            raise error.why from None
+        raise
 
 
 def _tell(message: str, code: int = FAILED) -> int:
