@@ -19,8 +19,8 @@ def main() -> int:
         statuses.append(run_cell(config, write_index))
 
     code = command_line(one)
-    plan = Sweep.end()
-    if plan is not None:  # also after Ctrl-C: what was run stands there
+    if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there
+        Sweep.end()
         from bench.report.write.html import write_index
         from bench.run.summary import show_sweep
 

@@ -145,7 +145,7 @@ def thinnest(field: Field, rendering: Rendering, *, radius: float) -> float:
 
 
 @torch.no_grad()
-def thickness(field: Field, hits: Float[Tensor, "n 3"], *, radius: float) -> Float[Tensor, "n"]:
+def thickness(field: Field, hits: Float[Tensor, "n 3"], *, radius: float) -> Float[Tensor, " n"]:
     """How thick the shape is behind points of its surface, in scene units: the chord along the inward normal.
 
     That is what a ray at normal incidence crosses, and bounded away from zero on a smooth shape: 2 r on a sphere of
@@ -166,7 +166,7 @@ def thickness(field: Field, hits: Float[Tensor, "n 3"], *, radius: float) -> Flo
     return torch.full_like(hits[:, 0], inf).masked_scatter(steep, exits)
 
 
-def first_exit(field: Field, rays: Rays, *, radius: float) -> Float[Tensor, "n"]:
+def first_exit(field: Field, rays: Rays, *, radius: float) -> Float[Tensor, " n"]:
     """Where n rays that begin on the surface, inward, first leave the shape, in scene units; infinite where nowhere.
 
     The field is evaluated at distances that rise by sqrt(2), from the spacing 2 R / (n - 1) at the largest n to

@@ -20,15 +20,15 @@ REFINEMENTS = ("secant", "bisection")
 class Bracket:
     """Distances along n rays between which the field falls from positive to at most zero, and its values there."""
 
-    near: Float[Tensor, "n"]
-    far: Float[Tensor, "n"]
-    near_value: Float[Tensor, "n"]
-    far_value: Float[Tensor, "n"]
+    near: Float[Tensor, " n"]
+    far: Float[Tensor, " n"]
+    near_value: Float[Tensor, " n"]
+    far_value: Float[Tensor, " n"]
 
 
 def first_crossing(
     distance: Float[Tensor, "n samples"], value: Float[Tensor, "n samples"]
-) -> tuple[Bool[Tensor, "n"], Bracket]:
+) -> tuple[Bool[Tensor, " n"], Bracket]:
     """The first interval between neighbouring samples over which the field falls from free to occupied (DVR, Eq. 10).
 
     Args:
@@ -67,7 +67,7 @@ def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: in
 
 def refine(
     field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: int
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """The root in a bracket: the last estimate after `narrow`, and the field's value at the better end."""
     closer = narrow(field, rays, bracket, method=method, steps=steps)
     better = closer.near_value.abs() < closer.far_value.abs()

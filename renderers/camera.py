@@ -44,7 +44,7 @@ class Rays:
         """The points at `distance` along the rays."""
         return self.origins + distance[..., None] * self.directions
 
-    def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, "n"]) -> "Rays":
+    def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, " n"]) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
 
     def to(self, device: torch.device) -> "Rays":

@@ -12,7 +12,7 @@ from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind, steepest
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
-from renderers.rendering import Capabilities, Rendering, assemble
+from renderers.rendering import Capabilities, Rendering
 from renderers.silhouette import hinge_silhouette_loss
 
 
@@ -78,13 +78,9 @@ class DIST:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches without a graph, then evaluates again the samples that carry the gradient."""
-        flat = rays.flat()
         with torch.no_grad():
             front = self._trace(field, rays)
-        distance, closest = approximate_front(field, flat, front, alpha=self.alpha)
-        return assemble(
-            rays, self.sphere_radius, distance=distance, status=front.status, residual=front.value, closest=closest
-        )
+        return approximate_front(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]

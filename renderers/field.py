@@ -1,5 +1,6 @@
 """Fields: callables from points to values, negative inside; their properties; normals; the Meter."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -62,16 +63,10 @@ class Counts:
         return Counts(self.value - other.value, self.gradient - other.gradient)
 
 
-@dataclass(frozen=True)
-class Meter:
-    """A Field that counts the evaluations of the field that it wraps, so that no renderer can under-report.
-
-    A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
-    gradient other than zero was propagated back, counted when the backward pass arrives there.
-    """
+class Wrapper(ABC):
+    """A Field that does something beside evaluating the field that it wraps, whose properties it has."""
 
     inner: Field
-    counts: Counts = field(default_factory=Counts)
 
     @property
     def kind(self) -> Kind:
@@ -84,6 +79,21 @@ class Meter:
     @property
     def flops(self) -> Flops | None:
         return self.inner.flops
+
+    @abstractmethod
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
+
+
+@dataclass(frozen=True)
+class Meter(Wrapper):
+    """A Field that counts the evaluations of the field that it wraps, so that no renderer can under-report.
+
+    A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
+    gradient other than zero was propagated back, counted when the backward pass arrives there.
+    """
+
+    inner: Field
+    counts: Counts = field(default_factory=Counts)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)

@@ -1,24 +1,24 @@
 """The gradient rules. A rule attaches a gradient to distances that were found without a graph."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
 from renderers.march import Front
-from renderers.rendering import Status
+from renderers.rendering import Rendering, Status, assemble
 
 
 def approximate(
     field: Field,
     rays: Rays,
-    distance: Float[Tensor, "n"],
+    distance: Float[Tensor, " n"],
     *,
     alpha: float,
     sample_distance: Float[Tensor, "n samples"],
     sample_value: Float[Tensor, "n samples"],
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """DIST's approximate gradient: the field at the K samples of least magnitude, evaluated again with a graph.
 
     Source: DIST, Eq. 4 (first term only) and B.2. The derivative of the distance is alpha times the sum of the
@@ -48,40 +48,48 @@ def approximate(
     return distance + alpha * (total - total.detach()), table[:, 0]
 
 
-def approximate_front(
-    field: Field, rays: Rays, front: Front, *, alpha: float
-) -> tuple[Float[Tensor, "n"], tuple[Int[Tensor, "m"], Float[Tensor, "m"]]]:
-    """The approximate gradient for all n rays of a front, whose samples carry it.
+def approximate_front(field: Field, rays: Rays, front: Front, *, alpha: float, radius: float) -> Rendering:
+    """The rendering of a front with the approximate gradient, which its samples carry, where a ray has hit.
 
-    Returns:
-        the distances, with a gradient where the ray has hit, and the rays on which the field was evaluated, each with
-        its value of least magnitude.
+    Args:
+        rays: of any leading shape; the front has them in one row.
+        front: after the march.
+        alpha: the factor of the marching step.
+        radius: of the sphere about the origin that holds the shape.
     """
+    flat = rays.flat()
     hit = front.status == Status.HIT
     queried = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
     wanted = front.sample_value[queried].clone()
     wanted[~hit[queried], 1:] = torch.inf  # a ray without a hit needs only its closest sample
     carried, least = approximate(
         field,
-        rays[queried],
+        flat[queried],
         front.distance[queried],
         alpha=alpha,
         sample_distance=front.sample_distance[queried],
         sample_value=wanted,
     )
-    return torch.where(hit, front.distance.index_put((queried,), carried), front.distance), (queried, least)
+    return assemble(
+        rays,
+        radius,
+        distance=torch.where(hit, front.distance.index_put((queried,), carried), front.distance),
+        status=front.status,
+        residual=front.value,
+        closest=(queried, least),
+    )
 
 
 def fixed_samples(
-    field: Field, rays: Rays, distance: Float[Tensor, "n"], value: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
+    field: Field, rays: Rays, distance: Float[Tensor, " n"], value: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
     """The field's values at fixed distances along rays, `value`, evaluated again where a gradient is wanted."""
     return field(rays.at(distance.detach())) if torch.is_grad_enabled() else value
 
 
 def implicit(
-    field: Field, rays: Rays, distance: Float[Tensor, "n"], *, least_slope: float, keep_sign: bool = True
-) -> Float[Tensor, "n"]:
+    field: Field, rays: Rays, distance: Float[Tensor, " n"], *, least_slope: float, keep_sign: bool = True
+) -> Float[Tensor, " n"]:
     """The gradient of the distance to a level set, by implicit differentiation.
 
     Source: DVR, Eqs. 8 and 11. On the ray o + d w, the level set stays under the ray's end if

@@ -65,18 +65,18 @@ class Stepping:
 class Front:
     """The current ends of n marching rays, and the `samples` least field values found on each."""
 
-    distance: Float[Tensor, "n"]
-    entry: Float[Tensor, "n"]  # of the bounding sphere; a ray that moves back beyond it began inside
-    leave: Float[Tensor, "n"]
-    meets: Bool[Tensor, "n"]  # the ray meets the bounding sphere
-    active: Bool[Tensor, "n"]
-    fresh: Bool[Tensor, "n"]  # not evaluated yet, on this ray or on its coarse ray
-    status: Int8[Tensor, "n"]
-    value: Float[Tensor, "n"]
+    distance: Float[Tensor, " n"]
+    entry: Float[Tensor, " n"]  # of the bounding sphere; a ray that moves back beyond it began inside
+    leave: Float[Tensor, " n"]
+    meets: Bool[Tensor, " n"]  # the ray meets the bounding sphere
+    active: Bool[Tensor, " n"]
+    fresh: Bool[Tensor, " n"]  # not evaluated yet, on this ray or on its coarse ray
+    status: Int8[Tensor, " n"]
+    value: Float[Tensor, " n"]
     sample_distance: Float[Tensor, "n samples"]
     sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
-    safe: Float[Tensor, "n"]  # the step that the last value allowed, and the step taken
-    gone: Float[Tensor, "n"]
+    safe: Float[Tensor, " n"]  # the step that the last value allowed, and the step taken
+    gone: Float[Tensor, " n"]
 
     @staticmethod
     def on_sphere(rays: Rays, *, radius: float, samples: int) -> "Front":
@@ -99,7 +99,7 @@ class Front:
         )
 
     def split(
-        self, parent: Int[Tensor, "children"], coarse: Rays, rays: Rays, *, radius: float, careful: bool
+        self, parent: Int[Tensor, " children"], coarse: Rays, rays: Rays, *, radius: float, careful: bool
     ) -> "Front":
         """The front of finer rays, each continuing from its coarse `parent`; for `careful`, see Stepping.
 
@@ -165,14 +165,14 @@ def march_coarse_to_fine(
     return front
 
 
-def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, "children"]:
+def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, " children"]:
     """For each ray of the finer image, the index of the coarse ray that covers it."""
     index = torch.arange(coarse.numel(), device=device).view(coarse)
     doubled = index.repeat_interleave(2, -2).repeat_interleave(2, -1)
     return doubled[..., : fine[-2], : fine[-1]].reshape(-1)
 
 
-def _advance(front: Front, queried: Int[Tensor, "m"], value: Float[Tensor, "m"], stepping: Stepping) -> None:
+def _advance(front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], stepping: Stepping) -> None:
     """Moves the active rays `queried` by their field values, in place."""
     finite = value.isfinite()
     value = torch.where(finite, value, 0.0)
@@ -210,8 +210,8 @@ def _advance(front: Front, queried: Int[Tensor, "m"], value: Float[Tensor, "m"],
 
 
 def _taken_back(
-    front: Front, queried: Int[Tensor, "m"], reach: Float[Tensor, "m"], step: Float[Tensor, "m"]
-) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"]]:
+    front: Front, queried: Int[Tensor, " m"], reach: Float[Tensor, " m"], step: Float[Tensor, " m"]
+) -> tuple[Float[Tensor, " m"], Bool[Tensor, " m"]]:
     """The steps, with a step back where the last two empty spheres do not meet; and on which rays that is."""
     safe, gone = front.safe[queried], front.gone[queried]
     apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
@@ -222,7 +222,7 @@ def _taken_back(
 
 
 def _keep_least(
-    front: Front, queried: Int[Tensor, "m"], value: Float[Tensor, "m"], distance: Float[Tensor, "m"]
+    front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], distance: Float[Tensor, " m"]
 ) -> None:
     """Keeps the samples of least magnitude of each ray, in rising order."""
     values = torch.cat([front.sample_value[queried], value[:, None]], dim=1)

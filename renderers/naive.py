@@ -99,10 +99,7 @@ class Naive:
             front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
             stepping = Stepping(self.epsilon, 1.0, None, None, active_only=False, careful_split=False)
             march(field, rays, front, stepping, self.steps)
-        distance, closest = approximate_front(field, rays, front, alpha=1.0)
-        return assemble(
-            rays, self.sphere_radius, distance=distance, status=front.status, residual=front.value, closest=closest
-        )
+        return approximate_front(field, rays, front, alpha=1.0, radius=self.sphere_radius)
 
     def _unrolled(self, field: Field, rays: Rays) -> Rendering:
         entry, leave, meets = sphere_span(rays, self.sphere_radius)

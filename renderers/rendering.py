@@ -109,10 +109,10 @@ def assemble(
     rays: Rays,
     radius: float,
     *,
-    distance: Float[Tensor, "n"],
-    status: Int8[Tensor, "n"],
-    residual: Float[Tensor, "n"],
-    closest: tuple[Int[Tensor, "m"], Float[Tensor, "m"]],
+    distance: Float[Tensor, " n"],
+    status: Int8[Tensor, " n"],
+    residual: Float[Tensor, " n"],
+    closest: tuple[Int[Tensor, " m"], Float[Tensor, " m"]],
 ) -> Rendering:
     """The rendering of rays of any leading shape, from one answer per ray in one row.
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from bench.config import EvaluationSettings
-from bench.models.field import FieldChoice
 from bench.records.record import Record
+from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior.autodecoder import Prior
 from datasets.mesh import Mesh
@@ -42,6 +42,13 @@ def altered(settings: Any, changed: dict[str, Any]) -> Any:
         part, _, rest = name.partition(".")
         settings = replace(settings, **{part: altered(getattr(settings, part), {rest: value}) if rest else value})
     return settings
+
+
+def phases_of(run: RunContext, task: Any) -> list[str]:
+    """The phases that a task reports when it is executed, in their order."""
+    phases: dict[str, None] = {}
+    task.execute(replace(run, progress=lambda phase, done, total, loss=None: phases.setdefault(phase)))
+    return list(phases)
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:

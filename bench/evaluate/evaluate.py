@@ -1,11 +1,16 @@
-"""Compares a field with the truth: its mesh, its images, its metrics. Never within a timed phase."""
+"""Compares a field with the truth: its mesh, its images, its metrics in scene units. Never within a timed phase.
+
+The noise floor of a surface metric is the metric between two independent samples of the truth.
+"""
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 
-from bench.evaluate.metrics import Surface, image_metrics, surface_metrics
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.extract import extract
@@ -18,6 +23,131 @@ from renderers.field import Field, autograd_normals
 from renderers.fields.analytic import Shape, sphere
 
 REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
+DEFINITIONS: dict[str, str] = {
+    "chamfer_l2": "Sum of the mean squared distance from each point sampled on the prediction to the nearest"
+    " point sampled on the truth and the same from truth to prediction (DIST), in squared scene units.",
+    "chamfer_l1": "Half the sum of the mean distance from each point sampled on the prediction to the nearest"
+    " point sampled on the truth and the same from truth to prediction (DVR), in scene units.",
+    "chamfer_gt_to_pred": "Mean squared distance from each point sampled on the truth to the nearest point"
+    " sampled on the prediction, that direction only (DIST Table 3), in squared scene units.",
+    "accuracy": "Mean distance from each point sampled on the prediction to the nearest point sampled on the"
+    " truth, in scene units; lower is better.",
+    "completeness": "Mean distance from each point sampled on the truth to the nearest point sampled on the"
+    " prediction, in scene units; lower is better.",
+    "fscore": "Harmonic mean of precision (share of points sampled on the prediction that lie closer than the"
+    " threshold to a point sampled on the truth) and recall (the same from truth to prediction), from 0 to 1;"
+    " the threshold, in scene units, stands in the run's config.",
+    "normal_consistency": "Mean absolute cosine between the normal at each sampled point and the normal at"
+    " the nearest point sampled on the other surface, averaged over both directions (Occupancy Networks),"
+    " from 0 to 1.",
+    "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
+    " predicted and the true mask, in scene units; infinite if there is no such pixel.",
+    "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
+    " in at least one, from 0 to 1; two empty masks give 1.",
+}
+
+# The score of a run without a surface: the worst.
+_WORST_SURFACE = {
+    "chamfer_l2": np.inf,
+    "chamfer_l1": np.inf,
+    "chamfer_gt_to_pred": np.inf,
+    "accuracy": np.inf,
+    "completeness": np.inf,
+    "fscore": 0.0,
+    "normal_consistency": 0.0,
+}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points sampled on a surface, each with its normal.
+
+    Args:
+        points: in scene units; may be empty.
+        normals: of any length; only the direction counts, and a zero normal is consistent with none.
+
+    Raises:
+        ValueError: if a shape is wrong or a value is not finite.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+
+    def __post_init__(self) -> None:
+        for name, array in (("points", self.points), ("normals", self.normals)):
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise ValueError(f"{name} must have shape [n, 3], found {list(array.shape)}; stack xyz rows.")
+            if not np.isfinite(array).all():
+                bad = int((~np.isfinite(array).all(axis=1)).sum())
+                raise ValueError(f"{name} must be finite, found {bad} rows that are not; drop these samples.")
+        if len(self.points) != len(self.normals):
+            raise ValueError(
+                f"normals must be one per point, found {len(self.normals)} for {len(self.points)} points;"
+                " sample both together."
+            )
+
+
+def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: float) -> dict[str, float]:
+    """The seven surface metrics of `DEFINITIONS`, unscaled.
+
+    Args:
+        predicted: None or empty means that there is no surface, which scores worst: infinite distances, zero
+            `fscore` and `normal_consistency`.
+        truth: must not be empty.
+        threshold: of `fscore`, in scene units, positive.
+
+    Raises:
+        ValueError: if the truth is empty or the threshold is not positive.
+    """
+    if not threshold > 0:
+        raise ValueError(f"threshold must be positive, found {threshold}; give it in scene units, such as 0.01.")
+    if len(truth.points) == 0:
+        raise ValueError("truth must have points, found 0; sample the true surface before comparing with it.")
+    if predicted is None or len(predicted.points) == 0:
+        return dict(_WORST_SURFACE)
+    to_truth, cosine_to_truth = _nearest(predicted, truth)
+    to_predicted, cosine_to_predicted = _nearest(truth, predicted)
+    return {
+        "chamfer_l2": float(np.mean(to_truth**2) + np.mean(to_predicted**2)),
+        "chamfer_l1": float(np.mean(to_truth) + np.mean(to_predicted)) / 2,
+        "chamfer_gt_to_pred": float(np.mean(to_predicted**2)),
+        "accuracy": float(np.mean(to_truth)),
+        "completeness": float(np.mean(to_predicted)),
+        "fscore": _harmonic_mean(float(np.mean(to_truth < threshold)), float(np.mean(to_predicted < threshold))),
+        "normal_consistency": float(np.mean(cosine_to_truth) + np.mean(cosine_to_predicted)) / 2,
+    }
+
+
+def image_metrics(
+    predicted_depth: Float[np.ndarray, "h w"],
+    predicted_mask: Bool[np.ndarray, "h w"],
+    truth_depth: Float[np.ndarray, "h w"],
+    truth_mask: Bool[np.ndarray, "h w"],
+) -> dict[str, float]:
+    """`depth_mae` and `mask_iou` of `DEFINITIONS`, unscaled.
+
+    Depth is camera z and is read only where both masks are true. A predicted depth there that is not a number
+    counts as infinitely wrong.
+
+    Raises:
+        ValueError: if shapes differ, a mask is not boolean, or a true foreground depth is not finite.
+    """
+    arrays = (predicted_depth, predicted_mask, truth_depth, truth_mask)
+    if len({array.shape for array in arrays}) > 1:
+        shapes = ", ".join(str(list(array.shape)) for array in arrays)
+        raise ValueError(f"depths and masks must share one shape, found {shapes}; render at the size of the truth.")
+    for name, mask in (("predicted_mask", predicted_mask), ("truth_mask", truth_mask)):
+        if mask.dtype != np.bool_:
+            raise ValueError(f"{name} must be boolean, found {mask.dtype}; compare it with a threshold first.")
+    if not np.isfinite(truth_depth[truth_mask]).all():
+        raise ValueError("truth_depth must be finite where truth_mask is true, found a value that is not; repair it.")
+    common, either = predicted_mask & truth_mask, predicted_mask | truth_mask
+    error = np.abs(predicted_depth[common].astype(np.float64) - truth_depth[common])
+    error[np.isnan(error)] = np.inf
+    return {
+        "depth_mae": float(error.mean()) if common.any() else np.inf,
+        "mask_iou": float(common.sum() / either.sum()) if either.any() else 1.0,
+    }
 
 
 @dataclass(frozen=True)
@@ -76,3 +206,20 @@ def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
     return View(camera, depth, normals.cpu(), rendering.hit.cpu())
+
+
+def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:
+    """From each source point to the nearest target point: distance, and absolute cosine of the normals."""
+    distance, index = cKDTree(target.points).query(source.points)
+    return distance, np.abs((_unit(source.normals) * _unit(target.normals)[index]).sum(axis=1))
+
+
+def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The vectors at unit length in float64; zero stays zero."""
+    vectors = vectors.astype(np.float64)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def _harmonic_mean(first: float, second: float) -> float:
+    return 2 * first * second / (first + second) if first + second > 0 else 0.0

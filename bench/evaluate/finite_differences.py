@@ -25,17 +25,17 @@ class Differences:
 
     code: Float[Tensor, "m directions"]
     camera: Float[Tensor, "m 6"]
-    valid: Bool[Tensor, "m"]
+    valid: Bool[Tensor, " m"]
 
 
 def differences(
     decoder: Decoder,
-    code: Float[Tensor, "code_length"],
+    code: Float[Tensor, " code_length"],
     directions: Float[Tensor, "code_length directions"],
     *,
     camera: Camera,
-    pixels: Int[Tensor, "m"],
-    distance: Float[Tensor, "m"],
+    pixels: Int[Tensor, " m"],
+    distance: Float[Tensor, " m"],
 ) -> Differences:
     """Central differences of the distance to the surface that the rays of some pixels hit.
 
@@ -71,7 +71,7 @@ def image_differences(
     directions: Float[Tensor, "code_length directions"],
     *,
     camera: Camera,
-    pixels: Int[Tensor, "m"],
+    pixels: Int[Tensor, " m"],
     step: float,
     supersampling: int,
     lipschitz: float,
@@ -101,7 +101,7 @@ def image_differences(
     return torch.stack(columns, dim=1)
 
 
-def subrays(camera: Camera, pixels: Int[Tensor, "m"], count: int) -> Rays:
+def subrays(camera: Camera, pixels: Int[Tensor, " m"], count: int) -> Rays:
     """The rays [m, count^2] through a regular grid in each of some pixels."""
     fine = camera.resized(camera.height * count, camera.width * count).rays()
     rows, columns = pixels // camera.width, pixels % camera.width
@@ -111,7 +111,7 @@ def subrays(camera: Camera, pixels: Int[Tensor, "m"], count: int) -> Rays:
     return Rays(fine.origins[down, across], fine.directions[down, across])
 
 
-def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, "m"]) -> tuple[Tensor, Tensor]:
+def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, " m"]) -> tuple[Tensor, Tensor]:
     """Roots of a batch of fields, a row each, along m rays near known roots; and which of them were found."""
 
     def values(distance: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, "m"]) -> tuple[
     return second, (second_value.abs() < RESIDUAL) & ((second - start).abs() < CLEAR)
 
 
-def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, "m"], *, margin: Tensor) -> Bool[Tensor, "m"]:
+def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
     """Whether the field stays above a margin along the ray up to the hit."""
     entry, _, _ = sphere_span(rays)
     shares = torch.linspace(0, 1, BEFORE, dtype=distance.dtype)

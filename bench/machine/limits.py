@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.machine.environment import MemoryPeak
 from bench.records.record import RunStatus
 from renderers.checks import check_positive
-from renderers.field import Field, Flops, Kind
+from renderers.field import Field, Wrapper
 
 MEMORY_INTERVAL = 0.05  # seconds between two checks of the memory
 
@@ -51,7 +51,7 @@ class Limits:
 
 
 @dataclass
-class Watched:
+class Watched(Wrapper):
     """A Field that raises LimitReached when it is evaluated, or differentiated, beyond the limits."""
 
     inner: Field
@@ -60,18 +60,6 @@ class Watched:
     where: str = ""  # " in a step": the end of the reason
     started: float = field(default_factory=lambda: time.perf_counter())
     memory_checked: float = 0.0
-
-    @property
-    def kind(self) -> Kind:
-        return self.inner.kind
-
-    @property
-    def lipschitz(self) -> float | None:
-        return self.inner.lipschitz
-
-    @property
-    def flops(self) -> Flops | None:
-        return self.inner.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         self._check()

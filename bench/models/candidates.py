@@ -1,19 +1,257 @@
-"""The fields to choose from, by name, and the settings of their fits."""
+"""The candidates: parts with a formula, unions of them, networks of one shape, and grids fitted near the surface.
 
-import re
+Every part has a pose; sizes are logarithms.
+"""
+
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
-from bench.config import nearest
-from bench.models.analytic import PARTS, OnePart, UnionOf
-from bench.models.learned import NarrowBand, Network
-from bench.models.model import Candidate
-from bench.setup.auto import AUTO
-from renderers.checks import check_at_least, check_share
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bench.models.model import Candidate, Model, Seen
+from bench.setup.fields import parsed
+from bench.shape_prior.autodecoder import initialise_to_sphere
+from renderers.camera import rigid
+from renderers.field import Flops, Kind
+from renderers.fields.analytic import Shape, sphere, superquadric
+from renderers.fields.analytic import box as exact_box
+from renderers.fields.grid import FLOPS, Grid
+from renderers.fields.mlp import BoundDecoder, Decoder
+
+LEARNING_RATE = 0.01  # of Adam: what one step may change, in scene units, radians or shares of a size
+MIN_HALF_SIZE = 0.01  # scene units: least half size of a part at its start
+MAX_POINTS, MAX_CLUSTER_POINTS = 3000, 200  # most points that are clustered, and most of one cluster for its box
+CUBE_HALF_SIZE = 0.3  # scene units: of the cube whose corners are used where too few points are known
+CLUSTERINGS = 6  # each is a start of a union
+MISSED_QUANTILE = 0.75  # of the errors of a smaller union: new parts begin at the points above it
+ROUND_LOGIT, EDGED_LOGIT = 0.0, -1.5  # initial rounding of a box: logit of radius over least half size
+EXPONENTS = (1.0, 20.0)  # of a superquadric: 1 is an octahedron, 20 nearly a box
+DEEP = 8  # layers from which on a skip connection feeds the points in again half-way, as in DeepSDF
+MAX_RATE, RATE_OF_WIDTH = 2e-3, 0.4  # Adam's rate: at most 2e-3, inversely as the width (Yang et al. 2021)
+START_RADIUS = 0.5  # of the sphere that a network is initialised to, in scene units
+REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
+BAND = 2.0  # cells to both sides of the surface whose samples are fitted
+GRID_RATE = 2e-3  # scene units
+
+
+def sphere_part(parameters: Float[Tensor, "4"]) -> Shape:
+    """A sphere from its centre and the logarithm of its radius."""
+    return sphere(parameters[3].exp(), parameters[:3])
+
+
+def ellipsoid(parameters: Float[Tensor, "9"]) -> Shape:
+    """An ellipsoid from its pose, see `_placed`, and the logarithms of its half axes."""
+    return _placed(sphere(1.0).stretch(parameters[6:9].exp()), parameters)
+
+
+def box(parameters: Float[Tensor, "9"]) -> Shape:
+    """A box from its pose, see `_placed`, and the logarithms of its half sizes."""
+    return _placed(exact_box(parameters[6:9].exp()), parameters)
+
+
+def rounded(parameters: Float[Tensor, "10"]) -> Shape:
+    """A rounded box: as a box, then the logit of its edges' radius over its least half size; at 1 it is a capsule."""
+    return union(parameters[None])
+
+
+def union(parameters: Float[Tensor, "parts 10"]) -> Shape:
+    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long."""
+    sizes = parameters[:, 6:9].exp()
+    radii = torch.sigmoid(parameters[:, 9]) * sizes.amin(-1)
+    turns = _turn(parameters)
+    cores = exact_box(sizes - radii[:, None])
+
+    def bound(points: Tensor) -> Tensor:
+        local = torch.einsum("...pi,pij->...pj", points[..., None, :] - parameters[:, :3], turns)
+        return (cores(local) - radii).amin(-1)
+
+    return Shape(bound, Kind.DISTANCE if len(parameters) == 1 else Kind.BOUND)
+
+
+def quadric(parameters: Float[Tensor, "11"]) -> Shape:
+    """A superquadric: as an ellipsoid, then the logits of two exponents between `EXPONENTS`, on a logarithmic scale."""
+    low, high = EXPONENTS
+    powers = low * (high / low) ** torch.sigmoid(parameters[9:11])
+    return _placed(superquadric(parameters[6:9].exp(), powers), parameters)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape with a formula: its field, its initial parameters after pose and sizes, and its operations per value."""
+
+    shape: Callable[[Tensor], Shape]
+    extra: tuple[float, ...]
+    flops: int
+
+
+PARTS = {
+    "sphere": Part(sphere_part, (), 10),
+    "ellipsoid": Part(ellipsoid, (), 50),
+    "box": Part(box, (), 50),
+    "rounded_box": Part(rounded, (ROUND_LOGIT,), 55),
+    "superquadric": Part(quadric, (0.0, 0.0), 110),
+}
+
+
+@dataclass(frozen=True)
+class OnePart:
+    """A part of `PARTS` that begins in the smallest box about the observed points."""
+
+    name: str
+    follows: ClassVar[bool] = False
+    tries: ClassVar[int] = 1
+
+    @property
+    def flops(self) -> int:
+        """An estimate: a power counts as 20."""
+        return PARTS[self.name].flops
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """A sphere about the points' middle, or the part in their oriented box."""
+        part = PARTS[self.name]
+        around = _subsampled(seen.points)
+        if self.name == "sphere":
+            middle = (around.amax(0) + around.amin(0)) / 2
+            radius = torch.linalg.vector_norm(around - middle, dim=-1).mean()
+            parameters = torch.cat([middle, radius.log()[None]])
+        else:
+            parameters = torch.cat([_fitting_box(around), torch.tensor(part.extra)])
+        return [_model(self.name, parameters, lambda tensors: part.shape(tensors[0]), self.flops, seen)]
+
+
+@dataclass(frozen=True)
+class UnionOf:
+    """A union of rounded boxes.
+
+    Some starts have one part about each of `count` clusters of the observed points. One start keeps the parts of a
+    smaller union, and adds parts about clusters of the points that this union is furthest from.
+    """
+
+    count: int
+    follows: ClassVar[bool] = False
+    tries: ClassVar[int] = CLUSTERINGS + 1
+
+    @property
+    def name(self) -> str:
+        return f"union_{self.count}"
+
+    @property
+    def flops(self) -> int:
+        return self.count * PARTS["rounded_box"].flops
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """One start for each clustering, and one from the previous union, if there is one."""
+        old = [] if seen.previous is None else _parts_of(seen.previous)
+        kept = old if len(old) < self.count else []
+        if not len(seen.points):
+            choices = [[*kept, *_random_boxes(self.count - len(kept), seen.seed)]]
+        else:
+            points = _subsampled(seen.points)
+            choices = [_cluster_boxes(points, self.count, seen.seed + start) for start in range(CLUSTERINGS)]
+            if kept:
+                error = seen.previous_values(points).abs()
+                missed = points[error >= error.quantile(MISSED_QUANTILE)]
+                choices.append([*kept, *_cluster_boxes(missed, self.count - len(kept), seen.seed)])
+        return [
+            _model(self.name, torch.stack(parts), lambda parameters: union(parameters[0]), self.flops, seen)
+            for parts in choices
+        ]
+
+
+@dataclass(frozen=True)
+class Network:
+    """Fully connected ReLU layers from a point to a distance (see `renderers.fields.mlp.Decoder`, without a code)."""
+
+    layers: int
+    width: int
+    follows: ClassVar[bool] = True
+    tries: ClassVar[int] = 1
+
+    @property
+    def name(self) -> str:
+        return f"network_{self.layers}x{self.width}"
+
+    @cached_property
+    def size(self) -> int:
+        """The number of parameters."""
+        return sum(parameter.numel() for parameter in self._decoder(0).parameters())
+
+    @cached_property
+    def flops(self) -> int:
+        return self._bound(list(self._decoder(0).parameters())).flops.value
+
+    def starts(self, seen: Seen) -> list[Model]:
+        """Initialised near the distance of a sphere; the warm start then fits it to the previous field."""
+        decoder = self._decoder(seen.seed)
+        initialise_to_sphere(decoder, START_RADIUS)
+        parameters = [parameter.detach().to(seen.device).requires_grad_() for parameter in decoder.parameters()]
+        return [Model(self.name, parameters, self._bound, min(MAX_RATE, RATE_OF_WIDTH / self.width), metric=False)]
+
+    def _decoder(self, seed: int) -> Decoder:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return Decoder(layers=self.layers, width=self.width, code_length=0, skip=self._skip, narrow=True)
+
+    @property
+    def _skip(self) -> int:
+        return self.layers // 2 if self.layers >= DEEP else 0
+
+    def _bound(self, free: list[Tensor]) -> BoundDecoder:
+        pairs = list(zip(free[::2], free[1::2], strict=True))
+        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], self._skip)
+
+
+@dataclass(frozen=True)
+class NarrowBand:
+    """A grid of distances: those near the surface are fitted, the others keep the values of the previous field."""
+
+    resolution: int
+    follows: ClassVar[bool] = True
+    tries: ClassVar[int] = 1
+
+    @property
+    def name(self) -> str:
+        return f"grid_{self.resolution}"
+
+    @property
+    def flops(self) -> int:
+        return FLOPS.value
+
+    @torch.no_grad()
+    def starts(self, seen: Seen) -> list[Model]:
+        """The previous field's values; fitted are those near its surface or near the observed points."""
+        axis = torch.linspace(-REACH, REACH, self.resolution, device=seen.device)
+        corners = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        values = seen.previous_values(corners.view(-1, 3)).to(seen.device)
+        cell = 2 * REACH / (self.resolution - 1)
+        near = values.abs() < BAND * cell
+        near[self._near_points(seen.points.to(seen.device), cell)] = True
+        band = near.nonzero().squeeze(-1)
+
+        def grid(free: list[Tensor]) -> Grid:
+            kept = values.index_put((band,), free[0])
+            return Grid(kept.view(self.resolution, self.resolution, self.resolution), REACH)
+
+        free = values[band].clone().requires_grad_()
+        return [Model(self.name, [free], grid, GRID_RATE, metric=False, held=len(values) - len(free))]
+
+    def _near_points(self, points: Float[Tensor, "n 3"], cell: float) -> Int[Tensor, " m"]:
+        """Indices of the samples within `BAND` cells of a point, along each axis."""
+        reach = int(BAND)
+        steps = torch.arange(1 - reach, reach + 1, device=points.device)
+        offsets = torch.cartesian_prod(steps, steps, steps)
+        low = ((points + REACH) / cell).floor().long()
+        corners = (low[:, None] + offsets).clamp(0, self.resolution - 1).reshape(-1, 3)
+        place = (corners[:, 0] * self.resolution + corners[:, 1]) * self.resolution + corners[:, 2]
+        return place.unique()
+
 
 SIZED: dict[str, Callable[..., Candidate]] = {"union": UnionOf, "network": Network, "grid": NarrowBand}
-EXAMPLES = ("union_3", "network_4x64", "grid_32", "auto", "prior")
-FORMS = "union_K, network_LAYERSxWIDTH, grid_N"
 PAPERS = Network(8, 512)  # that of DeepSDF and DIST, without a code
 
 
@@ -23,119 +261,81 @@ def candidate(name: str) -> Candidate:
     Raises:
         ValueError: where no candidate has this name.
     """
-    if name in PARTS:
-        return OnePart(name)
-    kind, _, size = name.partition("_")
-    in_form = re.fullmatch("[0-9]+x[0-9]+" if kind == "network" else "[0-9]+", size, re.ASCII)
-    if kind not in SIZED or in_form is None:
-        known = [*PARTS, *EXAMPLES]
-        raise ValueError(f"unknown field {name!r}{nearest(name, known)}; or {FORMS}, in numbers")
-    return SIZED[kind](*map(int, size.split("x")))
+    kind, sizes = parsed(name)
+    return SIZED[kind](*sizes) if sizes else OnePart(name)
 
 
-@dataclass(frozen=True)
-class FitSettings:
-    """How each candidate is fitted.
-
-    Args:
-        iterations: of the fit with the renderer's loss.
-        fewest_rays: least share of the rays in an iteration where their number follows the loss; 1 always takes all.
-            See `bench.setup.auto.rays_share`.
-        warm_iterations, warm_points: iterations and points per iteration of the warm start, which fits the observed
-            points or the previous field without a renderer.
-        eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are not distances by
-            construction.
-    """
-
-    iterations: int
-    fewest_rays: float
-    warm_iterations: int
-    warm_points: int
-    eikonal_weight: float
-
-    def __post_init__(self) -> None:
-        for name in ("iterations", "warm_points"):
-            check_at_least(f"models.fit.{name}", getattr(self, name), 1, "conf/scale has values that work")
-        check_share("models.fit.fewest_rays", self.fewest_rays, "1 always takes all rays")
-        check_at_least("models.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")
-        check_at_least("models.fit.eikonal_weight", self.eikonal_weight, 0, "0 switches the term off")
+def _model(name: str, parameters: Tensor, shape: Callable[[list[Tensor]], Shape], flops: int, seen: Seen) -> Model:
+    free = parameters.float().to(seen.device).requires_grad_()
+    return Model(
+        name,
+        [free],
+        lambda parameters: replace(shape(parameters), flops=Flops(flops, 2 * flops)),
+        LEARNING_RATE,
+        metric=True,
+    )
 
 
-@dataclass(frozen=True)
-class GrowthSettings:
-    """How `field=auto` tries candidates.
-
-    Args:
-        trial: share of a whole fit's iterations that a candidate's trial takes.
-        patience: successive candidates that may be tried without improvement.
-        budget: most cost of all candidates together, as a multiple of the final candidate's whole fit; by the cost
-            model of `bench.models.growth.cost`, not by a clock, so that a run ends the same on every machine.
-    """
-
-    trial: float
-    patience: int
-    budget: float
-
-    def __post_init__(self) -> None:
-        check_share("models.growth.trial", self.trial, "1/40 shows whether a candidate is better than the one before")
-        check_at_least("models.growth.patience", self.patience, 1, "5 finds a grid behind small networks")
-        check_at_least("models.growth.budget", self.budget, 1, "2 is twice the fit of the final candidate")
+def _placed(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
+    """The shape turned by the rotation vector, parameters 3 to 5, and moved by the translation, the first three."""
+    return shape.rotate(_turn(parameters)).translate(parameters[:3])
 
 
-@dataclass(frozen=True)
-class ViewSettings:
-    """The views that candidates are fitted to and evaluated on.
-
-    Args:
-        fitted: number of views whose depth and silhouette are given.
-        held_out: number of views that are held out.
-        share: of the fitted views' rays that are held out as well.
-        elevation: largest absolute elevation of the cameras, in degrees.
-        rays: of the fitted views, drawn in each iteration.
-    """
-
-    fitted: int
-    held_out: int
-    share: float
-    elevation: float
-    rays: int
-
-    def __post_init__(self) -> None:
-        check_at_least("models.views.fitted", self.fitted, 1, "12 cover all sides")
-        check_at_least("models.views.held_out", self.held_out, 2, "8 give a standard error")
-        check_at_least("models.views.rays", self.rays, 1, "1024 work")
-        if not 0 <= self.share < 1:
-            raise ValueError(f"models.views.share must lie between 0 and 1, not {self.share}: 0.1 holds out a tenth")
-        if not 0 <= self.elevation < 90:
-            raise ValueError(f"models.views.elevation must lie between 0 and 90 degrees, not {self.elevation}: 60")
+def _turn(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
+    """Rotation matrices of the rotation vectors, parameters 3 to 5."""
+    vector = parameters[..., 3:6]
+    return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
 
 
-@dataclass(frozen=True)
-class ModelSettings:
-    """The fields to choose from, and the settings of their fits.
+def _subsampled(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
+    """At most about `MAX_POINTS` of the points; the corners of a cube at the origin where there are fewer than four."""
+    if len(points) < 4:
+        return CUBE_HALF_SIZE * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    every = max(len(points) // MAX_POINTS, 1)
+    return points[::every].cpu()
 
-    Args:
-        candidates: their names, the smallest first; see `candidate`.
-        fit: settings of each fit.
-        growth: settings of `field=auto`.
-        views: of a known shape, where candidates are fitted to one.
-    """
 
-    candidates: tuple[str, ...]
-    fit: FitSettings
-    growth: GrowthSettings
-    views: ViewSettings
+def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
+    """Pose and logarithmic half sizes of the smallest box about the points."""
+    import trimesh  # here, since it takes a second and most runs do not need it
 
-    def __post_init__(self) -> None:
-        check_at_least("the length of models.candidates", len(self.candidates), 1, "conf/scale has complete lists")
-        if len(set(self.candidates)) < len(self.candidates):
-            raise ValueError(f"models.candidates must name each candidate once, not {', '.join(self.candidates)}")
-        self.all()
+    to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + _jitter(len(points)))
+    place = np.linalg.inv(to_box)
+    angle, axis, _ = trimesh.transformations.rotation_from_matrix(place)
+    sizes = np.log(np.maximum(extents / 2, MIN_HALF_SIZE))
+    return torch.from_numpy(np.concatenate([place[:3, 3], angle * np.array(axis), sizes])).float()
 
-    def all(self) -> list[Candidate]:
-        """All candidates."""
-        return [candidate(name) for name in self.candidates]
 
-    def requested(self, field: str) -> list[Candidate]:
-        """All candidates for `auto`, else the one of that name."""
-        return self.all() if field == AUTO else [candidate(field)]
+def _jitter(count: int) -> Float[np.ndarray, "n 3"]:
+    """A little noise, so that points on a plane have a box with a volume."""
+    return 1e-4 * np.random.default_rng(0).standard_normal((count, 3))
+
+
+def _cluster_boxes(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Float[Tensor, "10"]]:
+    """A rounded box about each of `count` clusters of the points (k-means)."""
+    from scipy.cluster.vq import kmeans2
+
+    _, labels = kmeans2(points.numpy().astype(np.float64), count, minit="++", rng=np.random.default_rng(seed))
+    clusters = [points[torch.from_numpy(labels == label)] for label in range(count)]
+    return [torch.cat([_cluster_box(cluster, points), torch.tensor([EDGED_LOGIT])]) for cluster in clusters]
+
+
+def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, "9"]:
+    """The smallest box about a cluster; a small one in its middle where it has too few points for a box."""
+    if len(cluster) >= 4:
+        return _fitting_box(cluster[:: -(-len(cluster) // MAX_CLUSTER_POINTS)])
+    middle = cluster.mean(0) if len(cluster) else points.mean(0)
+    return torch.cat([middle, torch.zeros(3), torch.full((3,), MIN_HALF_SIZE).log()])
+
+
+def _random_boxes(count: int, seed: int) -> list[Float[Tensor, "10"]]:
+    """Rounded boxes at random places, for where no point is known."""
+    draw = torch.Generator().manual_seed(seed)
+    sizes = torch.full((3,), CUBE_HALF_SIZE).log()
+    places = CUBE_HALF_SIZE * (2 * torch.rand(count, 3, generator=draw) - 1)
+    return [torch.cat([place, torch.zeros(3), sizes, torch.tensor([EDGED_LOGIT])]) for place in places]
+
+
+def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:
+    """The parts of a union; none of another model."""
+    return list(model.parameters[0].detach().cpu()) if model.candidate.startswith("union_") else []

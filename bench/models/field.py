@@ -1,34 +1,30 @@
-"""The field of an unknown shape: a code of the dataset's prior (`field=prior`), or a fitted candidate."""
+"""The field of an unknown shape, where it is no code of a prior: the candidate that early growth ends on."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.evaluate.evaluate import Evaluation, evaluate
-from bench.evaluate.metrics import DEFINITIONS
-from bench.models.candidates import ModelSettings
+from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
+from bench.models.candidates import candidate
 from bench.models.fit import FitProblem, Fitter
 from bench.models.growth import Growth, grow
 from bench.models.observations import Observations
 from bench.models.views import Views
 from bench.pictures.filmstrip import Filmstrip
-from bench.pictures.run_figures import Given
-from bench.pictures.views import draw_run
+from bench.pictures.run_figures import Given, draw_run
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import Weights
 from bench.solve.problem import InverseTask, check_field_gradient
-from bench.solve.solve import COSTS, draw, note_costs, note_result, solve_task
+from bench.solve.solve import COSTS, draw, note_costs, note_result
 from datasets.scene import Scene
 from datasets.truth import Truth
 from renderers.field import Field
 from renderers.rendering import Renderer
 
-PRIOR = "prior"
 NOT_RENDERED = ("part", "phase", "candidate", "eikonal", "rays_share")  # keys that curves of other runs lack
 ENDED = {
     "field": "the candidate that field=auto ended on, or the one that was requested",
@@ -55,101 +51,68 @@ class ShapeTask(InverseTask, Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class FieldChoice:
-    """The field that a run asks for.
-
-    Args:
-        name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
-        models: the fields to choose from, and the settings of their fits; not read for "prior".
+def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
+    """Executes a task whose unknown is a shape by early growth, or with the one field that was requested.
 
     Raises:
-        ValueError: for an unknown name.
+        Unsupported: where the renderer cannot do what the task or its field needs.
     """
-
-    name: str
-    models: ModelSettings | None
-
-    def __post_init__(self) -> None:
-        if not self.of_prior:
-            self.models.requested(self.name)
-
-    @property
-    def of_prior(self) -> bool:
-        """Whether it is a code of the dataset's prior."""
-        return self.name == PRIOR
-
-    def solve(self, task: ShapeTask, run: RunContext) -> None:
-        """Executes a task whose unknown is a shape.
-
-        Raises:
-            Unsupported: where the renderer cannot do what the task or its field needs.
-        """
-        if self.of_prior:
-            solve_task(task, run)
-        else:
-            self._solve_by_growth(task, run)
-
-    def known_shape(self, run: RunContext, weights: Weights, otherwise: Callable[[], Field]) -> Field:
-        """The scene's true shape, for a task with another unknown; fitted before the task's clock begins.
-
-        Args:
-            run: its record notes what was fitted.
-            weights: of a view's loss.
-            otherwise: gives the shape for `field=prior`, where no field is fitted.
-
-        Raises:
-            Unsupported: where the renderer has no gradient towards the field.
-            ValueError: where no field could be fitted.
-        """
-        if self.of_prior:
-            return otherwise()
-        inputs, settings = run.inputs, self.models
-        check_field_gradient(inputs.renderer)
-        truth = Truth(inputs.scene.mesh)
-        views = Views(truth, inputs.views, settings.views, weights, inputs.renderer, inputs.device)
+    inputs, record, choice = run.inputs, run.record, run.inputs.field
+    check_field_gradient(inputs.renderer)
+    record.definitions = DEFINITIONS | COSTS | ENDED
+    observations, given = task.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
+    lines: list[dict[str, Any]] = []
+    with curve_file(run.folder) as write_line:
 
         def on_line(name: str, line: dict[str, Any]) -> None:
-            run.progress(f"fitting {name}", line["iteration"] + 1, settings.fit.iterations, line["total"])
+            lines.append({**line, "candidate": name})
+            write_line(lines[-1])
+            run.progress(f"fitting {name}", line["iteration"] + 1, task.optimiser.iterations, line["total"])
 
-        fitter = Fitter(views.observations(inputs.seed), settings.fit, inputs.seed, inputs.device, on_line)
-        growth = grow(fitter, settings.requested(self.name), settings.growth)
-        if growth.fitted.failed:
-            reason = growth.fitted.evidence.reason
-            raise ValueError(f"no field was found for the known shape: {reason}; field=prior takes the shape itself")
-        run.record.notes = [*run.record.notes, *growth.summary(self.name)]
-        return growth.fitted.model.frozen()
+        settings = replace(choice.models.fit, iterations=task.optimiser.iterations)
+        fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
+        growth = grow(fitter, [candidate(name) for name in choice.candidates], choice.models.growth)
+    clock = time.perf_counter()
+    _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
+    first, last = growth.first, growth.fitted.model.frozen()
+    record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
+    metrics, notes = after.metrics | ended(growth), tuple(growth.summary(choice.name))
+    status, reason = verdict(growth, after)
+    note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
+    curve = rendered(lines, growth.fitted.evidence.candidate)
+    filmstrip = Filmstrip(inputs, "by candidate")
+    for name, field in growth.fields.items():
+        filmstrip.add(name, field)
+    draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
+    record.seconds["evaluation"] = time.perf_counter() - clock
 
-    def _solve_by_growth(self, task: ShapeTask, run: RunContext) -> None:
-        """Executes a task by early growth, or with the one field that was requested."""
-        inputs, record = run.inputs, run.record
-        check_field_gradient(inputs.renderer)
-        record.definitions = DEFINITIONS | COSTS | ENDED
-        observations, given = task.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
-        lines: list[dict[str, Any]] = []
-        with curve_file(run.folder) as write_line:
 
-            def on_line(name: str, line: dict[str, Any]) -> None:
-                lines.append({**line, "candidate": name})
-                write_line(lines[-1])
-                run.progress(f"fitting {name}", line["iteration"] + 1, task.optimiser.iterations, line["total"])
+def fitted_shape(run: RunContext, weights: Weights) -> Field:
+    """The scene's true shape as a field that is fitted to it, for a task with another unknown.
 
-            settings = replace(self.models.fit, iterations=task.optimiser.iterations)
-            fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
-            growth = grow(fitter, self.models.requested(self.name), self.models.growth)
-        clock = time.perf_counter()
-        _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
-        first, last = growth.first, growth.fitted.model.frozen()
-        record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
-        metrics, notes = after.metrics | ended(growth), tuple(growth.summary(self.name))
-        status, reason = verdict(growth, after)
-        note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
-        curve = rendered(lines, growth.fitted.evidence.candidate)
-        filmstrip = Filmstrip(inputs, "by candidate")
-        for name, field in growth.fields.items():
-            filmstrip.add(name, field)
-        draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
-        record.seconds["evaluation"] = time.perf_counter() - clock
+    Args:
+        run: its record notes what was fitted.
+        weights: of a view's loss.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+        ValueError: where no field could be fitted.
+    """
+    inputs, choice, settings = run.inputs, run.inputs.field, run.inputs.field.models
+    check_field_gradient(inputs.renderer)
+    truth = Truth(inputs.scene.mesh)
+    views = Views(truth, inputs.views, settings.views, weights, inputs.renderer, inputs.device)
+
+    def on_line(name: str, line: dict[str, Any]) -> None:
+        run.progress(f"fitting {name}", line["iteration"] + 1, settings.fit.iterations, line["total"])
+
+    fitter = Fitter(views.observations(inputs.seed), settings.fit, inputs.seed, inputs.device, on_line)
+    growth = grow(fitter, [candidate(name) for name in choice.candidates], settings.growth)
+    if growth.fitted.failed:
+        reason = growth.fitted.evidence.reason
+        raise ValueError(f"no field was found for the known shape: {reason}; field=prior takes the shape itself")
+    run.record.notes = [*run.record.notes, *growth.summary(choice.name)]
+    return growth.fitted.model.frozen()
 
 
 def rendered(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:

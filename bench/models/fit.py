@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.models.analytic import OnePart
-from bench.models.candidates import FitSettings
+from bench.models.candidates import OnePart
 from bench.models.choice import Evidence
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Model, Seen
@@ -19,6 +18,7 @@ from bench.models.observations import Observations, generator
 from bench.models.warm_start import WarmStart, scattered
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
+from bench.setup.fields import FitSettings
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import NotReached, OptimiserSettings, Unsupported, check_kind

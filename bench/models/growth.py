@@ -5,11 +5,11 @@ from math import ceil
 
 import torch
 
-from bench.models.candidates import GrowthSettings
 from bench.models.choice import Evidence
 from bench.models.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate
+from bench.setup.fields import GrowthSettings
 from renderers.adaptive_samples import final_note
 from renderers.field import Field
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from bench.models.candidates import ViewSettings
 from bench.models.held_out import HeldOut
 from bench.models.observations import Holdout, RayObservations, held, hold_out, together
 from bench.setup.auto import footprint
+from bench.setup.fields import ViewSettings
 from bench.solve.observed_view import GivenView, Weights
 from datasets.scene import see
 from datasets.truth import Truth

@@ -2,17 +2,15 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-import torch
 from jaxtyping import Float
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
 
 from bench.evaluate.evaluate import render_view
-from bench.pictures.run_figures import window
+from bench.pictures.run_figures import normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from bench.pictures.views import picture_normals
 from bench.setup.inputs import RunInputs
 from datasets.scene import View, see
 from datasets.truth import Truth
@@ -50,6 +48,7 @@ class Filmstrip:
             camera = self.inputs.scene.view.camera if camera is None else camera
             self.frames[name] = render_view(field, self._fine(camera), self.inputs)
 
+    @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:
         """Writes strip.png into a run folder, and film.gif or film.webp where one is requested.
 
@@ -61,10 +60,8 @@ class Filmstrip:
         if not self.frames:
             return
         truth = see(Truth(self.inputs.scene.mesh), self._fine(self.inputs.scene.view.camera))
-        matplotlib.use("Agg")
-        with matplotlib.rc_context(SCREEN):
-            strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
-            strip.savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
+        strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
+        strip.savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
         if self.inputs.evaluation.film is not None:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
@@ -93,7 +90,7 @@ def _strip(frames: dict[int | str, View], truth: View, title: str, chosen: str |
     shown = {str(name).replace("_", " "): view for name, view in frames.items()} | {"truth": truth}
     part = window([view.mask.numpy() for view in shown.values()])
     true = truth.mask.numpy()
-    columns = [(_normals(view)[part], silhouette_image(view.mask.numpy(), true)[part]) for view in shown.values()]
+    columns = [(normals_image(view)[part], silhouette_image(view.mask.numpy(), true)[part]) for view in shown.values()]
     montage = np.concatenate([np.concatenate([_framed(cell) for cell in column], axis=0) for column in columns], axis=1)
     size = montage.shape[0] / 2
     figure = Figure(figsize=(1.25 * len(shown) + 0.4, 3.1), layout="constrained")
@@ -115,12 +112,9 @@ def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
 def _animate(path: Path, views: list[View], truth: View) -> None:
     """Writes an animation: normals left, silhouette error right."""
     true = truth.mask.numpy()
-    pictures = [np.concatenate([_normals(view), silhouette_image(view.mask.numpy(), true)], axis=1) for view in views]
+    pictures = [
+        np.concatenate([normals_image(view), silhouette_image(view.mask.numpy(), true)], axis=1) for view in views
+    ]
     images = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in pictures]
     lasting = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_SECONDS)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=lasting, loop=0)
-
-
-def _normals(view: View) -> Float[np.ndarray, "height width 3"]:
-    shown = torch.where(view.mask[..., None], picture_normals(view) / 2 + 0.5, 1.0)
-    return shown.clamp(0, 1).numpy()

@@ -1,21 +1,33 @@
 """Pictures of a run: its input, the shape before and after, and the truth. Not part of any timing."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import atan2, degrees
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
+from matplotlib import rc_context
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from torch import Tensor
 
+from bench.evaluate.evaluate import render_view
+from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import BOTH, MISSED, PAPER, SCREEN, SPURIOUS, WRONG, bare, silhouette_image
-from datasets.scene import View
+from bench.setup.inputs import RunInputs
+from datasets.scene import View, see
+from datasets.truth import Truth
+from renderers.camera import Camera
+from renderers.field import Field
 
-LIGHT = np.array([-0.35, -0.6, -0.72])  # from the camera's upper left, in camera axes
+LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes to the right, up, towards the camera
+BEHIND = 160.0  # degrees about the vertical axis from the given camera to the one behind
+BEHIND_ELEVATION = 25.0  # degrees
 TERMS = {
     "total": "#222222",
     "depth": "#1f77b4",
@@ -61,60 +73,68 @@ class Given:
         return f"{'mask and ' if self.mask else ''}{int(self.observed.sum())} depths"
 
 
-def draw_all(
+@rc_context(SCREEN)
+def draw_run(
     folder: Path,
-    *,
-    pairs: tuple[ViewPair, ViewPair, ViewPair],
+    inputs: RunInputs,
+    fields: tuple[Field, Field],
     given: Given,
     curve: list[dict[str, Any]],
     title: str,
 ) -> None:
-    """Writes the pictures of a run: summary.png and its parts.
+    """Writes the pictures of a run, summary.png and its parts, at a higher resolution than in the run.
 
     Args:
         folder: the run folder.
-        pairs: views before, after, and of the truth.
+        inputs: of the run.
+        fields: before and after the optimisation.
         given: the input of the run.
         curve: lines of curve.jsonl.
         title: of the summary.
     """
-    matplotlib.use("Agg")
-    with matplotlib.rc_context(SCREEN):
-        figures = {
-            "input": _input(given),
-            "depth": _row(pairs, _show_depth, "Depth (camera z, scene units)"),
-            "normals": _row(pairs, _show_normals, "Normals (right, up, towards the camera as red, green, blue)"),
-            "silhouette": _row(pairs[:2], _show_silhouette(pairs[2]), "Silhouette error"),
-            "curve": _curve(curve),
-            "summary": _summary(pairs, given, title),
-        }
-        for name, figure in figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+    front, back = _cameras(inputs)
+    truth = Truth(inputs.scene.mesh)
+    pairs = (
+        *(
+            ViewPair(name, render_view(field, front, inputs), render_view(field, back, inputs))
+            for name, field in zip(("before", "after"), fields, strict=True)
+        ),
+        ViewPair("truth", see(truth, front), see(truth, back)),
+    )
+    figures = {
+        "input": _input(given),
+        "depth": _row(pairs, _show_depth, "Depth (camera z, scene units)"),
+        "normals": _row(pairs, _show_normals, "Normals (right, up, towards the camera as red, green, blue)"),
+        "silhouette": _row(pairs[:2], _show_silhouette(pairs[2]), "Silhouette error"),
+        "curve": _curve(curve),
+        "summary": _summary(pairs, given, title),
+    }
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
 
 
+@rc_context(SCREEN)
 def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     """Writes the terms of a loss over iterations and seconds."""
-    matplotlib.use("Agg")
-    with matplotlib.rc_context(SCREEN):
-        _curve(curve).savefig(path, dpi=110, bbox_inches="tight")
+    _curve(curve).savefig(path, dpi=110, bbox_inches="tight")
 
 
+@rc_context(SCREEN)
 def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
     """Writes a picture that compares a view with the true one: normals of both, missed and spurious pixels."""
-    matplotlib.use("Agg")
     both = ViewPair("rendered", found, found), ViewPair("reference", true, true)
-    with matplotlib.rc_context(SCREEN):
-        figure = Figure(figsize=(9.2, 3.5), layout="constrained")
-        axes = figure.subplots(1, 3)
-        for axis, pair in zip(axes, both, strict=False):
-            _show_normals(axis, pair, both)
-            axis.set_title(f"normals, {pair.title}")
-        _show_silhouette(both[1])(axes[2], both[0], both)
-        axes[2].set_title("silhouette error")
-        figure.suptitle(title)
-        figure.savefig(path, dpi=110, bbox_inches="tight")
+    figure = Figure(figsize=(9.2, 3.5), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for axis, pair in zip(axes, both, strict=False):
+        _show_normals(axis, pair, both)
+        axis.set_title(f"normals, {pair.title}")
+    _show_silhouette(both[1])(axes[2], both[0], both)
+    axes[2].set_title("silhouette error")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
+@rc_context(SCREEN)
 def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, title: str) -> None:
     """Writes images.npz and failure.png: rendered and true distances, and the kind of error of each pixel.
 
@@ -125,36 +145,61 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
         title: of the picture.
     """
     np.savez_compressed(folder / "images.npz", severity=severity, **images)  # type: ignore[arg-type]
-    matplotlib.use("Agg")
-    with matplotlib.rc_context(SCREEN):
-        figure = Figure(figsize=(9.2, 3.6), layout="constrained")
-        found, true, kinds = figure.subplots(1, 3)
-        true_distance = images["true_distance"]
-        known = true_distance[np.isfinite(true_distance)]
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-        for axis, name, heading in ((found, "distance", "found"), (true, "true_distance", "truth")):
-            shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
-            axis.set_title(f"distance along the ray, {heading}")
-            bare(axis)
-        figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
-        kinds.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
-        kinds.set_title("kind of error")
-        bare(kinds)
-        there = [name for number, name in enumerate(KINDS) if (images["kinds"] == number).any()]
-        patches = [Patch(facecolor=KINDS[name], edgecolor="#888888", label=name) for name in there]
-        kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
-        figure.suptitle(title)
-        figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
+    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    found, true, kinds = figure.subplots(1, 3)
+    true_distance = images["true_distance"]
+    known = true_distance[np.isfinite(true_distance)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    for axis, name, heading in ((found, "distance", "found"), (true, "true_distance", "truth")):
+        shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
+        axis.set_title(f"distance along the ray, {heading}")
+        bare(axis)
+    figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
+    kinds.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
+    kinds.set_title("kind of error")
+    bare(kinds)
+    there = [name for number, name in enumerate(KINDS) if (images["kinds"] == number).any()]
+    patches = [Patch(facecolor=KINDS[name], edgecolor="#888888", label=name) for name in there]
+    kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
+    figure.suptitle(title)
+    figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
 
 
+@rc_context(SCREEN)
 def draw_ladder(folder: Path, metrics: dict[str, Any], title: str) -> None:
     """Writes ladder.png into a run folder."""
-    matplotlib.use("Agg")
-    with matplotlib.rc_context(SCREEN):
-        figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-        panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
-        figure.suptitle(title)
-        figure.savefig(folder / "ladder.png", dpi=110)
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
+    figure.suptitle(title)
+    figure.savefig(folder / "ladder.png", dpi=110)
+
+
+def save_images(folder: Path, found: View, true: View, **more: np.ndarray) -> None:
+    """Writes `folder/images.npz`: normals of both [h, w, 3], hits of both and the depth error [h, w], and `more`."""
+    arrays = {
+        "normals": picture_normals(found).half(),
+        "reference_normals": picture_normals(true).half(),
+        "hit": found.mask,
+        "reference_hit": true.mask,
+        "depth_error": torch.where(found.mask & true.mask, (found.depth - true.depth).abs(), torch.nan),
+    }
+    plain = {name: array.numpy() for name, array in arrays.items()}
+    np.savez_compressed(folder / "images.npz", **plain, **more)  # type: ignore[arg-type]
+
+
+def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
+    """Normals with axes to the right, up and towards the camera, as pictures show them."""
+    rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
+    return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
+
+
+def _cameras(inputs: RunInputs) -> tuple[Camera, Camera]:
+    """The scene's camera at the pictures' resolution, and one behind the shape."""
+    camera, size = inputs.scene.view.camera, inputs.evaluation.picture
+    x, _, z = camera.center.tolist()
+    views = replace(inputs.views, resolution=size)
+    behind = views.camera(degrees(atan2(x, z)) + BEHIND, BEHIND_ELEVATION)
+    return camera.resized(size, size), behind
 
 
 def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
@@ -228,13 +273,12 @@ def _show_depth(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
 
 
 def _show_normals(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    flipped = _camera_normals(pair.front) * [1, -1, -1]  # to right, up, towards the camera
-    shown = np.where(pair.front.mask.numpy()[..., None], flipped / 2 + 0.5, 1.0).clip(0, 1)
-    return bare(axis).imshow(shown[window([other.front.mask.numpy() for other in pairs])])
+    part = window([other.front.mask.numpy() for other in pairs])
+    return bare(axis).imshow(normals_image(pair.front)[part])
 
 
 def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    shade = 0.25 + 0.75 * (_camera_normals(pair.back) @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
+    shade = 0.25 + 0.75 * (picture_normals(pair.back).numpy() @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
     shown = np.where(pair.back.mask.numpy(), shade, 1.0)
     part = window([other.back.mask.numpy() for other in pairs])
     return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
@@ -272,20 +316,15 @@ def _show_given(axis: Any, given: Given, inches: float = 2.0) -> Any:
     )
 
 
-def window(masks: list[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
-    """The smallest square part of an image that holds all masks, with a margin."""
-    together = np.any(masks, axis=0)
-    if not together.any():
-        return slice(0, together.shape[0]), slice(0, together.shape[1])
-    low = np.array([np.nonzero(together.any(1 - axis))[0][0] for axis in (0, 1)])
-    high = np.array([np.nonzero(together.any(1 - axis))[0][-1] + 1 for axis in (0, 1)])
-    size = min(int((high - low).max() * 1.12) + 2, min(together.shape))
-    start = np.clip((low + high - size) // 2, 0, np.array(together.shape) - size)
-    return slice(start[0], start[0] + size), slice(start[1], start[1] + size)
+def window(masks: Sequence[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
+    """The smallest square part of an image that holds all masks, with a margin, as slices of its pixels."""
+    top, left, side = (round(max(masks[0].shape) * length) for length in style.window(masks, margin=0.12))
+    return slice(top, top + side), slice(left, left + side)
 
 
-def _camera_normals(view: View) -> Float[np.ndarray, "height width 3"]:
-    return view.normals.numpy() @ view.camera.world_to_camera[:3, :3].numpy().T
+def normals_image(view: View) -> Float[np.ndarray, "height width 3"]:
+    """The normals of `picture_normals` as red, green, blue; white where there is no surface."""
+    return torch.where(view.mask[..., None], picture_normals(view) / 2 + 0.5, 1.0).clamp(0, 1).numpy()
 
 
 def _depth_range(pairs: tuple[ViewPair, ...]) -> tuple[float, float]:

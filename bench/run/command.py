@@ -13,9 +13,9 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, check_names, nearest, register, renamed
-from bench.records.rows import register_rows
-from bench.run.signals import catch_signals, stopped_by
+from bench.config import CONF, check_names, register
+from bench.hints import nearest, renamed
+from bench.run.process import catch_signals, stopped_by
 from bench.run.sweep import Refused, Sweep
 
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
@@ -32,7 +32,6 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         the exit status: 0, or the status of a mistake that was told on standard error.
     """
     register()
-    register_rows()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
     begun: list[DictConfig] = []
     raised: list[OSError | ValueError] = []
@@ -118,7 +117,8 @@ def _explain(error: Exception) -> str:
         if found := re.search(r"Could not override '([^']+)'", message):
             if (CONF / found[1]).is_dir():
                 return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
-            return f"unknown key {found[1]!r}" + (renamed(found[1]) or nearest(found[1], _known_keys()))
+            known = _known_keys()
+            return f"unknown key {found[1]!r}" + (renamed(found[1], known) or nearest(found[1], known))
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
             new = renamed(f"{found[1]}/{found[2]}")
             return f"unknown {found[1]} {found[2]!r}" + (new or nearest(found[2], _choices(found[1])))

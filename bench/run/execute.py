@@ -1,24 +1,56 @@
-"""Executes one run in this process; every failure is recorded with its reason."""
+"""Executes one run, in a process of its own or in the command's; every failure is recorded with its reason."""
 
+import fcntl
 import logging
+import os
+import signal
+import sys
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 
-from bench.config import build, check_top_level
+from bench.config import build, check_top_level, register
 from bench.machine import environment
-from bench.machine.contention import Contention
-from bench.models.field import FieldChoice
-from bench.progress import Report
+from bench.machine.environment import Contention
+from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
-from bench.setup.inputs import RunContext, RunInputs, set_up
+from bench.run.process import Ended, Job, Notice, Started, Step
+from bench.setup.inputs import RunContext, set_up
 from bench.solve.problem import Unsupported
 from bench.tasks.task import TakesField, Task
+
+INTERVAL = 0.05  # least seconds between two messages on progress
+
+
+def main(job: Job, channel: Connection, parent: Connection) -> None:
+    """Runs a job to its end in the process of a run; its output goes to the job's log.
+
+    Args:
+        job: the configuration, the folder and the record.
+        channel: where messages are sent to.
+        parent: the reading end of a pipe that only the parent holds open, and never writes to.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
+    signal.signal(signal.SIGTERM, _stop)
+    _die_with(parent)
+    _print_to(job.folder / "log.txt")
+    register()  # the configuration may have to be resolved here
+    notices_to(lambda text: channel.send(Notice(text)))
+    channel.send(Started())
+    try:
+        execute(job.config, job.folder, job.record, progress=_Progress(channel), checkpoint=channel.send)
+    except KeyboardInterrupt:
+        channel.send(job.record)  # what is known; then it ends by SIGTERM, as its exit code should say
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
+    channel.send(job.record)
+    channel.send(Ended())
 
 
 def execute(
@@ -43,7 +75,7 @@ def execute(
         task = build(config.task, "task", list(config.packages))
         if not isinstance(task, Task):
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/task.py")
-        inputs = _with_field(set_up(config, progress), config)
+        inputs = set_up(config, progress)
         if not inputs.field.of_prior and not isinstance(task, TakesField):
             raise ValueError(f"task={record.task} does not take field={config.field}: leave it out")
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
@@ -68,10 +100,42 @@ def execute(
         _close_log(log)
 
 
-def _with_field(inputs: RunInputs, config: DictConfig) -> RunInputs:
-    """The inputs with the kind of field for an unknown shape, and the candidates for it."""
-    models = build(config.models, "models", target="bench.models.candidates.ModelSettings")
-    return replace(inputs, field=FieldChoice(config.field, models))
+class _Progress:
+    """Sends progress to the parent: when a phase begins, when it ends, and between these once per `INTERVAL`."""
+
+    def __init__(self, channel: Connection) -> None:
+        self.channel, self.sent, self.phase = channel, 0.0, ""
+
+    def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None:
+        now = time.perf_counter()
+        if now - self.sent > INTERVAL or done == total or phase != self.phase:
+            self.sent, self.phase = now, phase
+            self.channel.send(Step(phase, done, total, loss))
+
+
+def _stop(number: int, frame: object) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second signal must not interrupt the handling of the first
+    raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
+
+
+def _die_with(parent: Connection) -> None:
+    """Makes the system end this process when the pipe's other end closes, also during native code."""
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    fcntl.fcntl(parent.fileno(), fcntl.F_SETOWN, os.getpid())
+    flags = fcntl.fcntl(parent.fileno(), fcntl.F_GETFL)
+    fcntl.fcntl(parent.fileno(), fcntl.F_SETFL, flags | os.O_ASYNC)
+    if parent.poll():  # closed before the signal was set up
+        os._exit(1)
+
+
+def _print_to(path: Path) -> None:
+    """Appends the output of Python and native code to a file from now on."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.close(log)
 
 
 def _one_line(error: BaseException) -> str:

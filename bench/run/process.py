@@ -1,20 +1,22 @@
-"""Runs a job in a child process that can be stopped at any moment, and reports how it ended."""
+"""The process of a run, seen from its parent: the job, the messages, the limits, how it ends, and signals."""
 
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from pkgutil import iter_modules
 
 import psutil
+from omegaconf import DictConfig
 
-from bench.records.record import RunStatus
-from bench.run.messages import Ended, Job, Message, Started, Step
-from bench.run.signals import raise_if_stopped, signals_delayed
+import bench.tasks
+import datasets
+from bench.records.record import Record, RunStatus
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -22,6 +24,53 @@ BOOT = 120.0  # seconds in which a child must be ready; a cold disk is slow
 GIB = 2**30
 # Signals that come from outside: from a user, a batch system, or the operating system where memory runs out.
 EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+# Signals are noted as well as raised: an interrupted library may swallow or replace the exception.
+_stopped = ""  # by which signal, in words
+_delayed = False  # within `signals_delayed`
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run for a child process: the configuration, the folder for its files, and the record that it fills."""
+
+    config: DictConfig
+    folder: Path
+    record: Record
+
+
+@dataclass(frozen=True)
+class Step:
+    """Progress within a phase; see `bench.progress.Report`."""
+
+    phase: str
+    done: int
+    total: int
+    loss: float | None
+
+    @property
+    def when(self) -> str:
+        """The phase and the step for the reason of a failure: `while optimising (3 of 20)`."""
+        return f"{'while' if self.done < self.total else 'after'} {self.phase} ({self.done} of {self.total})"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A message for the user."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Started:
+    """The child is ready: the time limit counts from now on."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The child has sent its final record."""
+
+
+Message = Started | Step | Notice | Record | Ended
 
 
 @dataclass(frozen=True)
@@ -64,7 +113,7 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
         multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["bench.run.child"])  # so that children need not import torch
+    context.set_forkserver_preload(preloaded())
     channel, childs = context.Pipe()
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
     process = context.Process(target=_enter, args=(job, childs, alive))
@@ -82,8 +131,16 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
                 _end(process, channel, receive)
 
 
+def preloaded() -> list[str]:
+    """Modules that are slow to import and that runs need: their processes inherit them from the fork server."""
+    packages = bench.tasks, datasets
+    named = [module.name for one in packages for module in iter_modules(one.__path__, f"{one.__name__}.")]
+    # bench first: it sets what torch reads at its import; _dynamo: optimisers import it when they are created.
+    return ["bench", "open3d", "torch._dynamo", "bench.run.execute", *named]
+
+
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:
-    from bench.run.child import main
+    from bench.run.execute import main
 
     main(job, channel, parent)
 
@@ -159,3 +216,44 @@ def machine_memory() -> int:
         with suppress(OSError, ValueError):
             total = min(total, int(path.read_text()))
     return total
+
+
+def catch_signals() -> None:
+    """From now on Ctrl-C and SIGTERM raise KeyboardInterrupt, which says which of them it was."""
+    global _stopped
+    _stopped = ""
+    signal.signal(signal.SIGTERM, _stop)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background jobs ignore it
+        signal.signal(signal.SIGINT, _stop)
+
+
+def _stop(number: int, frame: object) -> None:
+    global _stopped
+    _stopped = "stopped by Ctrl-C" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
+    if not _delayed:
+        raise KeyboardInterrupt(_stopped)
+
+
+def stopped_by(error: BaseException) -> str:
+    """The signal, in words, of which an error is the outcome; empty where it has another cause."""
+    if isinstance(error, KeyboardInterrupt):
+        return str(error) or "stopped by Ctrl-C"
+    return _stopped
+
+
+@contextmanager
+def signals_delayed() -> Iterator[None]:
+    """Signals that arrive in the block raise KeyboardInterrupt at its end."""
+    global _delayed
+    _delayed = True
+    try:
+        yield
+    finally:
+        _delayed = False
+    raise_if_stopped()
+
+
+def raise_if_stopped() -> None:
+    """Raises KeyboardInterrupt after a signal, also where nothing came of the first one."""
+    if _stopped:
+        raise KeyboardInterrupt(_stopped)

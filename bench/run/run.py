@@ -13,15 +13,12 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import Isolation, build, register
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
-from bench.records.folder import Claim, claimed, release
-from bench.records.identity import Identity, identify
+from bench.records.folder import Claim, Identity, claimed, identify, release
 from bench.records.record import Record, RunStatus, now, read_record
 from bench.run.command import unwritten
-from bench.run.messages import Job, Message, Notice, Step
-from bench.run.process import RunLimits, run_isolated
-from bench.run.signals import stopped_by
+from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, stopped_by
 from bench.run.summary import show
-from bench.trackers import Tracker
+from bench.trackers import Nothing, Tracker
 
 LOST = "lost"  # the status that the driver gets of a run whose record could not be written
 LAST_LINES, LAST_BYTES = 80, 16_384  # most of the log that the record of a failed run keeps
@@ -119,7 +116,7 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
             record.log = _last_lines(folder / "log.txt")
         release(folder)
         record.write(folder)
-    if tracker is not None:
+    if tracker is not None and not isinstance(tracker, Nothing):
         _export(tracker, folder, record)
     if stopped:
         raise Interrupted(folder, record)

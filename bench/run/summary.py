@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.records.format import count, number, seconds
+from bench.records.read import Plan
 from bench.records.record import NOT_RUN, Record, RunStatus
-from bench.run.sweep import Plan
 
 ROWS = (  # metric, its name in the table, factor, which direction is better
     ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),

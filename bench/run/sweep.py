@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import check_names
 from bench.progress import display
 from bench.records.files import digest
+from bench.records.folder import identify
 from bench.records.format import number, seconds
-from bench.records.identity import identify
-from bench.records.plans import Plan, PlannedCell
+from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
 
 SHOWN = (  # metric, its name in the line of a cell, factor
@@ -50,11 +50,10 @@ class Sweep:
         cls.shown.enter_context(followed(plan))
 
     @classmethod
-    def end(cls) -> Plan | None:
-        """The plan of the sweep that has ended, if there was one."""
+    def end(cls) -> None:
+        """Shows no more of the sweep, which has ended."""
         cls.shown.close()
-        plan, cls.plan = cls.plan, None
-        return plan
+        cls.plan = None
 
 
 class Planner(Callback):

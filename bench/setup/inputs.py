@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import cast
 
 import torch
 from omegaconf import DictConfig
@@ -14,35 +14,14 @@ from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
 from bench.setup.auto import AUTO, at_pixel_precision, resolved
+from bench.setup.fields import FieldChoice
 from bench.shape_prior.autodecoder import Prior
 from bench.shape_prior.store import prior_for, prior_settings
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.adaptive_samples import final_note, follow
-from renderers.field import Field
 from renderers.rendering import Renderer
-
-
-@runtime_checkable
-class UnknownField(Protocol):
-    """The field of a task's unknown shape: a code of the dataset's prior, or another field."""
-
-    @property
-    def of_prior(self) -> bool: ...
-
-    @property
-    def models(self) -> Any:
-        """The fields to choose from, `bench.models.candidates.ModelSettings`."""
-        ...
-
-    def solve(self, task: Any, run: "RunContext") -> None:
-        """Executes a task whose unknown is a shape."""
-        ...
-
-    def known_shape(self, run: "RunContext", weights: Any, otherwise: Callable[[], Field]) -> Field:
-        """The scene's true shape, for a task with another unknown; that of `otherwise` where none is fitted."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -58,9 +37,9 @@ class RunInputs:
     seed: int
     device: torch.device
     cache: Path  # folder of priors and references
+    field: FieldChoice  # what an unknown shape is made of
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
-    field: UnknownField | None = None  # what an unknown shape is made of
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
 
     @cached_property
@@ -141,6 +120,7 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
         seed=config.seed,
         device=device,
         cache=cache,
+        field=FieldChoice(config.field, build(config.models, "models", target="bench.setup.fields.ModelSettings")),
         notes=tuple(notes),
         trained=trained,
     )

@@ -66,6 +66,11 @@ class PriorSettings:
         check_positive("prior.learning_rate", self.learning_rate, "5e-3 works")
         check_positive("prior.surface_width", self.surface_width, "0.05 works")
 
+    @property
+    def of_one_shape(self) -> bool:
+        """Whether it is no prior, but a network that is fitted to one shape."""
+        return self.shapes == 1
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -133,6 +138,7 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimiser, lambda step: 0.5 * (1 + cos(pi * min(step / settings.steps, 1.0)))
     )
+    phase = "fitting the network" if settings.of_one_shape else "training the prior"
     shapes, count = samples.distances.shape
     rows = min(settings.shapes_per_step, shapes)
     for step in range(settings.steps):
@@ -147,7 +153,7 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         optimiser.step()
         schedule.step()
         if step % 50 == 0 or step + 1 == settings.steps:
-            progress("training the prior", step + 1, settings.steps, loss.item())
+            progress(phase, step + 1, settings.steps, loss.item())
     return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
 
 

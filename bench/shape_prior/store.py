@@ -40,7 +40,8 @@ def prior_for(
         with file_lock(priors_dir, prior_key(dataset, settings)):
             path = find(dataset, settings, priors_dir)  # another run may have made it meanwhile
             if path is None:
-                notice(f"training a prior of {dataset.name}, once; it is stored in {priors_dir}")
+                what = "fitting a network to one shape" if settings.of_one_shape else "training a prior"
+                notice(f"{what} of {dataset.name}, once; it is stored in {priors_dir}")
                 path = make_prior(dataset, settings, priors_dir, device, progress)
     return _load(path, settings)
 
@@ -103,7 +104,7 @@ def _surface_errors(
 
     A network of one shape has no other shapes: it is evaluated at its own code.
     """
-    if settings.shapes == 1:
+    if settings.of_one_shape:
         return {"training": surface_error(prior.decoder, prior.codes, samples)}
     unseen = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress)
     return {

@@ -11,16 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
-from bench.evaluate.metrics import DEFINITIONS
-from bench.pictures.run_figures import Given
-from bench.pictures.views import draw_run
+from bench.pictures.run_figures import Given, draw_run
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
+from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import NotReached
-from bench.solve.starts import Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter
-from renderers.fields.mlp import Decoder
 from renderers.fields.moved import Moved
 
 Terms = dict[str, Tensor]
@@ -50,22 +47,44 @@ class CodePenalty:
 
 @dataclass
 class CodeProblem:
-    """The problem of finding a code, and a similarity where one is given. The loss is `compare` plus the penalty."""
+    """The problem of finding a prior's code, and a similarity where one is given.
 
-    decoder: Decoder
+    Args:
+        prior: whose code is sought.
+        penalty: of the code.
+        compare: gives the weighted terms of the loss, at a counted field and an iteration.
+        observed: pixels of the scene's view whose depth is given.
+        rays_per_iteration: their number.
+        device: of all tensors.
+        initial: codes, one per start; None is code zero, the mean shape.
+        misplaced: initial similarities, one per start, see `renderers.fields.moved.Moved`; None keeps the shape.
+        trial: see `bench.solve.optimise.StartSettings`.
+        photographs: the given ones, for pictures.
+        judged_at: iteration at which the first and the last loss are evaluated; None: each at its own.
+    """
+
+    prior: Prior
     penalty: CodePenalty
-    compare: Callable[[Field, int], Terms]  # of the counted field and the iteration, to weighted terms
+    compare: Callable[[Field, int], Terms]
     observed: Bool[Tensor, "height width"]
     rays_per_iteration: int
-    codes: list[Float[Tensor, " code_length"]]  # one per start
-    similarities: list[Float[Tensor, "7"]]  # one per start, or none: see `renderers.fields.moved.Moved`
-    starts: Starts
-    photographs: Float[np.ndarray, "views height width 3"] | None = None  # the given ones, for pictures
-    judged_at: int | None = None  # iteration at which the first and the last loss are evaluated; None: each at its own
+    device: torch.device
+    initial: Float[Tensor, "starts code_length"] | None = None
+    misplaced: Float[Tensor, "starts 7"] | None = None
+    trial: int = 1
+    photographs: Float[np.ndarray, "views height width 3"] | None = None
+    judged_at: int | None = None
     counts: Counts = field(default_factory=Counts)
 
-    definitions: ClassVar[dict[str, str]] = DEFINITIONS
     tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
+
+    def __post_init__(self) -> None:
+        self.decoder = self.prior.decoder.to(self.device).requires_grad_(False)
+        self.observed = self.observed.to(self.device)
+        first = torch.zeros(1, self.decoder.code_length) if self.initial is None else self.initial
+        self.codes = self._free(first)
+        self.similarities = [] if self.misplaced is None else self._free(self.misplaced)
+        self.starts = Starts(StartSettings(len(first), self.trial))
 
     @property
     def parameters(self) -> list[Tensor]:
@@ -131,40 +150,5 @@ class CodeProblem:
         shape: Field = self.decoder.at(self.codes[start])
         return Moved(shape, self.similarities[start]) if self.similarities else shape
 
-
-def code_problem(
-    prior: Prior,
-    penalty: CodePenalty,
-    compare: Callable[[Field, int], Terms],
-    *,
-    observed: Bool[Tensor, "height width"],
-    rays: int,
-    device: torch.device,
-    codes: Float[Tensor, "starts code_length"] | None = None,
-    similarities: Float[Tensor, "starts 7"] | None = None,
-    trial: int = 1,
-) -> CodeProblem:
-    """The problem of finding a prior's code.
-
-    Args:
-        rays: number in an iteration.
-        codes: initial ones; None is code zero, the mean shape.
-        similarities: initial ones; None keeps the shape in place.
-        trial: see `bench.solve.starts.StartSettings`.
-    """
-    decoder = prior.decoder.to(device).requires_grad_(False)
-    first = torch.zeros(1, decoder.code_length) if codes is None else codes
-    return CodeProblem(
-        decoder,
-        penalty,
-        compare,
-        observed.to(device),
-        rays,
-        _free(first, device),
-        [] if similarities is None else _free(similarities, device),
-        Starts(StartSettings(len(first), trial)),
-    )
-
-
-def _free(rows: Float[Tensor, "starts n"], device: torch.device) -> list[Float[Tensor, " n"]]:
-    return [row.clone().to(device).requires_grad_() for row in rows]
+    def _free(self, rows: Float[Tensor, "starts n"]) -> list[Float[Tensor, " n"]]:
+        return [row.clone().to(self.device).requires_grad_() for row in rows]

@@ -73,7 +73,6 @@ class Objective(Protocol):
 class Problem(Objective, Protocol):
     """An inverse problem: its unknown, how a state of it is evaluated, and how it is drawn."""
 
-    definitions: dict[str, str]  # of the metrics that `evaluate` gives
     tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve
     rays_per_iteration: int
     observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given

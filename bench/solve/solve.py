@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from bench.evaluate.evaluate import Evaluation
-from bench.evaluate.metrics import DEFINITIONS
+from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.pictures.filmstrip import Filmstrip
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
@@ -30,14 +29,23 @@ COSTS = {
 }
 
 
-def solve(problem: Problem, settings: OptimiserSettings, run: RunContext) -> None:
-    """Solves a problem, and fills the run's record and folder.
+def solve(
+    make_problem: Callable[[], Problem], settings: OptimiserSettings, run: RunContext, definitions: dict[str, str]
+) -> Problem:
+    """Makes a problem, solves it, fills the run's record and folder, and gives the problem in its final state.
+
+    Args:
+        make_problem: makes it.
+        settings: iterations and learning rate.
+        run: its record has the definitions of its numbers also where it ends before it has a problem.
+        definitions: of the metrics of the problem's `evaluate`.
 
     Raises:
         Unsupported: where the renderer cannot do what the problem's field needs.
     """
     inputs, record = run.inputs, run.record
-    record.definitions = problem.definitions | COSTS
+    record.definitions = definitions | COSTS
+    problem = make_problem()
     first = problem.field()
     check_kind(inputs.renderer, first)
     clock = time.perf_counter()
@@ -56,15 +64,17 @@ def solve(problem: Problem, settings: OptimiserSettings, run: RunContext) -> Non
     filmstrip.add(len(history.curve), *problem.frame())
     draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
     record.seconds["evaluation"] += time.perf_counter() - clock
+    return problem
 
 
 def solve_task(task: InverseTask, run: RunContext) -> Problem:
-    """Solves a task's inverse problem, and gives it in its final state."""
+    """Solves a task's inverse problem of a code, and gives it in its final state."""
     inputs = run.inputs
-    run.record.definitions = DEFINITIONS | COSTS  # also of a run that ends before it has a problem
-    problem = task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
-    solve(problem, task.optimiser, run)
-    return problem
+
+    def problem() -> Problem:
+        return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
+
+    return solve(problem, task.optimiser, run, DEFINITIONS)
 
 
 def note_result(run: RunContext, after: Evaluation) -> None:

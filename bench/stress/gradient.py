@@ -50,7 +50,7 @@ def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Ou
 
 
 def _gradients(
-    distance: Float[Tensor, "n"], parameters: Float[Tensor, "m"], signs: Float[Tensor, "sums n"]
+    distance: Float[Tensor, " n"], parameters: Float[Tensor, " m"], signs: Float[Tensor, "sums n"]
 ) -> Float[Tensor, "sums m"]:
     sums = (signs * distance).sum(dim=1)
     rows = [torch.autograd.grad(total, parameters, retain_graph=True)[0] for total in sums]

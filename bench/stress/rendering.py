@@ -56,7 +56,7 @@ def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> O
     return Outcome(_failure(numbers, hit.numel(), conditions.criteria), numbers, images)
 
 
-def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, "n"]]:
+def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, " n"]]:
     """The first hits of an exam's rays in float64, and the footprint of each pixel along its ray, in scene units."""
     camera = exam.camera.double()
     rays: Rays = camera.rays().flat()

@@ -12,8 +12,7 @@ from torch import Tensor
 from bench.evaluate.reference import Reference, reference_for
 from bench.machine.environment import gemm_peak, synchronise
 from bench.machine.limits import LimitReached, Limits
-from bench.pictures.run_figures import draw_against
-from bench.pictures.views import save_images
+from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.problem import check_field_gradient, check_kind
@@ -84,7 +83,7 @@ class Ablation:
         failure: tuple[RunStatus, str] | None = None
         while measured is None:
             try:
-                measured = self._measure(inputs, camera, repeats=1 if failure else self.repeats)
+                measured = self._measure(run, camera, repeats=1 if failure else self.repeats)
             except LimitReached as limit:
                 failure = failure or (limit.status, str(limit))  # not the exception, which keeps all tensors alive
                 smaller = camera.height // SMALLER, camera.width // SMALLER
@@ -99,14 +98,19 @@ class Ablation:
         if measured is not None:
             self._note(run, measured)
 
-    def _measure(self, inputs: RunInputs, camera: Camera, *, repeats: int) -> "Measured":
+    def _measure(self, run: RunContext, camera: Camera, *, repeats: int) -> "Measured":
         """Measures everything at one resolution.
 
         Raises:
             LimitReached: where a rendering or a step exceeds a limit.
         """
-        bench = Workbench(inputs, camera, reference_for(inputs.fitted(), camera, inputs.cache), self.limits)
+        inputs, size = run.inputs, f"{camera.height} x {camera.width}"
+        fitted = inputs.fitted()
+        run.progress(f"making the reference at {size}", 0, 1)
+        bench = Workbench(inputs, camera, reference_for(fitted, camera, inputs.cache), self.limits)
+        run.progress(f"timing steps at {size}", 0, 1)
         step = bench.steps(repeats)  # first: it costs more, and where it exceeds a limit the rest would be wasted
+        run.progress(f"timing renderings at {size}", 0, 1)
         return Measured(bench, bench.forward(repeats), step)
 
     def _note(self, run: RunContext, measured: "Measured") -> None:

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.evaluate.evaluate import evaluate
-from bench.evaluate.metrics import DEFINITIONS
-from bench.models.candidates import PAPERS
+from bench.evaluate.evaluate import DEFINITIONS, evaluate
+from bench.models.candidates import PAPERS, candidate
 from bench.models.choice import Choice, Evidence
 from bench.models.fit import Fitter
 from bench.models.growth import Growth, grow
@@ -89,7 +88,8 @@ class Capacity:
                 write_line({"candidate": name, **line})
                 run.progress(f"fitting {name}", line["iteration"] + 1, models.fit.iterations, line["total"])
 
-            candidates, fitter = models.all(), Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
+            candidates = [candidate(name) for name in models.candidates]
+            fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
             pixel_precise, settings_notes = inputs.pixel_precise
             study = Study(fitter, pixel_precise, self.frugal_rays)
             growth = grow(fitter, candidates, models.growth)
@@ -152,19 +152,19 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
         "recommended_enough": int(choice.enough),
         "best_field": choice.best.candidate,
     }
-    for candidate in evidence:
-        metrics |= costs(candidate.candidate, candidate)
+    for fit in evidence:
+        metrics |= costs(fit.candidate, fit)
     metrics |= {"auto.field": last.candidate, **costs("auto", last), "auto.overhead": growth.overhead}
     metrics["auto.overhead_judged"] = growth.overhead_judged
     metrics |= {f"auto.{name}": growth.total(name) for name in ("seconds", "evaluations", "flops")}
     if last.error is not None:
         target = last.mean + last.error.standard_error
-        for candidate in evidence:
+        for fit in evidence:
             reached: dict[str, float] = next(
-                (checkpoint for checkpoint in candidate.checkpoints if checkpoint["error"] <= target), {}
+                (checkpoint for checkpoint in fit.checkpoints if checkpoint["error"] <= target), {}
             )
             metrics |= {
-                f"{candidate.candidate}.{key}_at_auto": reached.get(key) for key in ("seconds", "flops", "evaluations")
+                f"{fit.candidate}.{key}_at_auto": reached.get(key) for key in ("seconds", "flops", "evaluations")
             }
     return metrics | saved(chosen, evidence)
 

@@ -7,14 +7,16 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from bench.models.field import solve_by_growth
 from bench.models.observations import Holdout, Observations, hold_out, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, code_problem
+from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import GivenView
 from bench.solve.problem import OptimiserSettings, check_field_gradient
+from bench.solve.solve import solve_task
 from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene, View
 from renderers.checks import check_at_least
@@ -52,7 +54,8 @@ class Completion:
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
-        run.inputs.field.solve(self, run)
+        solve = solve_task if run.inputs.field.of_prior else solve_by_growth
+        solve(self, run)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -60,8 +63,7 @@ class Completion:
         """The problem of a scene; it starts from code zero, the mean shape."""
         check_field_gradient(renderer)
         given, observed = self._given(scene.view, renderer, seed=seed, device=device)
-        rays = observed.numel()
-        return code_problem(prior, self.code, given.compare, observed=observed, rays=rays, device=device)
+        return CodeProblem(prior, self.code, given.compare, observed, observed.numel(), device)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, code_problem
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.problem import OptimiserSettings
 from bench.solve.solve import solve_task
 from datasets.observe import observed_pixels, parse_amount
@@ -65,8 +65,7 @@ class DeepSDF:
             points=torch.cat([surface + shift, surface - shift]).to(device),
             distances=self.offset * torch.tensor([1.0, -1.0]).repeat_interleave(len(distance)).to(device),
         )
-        rows = len(samples.points)
-        return code_problem(prior, self.code, samples.compare, observed=observed, rays=rows, device=device)
+        return CodeProblem(prior, self.code, samples.compare, observed, len(samples.points), device)
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,8 @@ class Gradients:
     def _evaluate(
         self,
         subject: "Subject",
-        pixels: Int[Tensor, "m"],
-        distance: Float[Tensor, "m"],
+        pixels: Int[Tensor, " m"],
+        distance: Float[Tensor, " m"],
         directions: Float[Tensor, "code_length directions"],
     ) -> dict[str, float]:
         """The metrics of one band."""
@@ -119,7 +119,7 @@ class Gradients:
         return numbers
 
     def _evaluate_outline(
-        self, subject: "Subject", pixels: Int[Tensor, "m"], directions: Float[Tensor, "code_length directions"]
+        self, subject: "Subject", pixels: Int[Tensor, " m"], directions: Float[Tensor, "code_length directions"]
     ) -> dict[str, float]:
         """The metrics across the silhouette."""
         if not pixels.numel():
@@ -148,7 +148,7 @@ class Subject:
 
     renderer: Renderer
     decoder: Decoder
-    code: Float[Tensor, "code_length"]
+    code: Float[Tensor, " code_length"]
     camera: Camera
     counts: Counts
 
@@ -158,8 +158,8 @@ class Subject:
         check_field_gradient(self.renderer)
 
     def gradients(
-        self, pixels: Int[Tensor, "m"]
-    ) -> tuple[Float[Tensor, "m code_length"], Float[Tensor, "m 6"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
+        self, pixels: Int[Tensor, " m"]
+    ) -> tuple[Float[Tensor, "m code_length"], Float[Tensor, "m 6"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
         """For each pixel the gradients of its distance for code and camera, the distance, and whether it hits."""
         code = self.code.clone().requires_grad_(True)
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -189,7 +189,7 @@ def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str)
     }
 
 
-def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"]]:
+def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, " some"]]:
     """The hit pixels of each band of angles, as indices into the flattened image."""
     cosine = -(reference.normals * camera.rays().directions).sum(-1).clamp(min=-1)  # rounding can exceed 1
     bands = {}
@@ -199,11 +199,11 @@ def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, "some"
     return bands
 
 
-def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, "some"]:
+def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, " some"]:
     """Pixels whose 3 x 3 neighbourhood has both hits and misses, as indices into the flattened image."""
     around = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
     return (around.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
 
 
-def _draw(pixels: Int[Tensor, "some"], count: int, generator: torch.Generator) -> Int[Tensor, "few"]:
+def _draw(pixels: Int[Tensor, " some"], count: int, generator: torch.Generator) -> Int[Tensor, " few"]:
     return pixels[torch.randperm(len(pixels), generator=generator)[:count]].sort().values

@@ -9,13 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.models.field import solve_by_growth
 from bench.models.observations import Observations
 from bench.pictures.run_figures import Given
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, code_problem
+from bench.solve.latent_code import CodePenalty, CodeProblem
+from bench.solve.optimise import StartSettings
 from bench.solve.problem import OptimiserSettings, check_field_gradient
-from bench.solve.starts import StartSettings
+from bench.solve.solve import solve_task
 from bench.tasks.photographs import GivenPhotographs, PhotographObservations
 from datasets.photographs import Photography
 from datasets.scene import Scene
@@ -41,7 +43,7 @@ class Multiview:
         code: penalty on the code.
         start_scale: standard deviation of the random initial code over that of the prior's training codes; 0 is the
             mean shape.
-        starts, trial: see `bench.solve.starts.StartSettings`.
+        starts, trial: see `bench.solve.optimise.StartSettings`.
         coarse_blur: standard deviation of the initial Gaussian blur of the images, as a share of their height; it falls
             to 0 over the first half of a start's iterations.
         scale, degrees, shift: scale, rotation and shift of the initial shape against the true one; where one is not
@@ -97,7 +99,8 @@ class Multiview:
         if apart > FAR_APART:
             note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             run.record.notes = [*run.record.notes, note]
-        run.inputs.field.solve(self, run)
+        solve = solve_task if run.inputs.field.of_prior else solve_by_growth
+        solve(self, run)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
@@ -128,20 +131,19 @@ class Multiview:
             raise ValueError("a prior of one shape has no spread from which to draw codes: set scale.shapes=96")
         spread = self.start_scale * prior.codes.std(0)
         codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
-        problem = code_problem(
+        return CodeProblem(
             prior,
             self.code,
             given.compare,
-            observed=torch.zeros_like(scene.view.mask),
-            rays=2 * given.per_step * scene.view.mask.numel(),
-            device=device,
-            codes=codes,
-            similarities=self._misplaced(generator) if self.scale != 1 or self.degrees or self.shift else None,
+            torch.zeros_like(scene.view.mask),
+            2 * given.per_step * scene.view.mask.numel(),
+            device,
+            initial=codes,
+            misplaced=self._misplaced(generator) if self.scale != 1 or self.degrees or self.shift else None,
             trial=self.trial,
+            photographs=given.colours.cpu().numpy(),
+            judged_at=self.optimiser.iterations,  # where images are no longer blurred
         )
-        problem.photographs = given.colours.cpu().numpy()
-        problem.judged_at = self.optimiser.iterations  # where images are no longer blurred
-        return problem
 
     def _misplaced(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
         """A similarity transform of the given size in random directions, the same for all starts."""

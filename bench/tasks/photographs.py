@@ -12,8 +12,8 @@ from torch import Tensor
 
 from bench.models.held_out import HeldOutError
 from bench.solve.latent_code import Terms
+from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings
-from bench.solve.starts import StartSettings
 from datasets.photographs import Photograph
 from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
@@ -90,7 +90,7 @@ class GivenPhotographs:
         renderer: Renderer,
         pairs: list[tuple[int, int]],
         colours: Float[Tensor, "views height width 3"],
-    ) -> list[Float[Tensor, "_"]]:
+    ) -> list[Float[Tensor, " _"]]:
         """Absolute differences of colours for each pair, over the pixels that both views see."""
         mine = rendered(renderer, field, self._together([pair[0] for pair in pairs]))
         with torch.no_grad():
@@ -212,7 +212,7 @@ class PhotographObservations:
         )
 
 
-def photographic_error(differences: list[Float[Tensor, "_"]]) -> HeldOutError:
+def photographic_error(differences: list[Float[Tensor, " _"]]) -> HeldOutError:
     """The mean over pairs of the mean difference of colours; 1, the largest, where two photographs share no point."""
     rows = [[float(found.mean()), 1, 0, 1] if len(found) else [0, 0, 1, 1] for found in differences]
     return HeldOutError(np.array(rows, dtype=np.float64), 1.0)

@@ -1,5 +1,6 @@
 """Camera pose: optimise the camera of a depth image and silhouette of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from math import atan2, degrees, radians, sqrt
 from pathlib import Path
@@ -9,14 +10,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import Evaluation, render_view
-from bench.evaluate.metrics import DEFINITIONS as IMAGE_DEFINITIONS
-from bench.evaluate.metrics import image_metrics
+from bench.evaluate.evaluate import DEFINITIONS as IMAGE_DEFINITIONS
+from bench.evaluate.evaluate import Evaluation, image_metrics, render_view
+from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.solve.solve import solve
-from bench.solve.starts import Starts, StartSettings
 from datasets.scene import View
 from datasets.truth import Truth
 from renderers.boundary import rendered, silhouette_loss
@@ -38,8 +39,8 @@ EVALUATED = DEFINITIONS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae
 
 
 @dataclass(frozen=True)
-class PoseStart:
-    """The initial cameras, and the criteria of success.
+class PoseTask(ABC):
+    """A task that finds a camera: its initial cameras, and its criteria of success.
 
     Args:
         degrees: error in rotation of the initial camera, about a random axis through the object's origin.
@@ -64,6 +65,10 @@ class PoseStart:
         check_at_least("task.shift", self.shift, 0, "0.1 is a tenth of the object's radius")
         check_positive("task.success_degrees", self.success_degrees, "5 is usual")
         check_positive("task.success_distance", self.success_distance, "0.05 is usual")
+
+    @abstractmethod
+    def execute(self, run: RunContext) -> None:
+        """Finds the camera, and fills the run's record."""
 
     def cameras(self, true: Camera, seed: int) -> list[Camera]:
         """The initial cameras; the first one's errors are exactly `degrees` and `shift`."""
@@ -96,12 +101,12 @@ class PoseStart:
 
 
 @dataclass(frozen=True)
-class Pose:
+class Pose(PoseTask):
     """Finds the camera of a depth image and a silhouette from a perturbed start; the shape is known.
 
     Args:
-        degrees, shift, starts, spread, success_degrees, success_distance: see `PoseStart`.
-        trial: iterations of each start, where there are several; see `bench.solve.starts.StartSettings`.
+        degrees, shift, starts, spread, success_degrees, success_distance: see `PoseTask`.
+        trial: iterations of each start, where there are several; see `bench.solve.optimise.StartSettings`.
         shape: field of the known shape: "grid", distances of the mesh on a grid; "prior", the network at the scene's
             code, which must be a training shape; "formula", that of a procedural family.
         grid: samples per axis of the grid.
@@ -112,12 +117,6 @@ class Pose:
         optimiser: iterations and learning rates.
     """
 
-    degrees: float
-    shift: float
-    starts: int
-    spread: float
-    success_degrees: float
-    success_distance: float
     trial: int
     shape: str
     grid: int
@@ -134,14 +133,7 @@ class Pose:
         for name in ("depth_weight", "silhouette_weight", "normal_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
         StartSettings(self.starts, self.trial).check(self.optimiser.iterations)
-        _ = self.start
-
-    @property
-    def start(self) -> PoseStart:
-        """The initial cameras, and the criteria of success."""
-        return PoseStart(
-            self.degrees, self.shift, self.starts, self.spread, self.success_degrees, self.success_distance
-        )
+        super().__post_init__()
 
     def execute(self, run: RunContext) -> None:
         """Optimises the pose, and evaluates it before and after.
@@ -153,9 +145,13 @@ class Pose:
         name = type(inputs.renderer).__name__
         if not inputs.renderer.capabilities.ray_gradient:
             raise Unsupported(f"{name} has no gradient towards rays, so none towards a camera")
-        known = inputs.field.known_shape(run, self, lambda: known_shape(self, inputs))
-        cameras = self.start.cameras(view.camera, inputs.scene.seed(inputs.seed))
-        solve(PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device), self.optimiser, run)
+        known = known_shape(self, inputs) if inputs.field.of_prior else fitted_shape(run, self)
+        cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
+
+        def problem() -> PoseProblem:
+            return PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device)
+
+        solve(problem, self.optimiser, run, EVALUATED)
 
 
 def known_shape(settings: Pose, inputs: RunInputs) -> Field:
@@ -187,7 +183,6 @@ class PoseProblem:
     device: torch.device
     counts: Counts = field(default_factory=Counts)
 
-    definitions: ClassVar[dict[str, str]] = EVALUATED
     tracked: ClassVar[tuple[str, ...]] = TRACKED
 
     def __post_init__(self) -> None:
@@ -220,11 +215,11 @@ class PoseProblem:
 
     def evaluate(self, inputs: RunInputs) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
-        return self.settings.start.evaluate(render_view(self.known, self.camera(), inputs), self.view)
+        return self.settings.evaluate(render_view(self.known, self.camera(), inputs), self.view)
 
     def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
         """The errors of the current camera."""
-        return self.settings.start.metrics(self.camera(), self.view.camera)
+        return self.settings.metrics(self.camera(), self.view.camera)
 
     def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
         """Writes the curve of the loss."""

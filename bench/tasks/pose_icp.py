@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.tasks.pose import EVALUATED, PoseStart
+from bench.tasks.pose import EVALUATED, PoseTask
 from datasets.scene import View, see
 from datasets.truth import Truth, sample_surface
 from renderers.camera import Camera
@@ -27,11 +27,11 @@ COSTS = {
 
 
 @dataclass(frozen=True)
-class PoseICP:
+class PoseICP(PoseTask):
     """Finds the camera of a depth image of a known mesh by Open3D's iterative closest points.
 
     Args:
-        degrees, shift, starts, spread, success_degrees, success_distance: see `bench.tasks.pose.PoseStart`. Every start
+        degrees, shift, starts, spread, success_degrees, success_distance: see `bench.tasks.pose.PoseTask`. Every start
             runs to its end.
         method: "point_to_point" (Besl and McKay 1992) or "point_to_plane" (Chen and Medioni 1992).
         points: number of points sampled on the known mesh.
@@ -39,12 +39,6 @@ class PoseICP:
         iterations: most iterations in each pass.
     """
 
-    degrees: float
-    shift: float
-    starts: int
-    spread: float
-    success_degrees: float
-    success_distance: float
     method: str
     points: int
     reach: tuple[float, ...]
@@ -58,29 +52,26 @@ class PoseICP:
             raise ValueError("task.reach must have one pass or more: [0.5, 0.2, 0.05] works")
         for reach in self.reach:
             check_positive("task.reach", reach, "[0.5, 0.1] works")
-        _ = self.start
-
-    @property
-    def start(self) -> PoseStart:
-        """The initial cameras, and the criteria of success."""
-        return PoseStart(
-            self.degrees, self.shift, self.starts, self.spread, self.success_degrees, self.success_distance
-        )
+        super().__post_init__()
 
     def execute(self, run: RunContext) -> None:
         """Registers the points of the depth image to the mesh, and evaluates the camera before and after."""
         inputs, record, view = run.inputs, run.record, run.inputs.scene.view
         record.definitions = EVALUATED | COSTS
-        cameras = self.start.cameras(view.camera, inputs.scene.seed(inputs.seed))
-        record.metrics_start = self.start.evaluate(see(Truth(inputs.scene.mesh), cameras[0]), view).metrics
+        cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
+        record.metrics_start = self.evaluate(see(Truth(inputs.scene.mesh), cameras[0]), view).metrics
         points, normals = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
         clock = time.perf_counter()
-        tried = [self._register(camera, view, points, normals) for camera in cameras]
+        tried = []
+        for camera in cameras:
+            run.progress("registering points", len(tried), len(cameras))
+            tried.append(self._register(camera, view, points, normals))
+        run.progress("registering points", len(tried), len(cameras))
         found, distance = min(tried, key=lambda result: result[1])
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         clock = time.perf_counter()
-        after = self.start.evaluate(see(Truth(inputs.scene.mesh), found), view)
+        after = self.evaluate(see(Truth(inputs.scene.mesh), found), view)
         record.seconds["evaluation"] = time.perf_counter() - clock
         record.metrics, record.notes = after.metrics, [*record.notes, *after.notes]
         record.status, record.reason = RunStatus.OK, ""

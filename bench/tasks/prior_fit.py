@@ -6,12 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import render_view, true_surface
-from bench.evaluate.metrics import surface_metrics
-from bench.pictures.views import save_images
+from bench.evaluate.evaluate import render_view, surface_metrics, true_surface
+from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_distances
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, code_problem
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.problem import OptimiserSettings
 from bench.solve.solve import solve_task
 from datasets.scene import Scene, see
@@ -88,7 +87,7 @@ class PriorFit:
         generator = torch.Generator(device=device).manual_seed(seed)
         given = TrueDistances(self, points.to(device), distances.to(device), generator)
         nothing = torch.zeros_like(scene.view.mask)
-        return code_problem(prior, self.code, given.compare, observed=nothing, rays=self.batch, device=device)
+        return CodeProblem(prior, self.code, given.compare, nothing, self.batch, device)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started
-from bench.trackers.content import curve, settings, values
+from bench.trackers import curve, settings, values
 
 METRICS, PARAMETERS = 1000, 100  # largest numbers that one call of log_batch takes
 LONGEST = 500  # characters of a parameter's value

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.trackers.content import curve, settings, values
+from bench.trackers import curve, settings, values
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class Exam:
     camera: Camera
     truth: Truth
     solid: Callable[[Tensor], Solid] | None = None
-    parameters: Float[Tensor, "n"] | None = None
+    parameters: Float[Tensor, " n"] | None = None
 
 
 Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, random generator, and W of W x W pixels

@@ -24,9 +24,9 @@ Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; of a missing sp
 class FirstHit:
     """The true first hits of n rays within the unit sphere; distances only where `hit`."""
 
-    distance: Float[Tensor, "n"]
-    hit: Bool[Tensor, "n"]
-    inside: Bool[Tensor, "n"]  # the ray begins inside the solid, so that it has no first hit
+    distance: Float[Tensor, " n"]
+    hit: Bool[Tensor, " n"]
+    inside: Bool[Tensor, " n"]  # the ray begins inside the solid, so that it has no first hit
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Solid:
         return FirstHit(torch.where(hit, distance, leave), hit, inside)
 
 
-def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor, "n"]:
+def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor, " n"]:
     """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
     normals = autograd_normals(field, rays.at(first.distance.detach()))
     return torch.where(first.hit, (normals * rays.directions).sum(-1).abs(), 1.0)

@@ -6,11 +6,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
-from renderers.field import Field, Flops, Kind
+from renderers.field import Field, Wrapper
 
 
 @dataclass(frozen=True)
-class Moved:
+class Moved(Wrapper):
     """A shape that was scaled, then moved: world = M (scale * local); values stay distances.
 
     Args:
@@ -21,18 +21,6 @@ class Moved:
 
     inner: Field
     similarity: Float[Tensor, "7"]
-
-    @property
-    def kind(self) -> Kind:
-        return self.inner.kind
-
-    @property
-    def lipschitz(self) -> float | None:
-        return self.inner.lipschitz
-
-    @property
-    def flops(self) -> Flops | None:
-        return self.inner.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         scale = self.similarity[6].exp()

@@ -9,8 +9,8 @@ import trimesh
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, load, register, renamed
-from bench.records.rows import register_rows
+from bench.config import CONF, build, load, register
+from bench.hints import RENAMED, SETTINGS, STRATEGIES, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
@@ -45,7 +45,6 @@ NEEDS = {
 def composed_with_hydra(*overrides: str) -> DictConfig:
     """The configuration with Hydra's own node, which says what an experiment sweeps over."""
     register()
-    register_rows()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
 
@@ -336,6 +335,8 @@ def test_the_old_name_of_a_choice_or_a_key_is_told_the_new_one():
     assert renamed("scale.table2.shapes") == renamed("scale.table2")  # with all that lay under it
     assert renamed("strategy/of_ones_own") == renamed("strategy")
     assert [renamed(name) for name in ("renderer.steps", "scale.grid", "task", "experiment/table1")] == [""] * 4
+    assert renamed("task.iterations", ["task.optimiser", "task.points"]) == renamed("task.iterations")
+    assert renamed("task.iterations", ["task", "task.limits", "task.repeats"]) == ""  # this task has no optimiser
     assert (len(STRATEGIES), len(SETTINGS)) == (18, 15)
 
 

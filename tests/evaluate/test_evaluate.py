@@ -8,8 +8,7 @@ import torch
 import trimesh
 
 from bench.config import EvaluationSettings, load
-from bench.evaluate.evaluate import evaluate, render_view
-from bench.evaluate.metrics import DEFINITIONS
+from bench.evaluate.evaluate import DEFINITIONS, evaluate, render_view
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
 from datasets.mesh import Mesh

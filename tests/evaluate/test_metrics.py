@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from bench.evaluate.metrics import DEFINITIONS, Surface, image_metrics, surface_metrics
+from bench.evaluate.evaluate import DEFINITIONS, Surface, image_metrics, surface_metrics
 
 SURFACE = [
     "chamfer_l2",

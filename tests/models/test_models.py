@@ -10,18 +10,18 @@ import torch
 from omegaconf import OmegaConf
 
 from bench.config import load
-from bench.models import analytic
-from bench.models.candidates import PAPERS, FitSettings, GrowthSettings, ModelSettings, ViewSettings, candidate
+from bench.models import candidates as formulas
+from bench.models.candidates import PAPERS, REACH, candidate
 from bench.models.choice import Evidence, choose
 from bench.models.fit import Fitter
 from bench.models.growth import cost, grow
 from bench.models.held_out import MISSED, HeldOut, HeldOutError
-from bench.models.learned import REACH
 from bench.models.model import Model, Seen
 from bench.models.observations import Holdout, hold_out, together
 from bench.models.views import Views
 from bench.records.record import RunStatus
 from bench.setup.auto import AutoSettings, epsilon, rays_share
+from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import GivenView
 from datasets.extract import extract
 from datasets.scene import see
@@ -116,9 +116,9 @@ def test_a_rounded_box_can_be_a_box_and_a_capsule():
     logs = [*np.log([0.2, 0.5, 0.2]), 40.0]
     numbers = torch.tensor([0.0] * 6 + logs, dtype=torch.float64)
     as_capsule = capsule((0.0, -0.3, 0.0), (0.0, 0.3, 0.0), 0.2)
-    assert torch.allclose(analytic.rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
+    assert torch.allclose(formulas.rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
     numbers[9] = -40.0
-    assert torch.allclose(analytic.rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
+    assert torch.allclose(formulas.rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
 
 
 def test_parts_are_turned_and_moved_and_united():
@@ -126,8 +126,8 @@ def test_parts_are_turned_and_moved_and_united():
     second = torch.tensor([-0.4, 0.0, 0.0, 0.0, 0.0, 0.0, *np.log([0.2, 0.2, 0.2]), 40.0], dtype=torch.float64)
     turned = box((0.4, 0.1, 0.2)).translate((0.3, 0.1, -0.2))  # by a right angle about z
     whole = turned | sphere(0.2, (-0.4, 0.0, 0.0))
-    assert torch.allclose(analytic.union(torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
-    assert torch.allclose(analytic.box(first[:9])(points()), turned(points()), atol=1e-6)
+    assert torch.allclose(formulas.union(torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
+    assert torch.allclose(formulas.box(first[:9])(points()), turned(points()), atol=1e-6)
 
 
 @pytest.mark.parametrize("powers", [(1.0, 1.0), (1.0, 4.0), (2.0, 2.0), (3.0, 1.5), (20.0, 20.0)])
@@ -169,7 +169,7 @@ def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
 
 def test_a_union_keeps_the_parts_of_a_smaller_one():
     old = torch.tensor([[0.0] * 6 + [-1.0] * 3 + [0.0], [0.5] + [0.0] * 5 + [-2.0] * 3 + [0.0]], requires_grad=True)
-    smaller = Model("union_2", [old], lambda free: analytic.union(free[0]), 0.1, metric=True)
+    smaller = Model("union_2", [old], lambda free: formulas.union(free[0]), 0.1, metric=True)
     *_, kept = candidate("union_3").starts(Seen(points(400).float(), smaller, 0, CPU))
     assert torch.equal(kept.parameters[0][:2], old)
     assert len(candidate("union_3").starts(Seen(points(400).float(), None, 0, CPU))) == candidate("union_3").tries - 1

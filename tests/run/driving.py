@@ -60,7 +60,7 @@ class Driver:
     def __init__(self, output: Path, arguments: tuple[str, ...]) -> None:
         output.mkdir(parents=True)
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["bench.run.child"])
+        context.set_forkserver_preload(process.preloaded())
         self.output, self.process = output, context.Process(target=_drive, args=(output, arguments))
         self.process.start()
 

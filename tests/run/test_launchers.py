@@ -16,7 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from bench.config import CONF, register
-from bench.records.identity import identify
+from bench.records.folder import identify
 from bench.records.read import read_records
 from bench.report.write.html import write_index
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, wait_for

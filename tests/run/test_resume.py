@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.identity import _package
+from bench.records.folder import _package
 from bench.records.read import read_records
 from tests.run.driving import FAILING, ROOT, command, driver, record_of, wait_for
 

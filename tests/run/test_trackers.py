@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from bench.records.record import read_record
-from bench.trackers import Nothing
-from bench.trackers.content import curve, settings, values
+from bench.trackers import curve, settings, values
 from bench.trackers.mlflow import MLflow
 from bench.trackers.tensorboard import TensorBoard
 from tests.run.driving import FAILING, record_of
@@ -84,12 +83,18 @@ def test_a_tracker_that_is_not_installed_is_told_before_the_run(monkeypatch, cls
         cls(*("sqlite:///x.db", "e", "a") if cls is MLflow else ("folder",))
 
 
+def tracked(monkeypatch, export) -> tuple[str, ...]:
+    """Overrides that choose a tracker whose export is replaced."""
+    monkeypatch.setattr(sys.modules[TensorBoard.__module__], "find_spec", lambda name: True)
+    monkeypatch.setattr(TensorBoard, "export", export)
+    return ("tracker=tensorboard",)
+
+
 def test_a_tracker_that_fails_is_noted_and_costs_no_run(isolated, monkeypatch):
     def fail(self, folder, record):
         raise ConnectionError("the server\nis away")
 
-    monkeypatch.setattr(Nothing, "export", fail)
-    _, out, _ = isolated(*FAILING, "+renderer.how=not")
+    _, out, _ = isolated(*FAILING, "+renderer.how=not", *tracked(monkeypatch, fail))
     record = record_of(out)
     assert record["notes"][-1] == "not exported to the tracker: the server is away"
     assert record["metrics"]
@@ -97,7 +102,7 @@ def test_a_tracker_that_fails_is_noted_and_costs_no_run(isolated, monkeypatch):
 
 def test_what_is_reused_is_not_exported_again(isolated, monkeypatch):
     exported = []
-    monkeypatch.setattr(Nothing, "export", lambda self, folder, record: exported.append(folder.name))
+    tracker = tracked(monkeypatch, lambda self, folder, record: exported.append(folder.name))
     for _ in range(2):
-        isolated(*FAILING, "+renderer.how=not")
+        isolated(*FAILING, "+renderer.how=not", *tracker)
     assert len(exported) == 1

@@ -28,7 +28,6 @@ class Toy:
     counts: Counts = field(default_factory=Counts)
     calls: int = 0
     rays_per_iteration: int = POINTS
-    definitions: dict[str, str] = field(default_factory=dict)
     tracked: tuple[str, ...] = ()
     observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
 

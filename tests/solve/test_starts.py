@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bench.solve.starts import Starts, StartSettings
+from bench.solve.optimise import Starts, StartSettings
 
 
 def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]:

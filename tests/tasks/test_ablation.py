@@ -27,7 +27,7 @@ from bench.tasks.ablation import DEFINITIONS, SMALLER, WARM_UP, Ablation
 from renderers.camera import Camera, Rays
 from renderers.field import Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
-from tests.tiny import PEAK, ball_prior, camera_of, run_of
+from tests.tiny import PEAK, ball_prior, camera_of, phases_of, run_of
 
 SETTINGS = Ablation(repeats=2, limits=Limits(seconds=60, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
@@ -50,6 +50,12 @@ def measured(folder: Any, renderer: Any, settings: Ablation = SETTINGS, size: in
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory) -> RunContext:
     return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"))
+
+
+def test_it_says_what_it_does(tmp_path):
+    run = run_of(tmp_path, load("renderer", "dist"), PRIOR, view(SIZE))
+    phases = ["making the reference at 16 x 16", "timing steps at 16 x 16", "timing renderings at 16 x 16"]
+    assert phases_of(run, SETTINGS) == phases
 
 
 def test_it_ends_well_with_all_its_files(dist):

@@ -9,15 +9,16 @@ import pytest
 import torch
 
 from bench.evaluate.evaluate import Evaluation
-from bench.models.candidates import PAPERS, ModelSettings, candidate
+from bench.models.candidates import PAPERS, candidate
 from bench.models.choice import Evidence
-from bench.models.field import FieldChoice, verdict
+from bench.models.field import verdict
 from bench.models.growth import grow
 from bench.models.held_out import HeldOutError
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus, read_record
 from bench.run.execute import execute
 from bench.run.summary import show
+from bench.setup.fields import FieldChoice, ModelSettings
 from bench.solve.problem import Unsupported
 from bench.tasks.capacity import Capacity, saved
 from bench.tasks.photographs import photographic_error, split_pairs

@@ -13,23 +13,23 @@ from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import OptimiserSettings, Unsupported
-from bench.tasks.pose import Pose, PoseProblem, PoseStart, known_shape, pose_error
+from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
 from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from renderers.boundary import BrokenContract
 from renderers.fields.analytic import box
-from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of
+from tests.tiny import CPU, Blind, ball_prior, camera_of, phases_of, run_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
-START = PoseStart(degrees=20.0, shift=0.1, starts=3, spread=40.0, success_degrees=5.0, success_distance=0.05)
 SETTINGS = Pose(
     degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05, trial=5,
     shape="formula", grid=32, depth_weight=10.0, silhouette_weight=10.0, normal_weight=0.0,
     optimiser=OptimiserSettings(60, 0.02, "cosine"),
 )  # fmt: skip
+START = replace(SETTINGS, degrees=20.0, shift=0.1, starts=3, spread=40.0)
 ICP = PoseICP(
     degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05,
     method="point_to_plane", points=4000, reach=(0.3, 0.05), iterations=50,
@@ -52,7 +52,7 @@ def run(tmp_path, scene):
 
 def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
     settings = replace(SETTINGS, **changed)
-    return PoseProblem(settings, renderer, box(SIZES), scene.view, settings.start.cameras(CAMERA, 0), CPU)
+    return PoseProblem(settings, renderer, box(SIZES), scene.view, settings.cameras(CAMERA, 0), CPU)
 
 
 def test_a_renderer_that_claims_a_gradient_towards_rays_and_lacks_it_is_told(scene, tmp_path):
@@ -145,7 +145,7 @@ def test_it_finds_the_pose_and_leaves_a_record(run):
 def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
     optimiser = OptimiserSettings(iterations, 0.1, "cosine")
     settings = replace(SETTINGS, degrees=90.0, optimiser=optimiser, **changed)
-    problem = PoseProblem(settings, DIST, box(SIZES), scene.view, settings.start.cameras(CAMERA, seed), CPU)
+    problem = PoseProblem(settings, DIST, box(SIZES), scene.view, settings.cameras(CAMERA, seed), CPU)
     history = History()
     optimise(problem, settings.optimiser, CPU, history=history, on_step=lambda line: None)
     return history.curve[-1]["total"]
@@ -199,8 +199,12 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.seconds["forward"] > 0
 
 
+def test_closest_points_say_what_they_do(run):
+    assert phases_of(run, ICP) == ["registering points"]
+
+
 def test_closest_points_start_where_the_renderers_do():
-    mine, theirs = (settings.start.cameras(CAMERA, 7)[0].world_to_camera for settings in (ICP, SETTINGS))
+    mine, theirs = (settings.cameras(CAMERA, 7)[0].world_to_camera for settings in (ICP, SETTINGS))
     assert torch.equal(mine, theirs)
 
 

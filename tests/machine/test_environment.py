@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from bench.machine import contention
-from bench.machine.contention import Contention
+from bench.machine import environment
+from bench.machine.environment import Contention
 from bench.records.record import Record
 
-HAS_COUNTS = contention._scheduled() is not None
+HAS_COUNTS = environment._scheduled() is not None
 
 
 def record(**changed) -> Record:
@@ -58,7 +58,7 @@ def test_a_busy_machine_is_seen():
 
 
 def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
-    monkeypatch.setattr(contention, "_scheduled", lambda: (1000, 10))
+    monkeypatch.setattr(environment, "_scheduled", lambda: (1000, 10))
     measured = Contention()
-    monkeypatch.setattr(contention, "_scheduled", lambda: (500, 20))
+    monkeypatch.setattr(environment, "_scheduled", lambda: (500, 20))
     assert measured.measured() == {"waited_share": None}

@@ -1,0 +1,168 @@
+"""The field that an unknown shape is made of: the names to choose from, and the settings of fits."""
+
+import re
+from dataclasses import dataclass
+
+from bench.hints import nearest
+from bench.setup.auto import AUTO
+from renderers.checks import check_at_least, check_share
+
+PRIOR = "prior"
+PARTS = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
+SIZED = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+"}  # and what follows the underscore
+EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
+FORMS = "union_K, network_LAYERSxWIDTH, grid_N"
+MOST_SAMPLES = 256  # of a grid along an axis: 64 MiB of values
+
+
+def parsed(name: str) -> tuple[str, tuple[int, ...]]:
+    """The kind and the sizes of a candidate's name, such as ("network", (4, 64)); a part has no size.
+
+    Raises:
+        ValueError: where no candidate has this name.
+    """
+    if name in PARTS:
+        return name, ()
+    kind, _, size = name.partition("_")
+    if kind not in SIZED or re.fullmatch(SIZED[kind], size, re.ASCII) is None:
+        raise ValueError(f"unknown field {name!r}{nearest(name, [*PARTS, *EXAMPLES])}; or {FORMS}, in numbers")
+    sizes = tuple(map(int, size.split("x")))
+    if kind == "union":
+        check_at_least("K of union_K", sizes[0], 2, "union_2 is the smallest")
+    if kind == "network":
+        check_at_least("network layers", sizes[0], 1, "network_1x16 is small")
+        check_at_least("network width", sizes[1], 4, "network_1x16 is small")
+    if kind == "grid" and not 8 <= sizes[0] <= MOST_SAMPLES:
+        raise ValueError(f"N of grid_N must lie between 8 and {MOST_SAMPLES}, not {sizes[0]}: grid_32")
+    return kind, sizes
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How each candidate is fitted.
+
+    Args:
+        iterations: of the fit with the renderer's loss.
+        fewest_rays: least share of the rays in an iteration where their number follows the loss; 1 always takes all.
+            See `bench.setup.auto.rays_share`.
+        warm_iterations, warm_points: iterations and points per iteration of the warm start, which fits the observed
+            points or the previous field without a renderer.
+        eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are not distances by
+            construction.
+    """
+
+    iterations: int
+    fewest_rays: float
+    warm_iterations: int
+    warm_points: int
+    eikonal_weight: float
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "warm_points"):
+            check_at_least(f"models.fit.{name}", getattr(self, name), 1, "conf/scale has values that work")
+        check_share("models.fit.fewest_rays", self.fewest_rays, "1 always takes all rays")
+        check_at_least("models.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")
+        check_at_least("models.fit.eikonal_weight", self.eikonal_weight, 0, "0 switches the term off")
+
+
+@dataclass(frozen=True)
+class GrowthSettings:
+    """How `field=auto` tries candidates.
+
+    Args:
+        trial: share of a whole fit's iterations that a candidate's trial takes.
+        patience: successive candidates that may be tried without improvement.
+        budget: most cost of all candidates together, as a multiple of the final candidate's whole fit; by the cost
+            model of `bench.models.growth.cost`, not by a clock, so that a run ends the same on every machine.
+    """
+
+    trial: float
+    patience: int
+    budget: float
+
+    def __post_init__(self) -> None:
+        check_share("models.growth.trial", self.trial, "1/40 shows whether a candidate is better than the one before")
+        check_at_least("models.growth.patience", self.patience, 1, "5 finds a grid behind small networks")
+        check_at_least("models.growth.budget", self.budget, 1, "2 is twice the fit of the final candidate")
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """The views that candidates are fitted to and evaluated on.
+
+    Args:
+        fitted: number of views whose depth and silhouette are given.
+        held_out: number of views that are held out.
+        share: of the fitted views' rays that are held out as well.
+        elevation: largest absolute elevation of the cameras, in degrees.
+        rays: of the fitted views, drawn in each iteration.
+    """
+
+    fitted: int
+    held_out: int
+    share: float
+    elevation: float
+    rays: int
+
+    def __post_init__(self) -> None:
+        check_at_least("models.views.fitted", self.fitted, 1, "12 cover all sides")
+        check_at_least("models.views.held_out", self.held_out, 2, "8 give a standard error")
+        check_at_least("models.views.rays", self.rays, 1, "1024 work")
+        if not 0 <= self.share < 1:
+            raise ValueError(f"models.views.share must lie between 0 and 1, not {self.share}: 0.1 holds out a tenth")
+        if not 0 <= self.elevation < 90:
+            raise ValueError(f"models.views.elevation must lie between 0 and 90 degrees, not {self.elevation}: 60")
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """The fields to choose from, and the settings of their fits.
+
+    Args:
+        candidates: their names, the smallest first; see `bench.models.candidates.candidate`.
+        fit: settings of each fit.
+        growth: settings of `field=auto`.
+        views: of a known shape, where candidates are fitted to one.
+    """
+
+    candidates: tuple[str, ...]
+    fit: FitSettings
+    growth: GrowthSettings
+    views: ViewSettings
+
+    def __post_init__(self) -> None:
+        check_at_least("the length of models.candidates", len(self.candidates), 1, "conf/scale has complete lists")
+        if len(set(self.candidates)) < len(self.candidates):
+            raise ValueError(f"models.candidates must name each candidate once, not {', '.join(self.candidates)}")
+        for name in self.candidates:
+            parsed(name)
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """The field that a run asks for.
+
+    Args:
+        name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
+        models: the fields to choose from, and the settings of their fits; not read for "prior".
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+
+    name: str
+    models: ModelSettings | None
+
+    def __post_init__(self) -> None:
+        if self.name not in (PRIOR, AUTO):
+            parsed(self.name)
+
+    @property
+    def of_prior(self) -> bool:
+        """Whether it is a code of the dataset's prior."""
+        return self.name == PRIOR
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The names of the candidates that are tried."""
+        return self.models.candidates if self.name == AUTO else (self.name,)
