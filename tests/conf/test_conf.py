@@ -9,8 +9,7 @@ import trimesh
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, build, load, register
-from bench.hints import RENAMED, SETTINGS, STRATEGIES, renamed
+from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, load, register, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
