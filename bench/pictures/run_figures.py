@@ -18,7 +18,7 @@ from torch import Tensor
 from bench.evaluate.evaluate import render_view
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
-from bench.pictures.style import BOTH, MISSED, PAPER, SCREEN, SPURIOUS, WRONG, bare, silhouette_image
+from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
 from bench.setup.inputs import RunInputs
 from datasets.scene import View, see
 from datasets.truth import Truth
@@ -36,7 +36,6 @@ TERMS = {
     "normals": "#2ca02c",
     "code": "#7f7f7f",
 }
-KINDS = {"background": PAPER, "hit": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": WRONG}  # of pixels
 MOST_PHOTOGRAPHS = 4  # shown, in two rows
 
 
@@ -140,7 +139,7 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
 
     Args:
         folder: the run folder.
-        images: "distance", "true_distance" and "kinds", a place in `KINDS` for each pixel; all [height, width].
+        images: "distance", "true_distance" and "kinds", a place in `PIXELS` for each pixel; all [height, width].
         severity: of the trial.
         title: of the picture.
     """
@@ -155,18 +154,19 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
         axis.set_title(f"distance along the ray, {heading}")
         bare(axis)
     figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
-    kinds.imshow(images["kinds"], cmap=ListedColormap(list(KINDS.values())), vmin=-0.5, vmax=len(KINDS) - 0.5)
+    kinds.imshow(images["kinds"], cmap=ListedColormap(list(PIXELS.values())), vmin=-0.5, vmax=len(PIXELS) - 0.5)
     kinds.set_title("kind of error")
     bare(kinds)
-    there = [name for number, name in enumerate(KINDS) if (images["kinds"] == number).any()]
-    patches = [Patch(facecolor=KINDS[name], edgecolor="#888888", label=name) for name in there]
+    there = [name for number, name in enumerate(PIXELS) if (images["kinds"] == number).any()]
+    named = {PIXEL_NAMES.get(name, name): PIXELS[name] for name in there}
+    patches = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in named.items()]
     kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
     figure.suptitle(title)
     figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
 
 
 @rc_context(SCREEN)
-def draw_ladder(folder: Path, metrics: dict[str, Any], title: str) -> None:
+def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
     """Writes ladder.png into a run folder."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))

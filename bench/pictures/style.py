@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap, to_rgb
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter
 
 WIDTH = 7.0  # inches: two columns of a paper
@@ -40,6 +40,9 @@ SCREEN = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.
 # Pixels of a rendered silhouette compared with the true one: in the true one only, in the rendered one only, in both,
 # in none; and pixels that show a wrong surface.
 MISSED, SPURIOUS, BOTH, PAPER, WRONG = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff", "#f2a600"
+# Kinds of pixels in a stress test's images.npz, in the order of their numbers, with their colours; names for readers.
+PIXELS = {"background": PAPER, "right": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": WRONG}
+PIXEL_NAMES = {"lost": "missed", "false": "spurious"}
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,7 @@ def labelled(*axes: Axes) -> dict[str, Any]:
     return {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
 
 
-def legend_below(figure: Figure, *axes: Axes, columns: int = 4) -> None:
+def legend_below(figure: Figure | SubFigure, *axes: Axes, columns: int = 4) -> None:
     """Draws one legend of some axes below them."""
     named = labelled(*axes)
     figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns)

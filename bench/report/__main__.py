@@ -6,8 +6,7 @@ from pathlib import Path
 from bench.records.read import read_records
 from bench.report.data.frame import write_frame
 from bench.report.write.html import write_index
-from bench.report.write.paper import write_paper
-from bench.report.write.readme import write_readme
+from bench.report.write.paper import write_paper, write_readme
 
 USAGE = "usage: python -m bench.report [results_dir=PATH]   (results_dir is `results` unless given)"
 

@@ -60,7 +60,7 @@ class CodeProblem:
         misplaced: initial similarities, one per start, see `renderers.fields.moved.Moved`; None keeps the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the given ones, for pictures.
-        judged_at: iteration at which the first and the last loss are evaluated; None: each at its own.
+        compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.
     """
 
     prior: Prior
@@ -73,7 +73,7 @@ class CodeProblem:
     misplaced: Float[Tensor, "starts 7"] | None = None
     trial: int = 1
     photographs: Float[np.ndarray, "views height width 3"] | None = None
-    judged_at: int | None = None
+    compared_at: int | None = None
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
@@ -139,11 +139,11 @@ class CodeProblem:
 
     @torch.no_grad()
     def objective(self) -> float | None:
-        """The current loss, at iteration `judged_at`, not counted; None where that is not set."""
-        if self.judged_at is None:
+        """The current loss, at iteration `compared_at`, not counted; None where that is not set."""
+        if self.compared_at is None:
             return None
         best = self.starts.best()
-        terms = self.compare(self._shape(best), self.judged_at)
+        terms = self.compare(self._shape(best), self.compared_at)
         return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
 
     def _shape(self, start: int) -> Field:

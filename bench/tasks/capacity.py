@@ -13,7 +13,7 @@ from bench.models.observations import RayObservations
 from bench.models.study import CheckSettings, Study
 from bench.models.views import Views
 from bench.pictures.filmstrip import Filmstrip
-from bench.pictures.run_figures import draw_ladder
+from bench.pictures.run_figures import draw_candidates
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
@@ -115,7 +115,7 @@ class Capacity:
         title = f"{record.task}, {record.name}, {record.scene}"
         filmstrip.save(run.folder, f"{title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name)
         if inputs.evaluation.picture is not None:
-            draw_ladder(run.folder, record.metrics, title)
+            draw_candidates(run.folder, record.metrics, title)
 
 
 def _note_costs(run: RunContext, fitter: Fitter, observations: RayObservations, evidence: list[Evidence]) -> None:

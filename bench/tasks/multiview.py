@@ -142,7 +142,7 @@ class Multiview:
             misplaced=self._misplaced(generator) if self.scale != 1 or self.degrees or self.shift else None,
             trial=self.trial,
             photographs=given.colours.cpu().numpy(),
-            judged_at=self.optimiser.iterations,  # where images are no longer blurred
+            compared_at=self.optimiser.iterations,  # where images are no longer blurred
         )
 
     def _misplaced(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.report.write.readme import write_readme
+from bench.report.write.paper import write_readme
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "results" / "paper"

@@ -12,26 +12,29 @@ from bench.records.read import read_records
 from bench.report import pages as report_pages
 from bench.report.data.experiments import choose
 from bench.report.data.records import Row, base_renderer, row_of
-from bench.report.pages import speed_front, table1, table2_intervals
+from bench.report.pages import speed, table1, table2
 from bench.report.write import paper
 from bench.report.write.paper import find_paper, page_names, write_paper
 from tests.report.test_report_paper import DYNAMIC, NAIVE, coarse_pictures, costs, write_run  # noqa: F401, a fixture
 
 PAGE = """
 from bench.report.data.experiments import Selection
-from bench.report.write.caption import captioned
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, metric, to_data, to_table
 
 PLACE = {place}
+PLACE_AGAIN = 7
 READS = (Selection("mine", ("ablation",)),)
 COLUMNS = (*IDENTITY, metric("queries", "Queries"))
 
 
 def make(experiment):
     lines = experiment.records
-    about = captioned(experiment, "Queries.")
-    return Result("Mine.", data=to_data(COLUMNS, lines), table=to_table(COLUMNS, lines), **about)
+    tables = {{"data": to_data(COLUMNS, lines), "table": to_table(COLUMNS, lines)}}
+    return Result(experiment, "Mine.", "Queries.", **tables)
+
+
+make_again = make
 """
 
 
@@ -89,7 +92,7 @@ def test_the_reference_of_table_2_is_its_preset_under_any_label(tmp_path):
         settings = {"task": {"points": "50"}}
         metrics = {"chamfer_l2": chamfer}
         write_run(tmp_path, "table2", label, task="completion", method=preset, metrics=metrics, settings=settings)
-    made = table2_intervals.make(choose(read_records(tmp_path)[0], table2_intervals.READS[0], tmp_path))
+    made = table2.make_intervals(choose(read_records(tmp_path)[0], table2.READS[0], tmp_path))
     ratios = dict(zip(made.table["Method"], made.table["Ratio to the reference"], strict=True))
     assert ratios == {"ours": "", "theirs": "2.00"}
 
@@ -116,12 +119,12 @@ def test_a_page_is_found_by_its_file(tmp_path, monkeypatch):
     monkeypatch.setattr(report_pages, "__path__", [str(pages), *report_pages.__path__])
     page_names.cache_clear()
     try:
-        assert page_names() == ("mine", "table1")
+        assert list(page_names()) == ["mine", "mine_again", "table1"]
         write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
         write_run(tmp_path, "mine", NAIVE, metrics=costs(3))
         written = write_paper(read_records(tmp_path)[0], tmp_path)
-        assert [path.name for path in written] == ["mine.csv", "table1.csv"]
-        assert [found["name"] for found in find_paper(tmp_path)] == ["mine", "table1"]
+        assert [path.name for path in written] == ["mine.csv", "mine_again.csv", "table1.csv"]
+        assert [found["name"] for found in find_paper(tmp_path)] == ["mine", "mine_again", "table1"]
         (pages / "lost.py").write_text("READS = ()\n")
         page_names.cache_clear()
         with pytest.raises(ValueError, match=r"lost\.py must have a line such as PLACE = 10"):
@@ -131,10 +134,10 @@ def test_a_page_is_found_by_its_file(tmp_path, monkeypatch):
 
 
 def test_every_page_has_a_place_of_its_own_and_says_what_it_reads():
-    pages = [import_module(f"bench.report.pages.{name}") for name in page_names()]
-    places = [page.PLACE for page in pages]
+    pages = {name: (import_module(f"bench.report.pages.{file}"), make) for name, (file, make) in page_names().items()}
+    places = [getattr(page, make.replace("make", "PLACE").upper()) for page, make in pages.values()]
     assert len(pages) >= 23 and places == sorted(set(places))
-    assert all(page.READS and callable(page.make) for page in pages)
+    assert all(page.READS and callable(getattr(page, make)) for page, make in pages.values())
 
 
 def test_finding_the_files_loads_no_page():
@@ -158,7 +161,7 @@ def test_records_of_the_former_speed_experiment_are_tabulated(tmp_path):
             del older["method"]
             (folder / "record.json").write_text(json.dumps(older))
     records = read_records(tmp_path)[0]
-    made = speed_front.make(*(choose(records, selection, tmp_path) for selection in speed_front.READS))
+    made = speed.make_front(*(choose(records, selection, tmp_path) for selection in speed.READS))
     assert list(made.data["setting"]) == ["dist", "dist, alpha 1", "dvr, n 64"] * 2
     assert list(made.data["renderer"]) == ["dist", "dist", "dvr"] * 2
     assert list(made.data["trial"]) == ["completing a shape"] * 3 + ["rendering an image"] * 3

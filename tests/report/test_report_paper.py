@@ -235,7 +235,7 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
     made = table1.make(chosen(tmp_path, "table1"))
     assert list(made.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
     assert made.table["Step"].iloc[2] == "750 ms (625–875)"
-    assert made.table["Missed / spurious / wrong"].iloc[2] == "12 / 8 / 3"
+    assert made.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
     for words in ("car 0", "64×64 pixels", "4 layers of 128", "Some CPU", "2 threads", "5 repeats", "n = 3 runs"):
         assert words in made.caption
     assert "GTX 1080Ti" in told(made)

@@ -12,7 +12,7 @@ from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.data.parsimony import NETWORK, PARSIMONY, SETTINGS, scene_runs
 from bench.report.data.records import setting
-from bench.report.pages import parsimony, parsimony_auto, parsimony_flops, parsimony_needs
+from bench.report.pages import parsimony, parsimony_auto
 from bench.report.write.paper import write_paper
 from bench.report.write.result import latex
 from tests.report.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture
@@ -27,15 +27,15 @@ CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIE
 def climbed(
     results, scene, errors, *, needs, failed=(), at_auto=None, enough=1, status="ok", settings=None, **metrics
 ) -> None:
-    """A run whose rungs have these errors, in half pixels of 0.02; `at_auto` is when the network came to auto's."""
+    """A run whose candidates have these errors in half pixels of 0.02; at `at_auto` the network came to auto's."""
     known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
     known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": enough}
-    for rung, error in errors.items():
-        spent = {"parameters": SIZES[rung], "bytes": 4 * SIZES[rung], "flops_per_query": 2 * SIZES[rung], **COSTS}
-        spent |= {"failed": "nan: why"} if rung in failed else {"error": 0.02 * error, "standard_error": 0.001}
-        spent |= dict.fromkeys((f"{cost}_at_auto" for cost in COSTS), at_auto if rung == NETWORK else None)
-        known |= {f"{rung}.{key}": value for key, value in spent.items()}
-    best = min((rung for rung in errors if rung not in failed), key=lambda rung: errors[rung])
+    for name, error in errors.items():
+        spent = {"parameters": SIZES[name], "bytes": 4 * SIZES[name], "flops_per_query": 2 * SIZES[name], **COSTS}
+        spent |= {"failed": "nan: why"} if name in failed else {"error": 0.02 * error, "standard_error": 0.001}
+        spent |= dict.fromkeys((f"{cost}_at_auto" for cost in COSTS), at_auto if name == NETWORK else None)
+        known |= {f"{name}.{key}": value for key, value in spent.items()}
+    best = min((name for name in errors if name not in failed), key=lambda name: errors[name])
     known |= {"recommended_field": needs, "recommended_parameters": SIZES[needs], "best_field": best}
     known |= {"recommended_error": known[f"{needs}.error"], "saved_parameters": PAPERS / SIZES[needs]}
     known |= {"auto.field": needs, "auto.parameters": SIZES[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
@@ -122,15 +122,15 @@ def test_captions_find_their_settings_where_the_configuration_has_them(compose_c
     assert all(isinstance(value, int | float) for value in found.values()), found
 
 
-def test_plotted_numbers_stand_as_csv_a_line_a_rung(four):
-    for made in (made_of(four, parsimony.make), made_of(four, parsimony_flops.make)):
+def test_plotted_numbers_stand_as_csv_a_line_per_candidate(four):
+    for made in (made_of(four, parsimony.make), made_of(four, parsimony.make_flops)):
         assert len(made.data) == 3 + 3 + 3 + 1
         ringed = made.data[made.data["recommended"] == True]  # noqa: E712, a column of objects
         assert list(ringed["rung"]) == ["sphere", "box", "grid_24"]
     assert list(made.data["error"].dropna())[:3] == pytest.approx([2e-4, 0.1, 4e-3])
 
 
-def test_a_rung_that_failed_is_counted_named_and_crossed(tmp_path):
+def test_a_candidate_that_failed_is_counted_named_and_crossed(tmp_path):
     climbed(tmp_path, "car", {"sphere": 8, "box": 1, "grid_24": 0.2}, needs="grid_24", failed=("box",))
     made = parsimony.make(chosen(tmp_path))
     assert made.table["Failed candidates"].item() == "1 of 3"
@@ -139,8 +139,8 @@ def test_a_rung_that_failed_is_counted_named_and_crossed(tmp_path):
     assert [list(line.get_xdata()) for line in crosses] == [[9]]
 
 
-@pytest.mark.parametrize(("function", "size"), [(parsimony.make, 9), (parsimony_flops.make, 18)])
-def test_the_recommended_rung_is_ringed_not_the_best(four, function, size):
+@pytest.mark.parametrize(("function", "size"), [(parsimony.make, 9), (parsimony.make_flops, 18)])
+def test_the_recommended_candidate_is_ringed_not_the_best(four, function, size):
     figure = made_of(four, function).figure
     titles = [axis.get_title() for axis in figure.axes]
     assert titles == ["ball\nneeds sphere", "box\nneeds box", "car\nneeds grid 24", "torus\n"]
@@ -166,7 +166,7 @@ def test_a_place_that_is_left_over_holds_the_legend(four):
 
 
 def test_need_over_what_the_best_single_part_leaves(four):
-    made = made_of(four, parsimony_needs.make)
+    made = made_of(four, parsimony.make_needs)
     data = made.data.set_index("scene")
     assert list(data["single_part_error_footprints"][:3]) == pytest.approx([0.01, 0.5, 8])
     assert list(data["recommended_parameters"][:3]) == [4, 9, 3000]
@@ -183,7 +183,7 @@ def test_need_over_what_the_best_single_part_leaves(four):
 def test_names_of_near_points_do_not_cover_each_other(tmp_path):
     for scene in ("one", "two", "three", "four"):
         climbed(tmp_path, scene, {"sphere": 8, "box": 0.5}, needs="box")
-    figure = parsimony_needs.make(chosen(tmp_path)).figure
+    figure = parsimony.make_needs(chosen(tmp_path)).figure
     figure.draw_without_rendering()
     boxes = [text.get_window_extent() for text in figure.axes[0].texts if text.get_text() != "half a pixel"]
     assert len(boxes) == 4
@@ -193,7 +193,7 @@ def test_names_of_near_points_do_not_cover_each_other(tmp_path):
 def test_a_name_beside_a_point_at_the_left_stays_clear_of_the_axis(tmp_path):
     for scene in ("sphere", "box", "capsule", "rounded_box"):
         climbed(tmp_path, scene, {"sphere": 8, "box": 0.1}, needs="box")
-    figure = parsimony_needs.make(chosen(tmp_path)).figure
+    figure = parsimony.make_needs(chosen(tmp_path)).figure
     figure.draw_without_rendering()
     axes = figure.axes[0]
     assert min(text.get_window_extent().x0 for text in axes.texts) >= axes.get_window_extent().x0

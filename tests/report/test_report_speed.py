@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from bench.records.read import read_records
 from bench.report.data.curves import history_of
 from bench.report.data.experiments import choose
 from bench.report.data.speed import COMPLETION, TARGET, TRIALS, settings
-from bench.report.pages import loss_chamfer, speed_curves, speed_front, speed_volume
+from bench.report.pages import loss_chamfer, speed, speed_curves
 from bench.report.write.html import write_index
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
@@ -59,9 +60,9 @@ def rendered(results, label, seconds, error, *, size=64, status="ok"):
     )  # fmt: skip
 
 
-def made(results, page):
-    records = read_records(results)[0]
-    return page.make(*(choose(records, selection, results) for selection in page.READS))
+def made(results, make):
+    records, page = read_records(results)[0], sys.modules[make.__module__]
+    return make(*(choose(records, selection, results) for selection in page.READS))
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def three(tmp_path):
 
 
 def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
-    data = made(three, speed_front).data.set_index("setting")
+    data = made(three, speed.make_front).data.set_index("setting")
     assert data["dominated"].to_dict() == {"fast": False, "good": False, "bad": True, "broken": True}
     chance = 7 / 27  # that at least two of three draws are the shape that it did not fail on; then it beats "fast"
     expected = {"fast": 1 - chance, "good": 1.0, "bad": 0.0, "broken": chance}
@@ -89,11 +90,11 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
 def test_failed_and_dominated_points_are_drawn(three):
     records = read_records(three)[0]
     rows = [settings(choose(records, trial.selection, three), trial) for trial in TRIALS]
-    points = {point.row.name: point for point in speed_front.place(rows[0])}
+    points = {point.row.name: point for point in speed.place(rows[0])}
     assert rows[1] == []
     assert points["broken"].infinite and not points["broken"].on_front
     assert (points["broken"].x, points["broken"].y) == pytest.approx((1.5 * 4, 1.5 * 8))
-    figure = made(three, speed_front).figure
+    figure = made(three, speed.make_front).figure
     drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in figure.axes[0].lines
              if len(line.get_xdata()) == 1}  # fmt: skip
     assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0), (6.0, 12.0)}
@@ -127,7 +128,7 @@ def test_a_browser_draws_the_page(three, tmp_path):
 
 
 def test_a_look_costs_what_was_spent_before_it(three):
-    data = made(three, speed_curves).data
+    data = made(three, speed_curves.make).data
     good = data[(data["row"] == "good") & (data["index"] == 0)]
     assert good["error"].tolist() == [9, 5, 3, 0.5]
     assert good["seconds"].tolist() == [0, 1, 2, 3]
@@ -137,7 +138,7 @@ def test_a_look_costs_what_was_spent_before_it(three):
 
 def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
     assert TARGET == 1e-3
-    table = made(three, speed_curves).table.set_index("Setting")
+    table = made(three, speed_curves.make).table.set_index("Setting")
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s"]
     assert table.loc["bad"].tolist() == ["3", "0", "–"]
     assert table.loc["broken"].tolist() == [
@@ -151,7 +152,7 @@ def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_pat
     for index in range(5):
         completed(tmp_path, "dist", [9, 8], index=index, status="nan")
     completed(tmp_path, "dist", [9, 8, 8, 0.5], index=5)
-    figure = made(tmp_path, speed_curves).figure
+    figure = made(tmp_path, speed_curves.make).figure
     figure.draw_without_rendering()  # also where every median is infinite
     (steps,) = [line for line in figure.axes[2].lines if len(line.get_xdata()) > 1]
     assert steps.get_ydata()[-1] == pytest.approx(5 / 6)
@@ -169,7 +170,7 @@ def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
     for index in range(2):
         completed(tmp_path, "dist", [9, 1], index=index)
     completed(tmp_path, "idr", [9, 1], renderer="idr")
-    result = made(tmp_path, speed_front)
+    result = made(tmp_path, speed.make_front)
     row = result.table.set_index("Setting").loc["idr"]
     assert row["Failed"] == "0 of 1, 1 missing"
     assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
@@ -180,7 +181,7 @@ def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
     record = json.loads((folder / "record.json").read_text())
     record["seconds"]["forward"] = "nan"
     (folder / "record.json").write_text(json.dumps(record))
-    assert math.isinf(made(tmp_path, speed_front).data["seconds"].iloc[0])
+    assert math.isinf(made(tmp_path, speed.make_front).data["seconds"].iloc[0])
 
 
 def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
@@ -188,7 +189,7 @@ def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
     settings = {"index": 0, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "validation"}
     write_run(tmp_path, "speed_completion", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
               settings=settings, minute=0)  # fmt: skip
-    result = made(tmp_path, speed_front)
+    result = made(tmp_path, speed.make_front)
     assert result.data["error"].tolist() == [1.0]
     assert "Not shown: 1 run" in told(result)
 
@@ -206,7 +207,7 @@ def test_renderings_of_another_size_are_not_compared(tmp_path):
     rendered(tmp_path, "dist", 1.0, 0.01)
     rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
     rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
-    result = made(tmp_path, speed_front)
+    result = made(tmp_path, speed.make_front)
     data = result.data
     assert "Not shown: 1 renderings of another size." in result.notes
     assert data["setting"].tolist() == ["dist", "dist, 20 steps"]
@@ -218,14 +219,14 @@ def test_the_hypervolume_is_that_of_the_renderers_settings(tmp_path):
     for index in range(2):
         completed(tmp_path, "one", [9, 9, 1], index=index)
         completed(tmp_path, "two", [9, 9, 10], index=index, renderer="idr")
-    data = made(tmp_path, speed_volume).data.set_index("renderer")
+    data = made(tmp_path, speed.make_volume).data.set_index("renderer")
     assert data.loc["dist", ["reference_seconds", "reference_error"]].tolist() == [4.0, 20.0]
     assert data.loc["dist", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 1))
     assert data.loc["idr", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 10))
 
 
 def test_loss_and_error_are_correlated_by_rank(three):
-    data = made(three, loss_chamfer).data.set_index("row")
+    data = made(three, loss_chamfer.make).data.set_index("row")
     assert data.loc["good", ["within", "together", "looks", "runs"]].tolist() == [1.0, 1.0, 9, 3]
     assert data["together"].isna()["fast"]  # one look is no correlation
 
@@ -234,12 +235,12 @@ def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
     completed(tmp_path, "dist", [9, 5, 1])
     folder = completed(tmp_path, "idr", [9, 5, 1], status="timeout", renderer="idr")
     (folder / "curve.jsonl").unlink()
-    for page in (speed_front, speed_volume, speed_curves, loss_chamfer):
-        result = made(tmp_path, page)
+    for make in (speed.make_front, speed.make_volume, speed_curves.make, loss_chamfer.make):
+        result = made(tmp_path, make)
         assert "idr" in result.table.to_string()
 
 
 def test_an_error_of_zero_does_not_break_the_volume(tmp_path):
     rendered(tmp_path, "dist", 1.0, 0.0)
     rendered(tmp_path, "idr", 0.5, 0.02)
-    assert np.isfinite(made(tmp_path, speed_volume).data["hypervolume"].astype(float)).all()
+    assert np.isfinite(made(tmp_path, speed.make_volume).data["hypervolume"].astype(float)).all()

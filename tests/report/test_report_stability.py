@@ -8,7 +8,7 @@ import pytest
 from bench.records.read import read_records
 from bench.report.data.atlas import STABILITY, atlas
 from bench.report.data.experiments import choose
-from bench.report.pages import stability, stability_cost, stability_curves, stability_failures
+from bench.report.pages import stability, stability_curves, stability_failures
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
@@ -59,7 +59,8 @@ def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
     assert table.table.loc[0, "Axis"] == "wires"
     assert table.table.loc[0, "DIST"] == "0.100 (0.126 to 0.0794)"
     assert "Predicted, wires: DIST 0.125, measured 0.100 (0.126 to 0.0794)." in table.notes
-    assert "DIST: worst on wires 0.100 (0.126 to 0.0794) scene units. Failed trials: 3 lost, 1 false." in table.notes
+    worst = "DIST: worst on wires 0.100 (0.126 to 0.0794) scene units."
+    assert f"{worst} Failed trials: 3 missed, 1 spurious." in table.notes
     assert "n = 10 trials in all, of 1 axes and 1 renderers" in table.caption
     assert "25 % of a full grid's" in told(table)
 
@@ -91,7 +92,7 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
         broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
     broke(tmp_path, "alpha", "DIST", 0.9)
     broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
-    rows = made(tmp_path, stability_cost.make).data.set_index("row")
+    rows = made(tmp_path, stability.make_cost).data.set_index("row")
     columns = ["axes", "at_once", "never", "cost"]
     assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
     assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
@@ -105,7 +106,7 @@ def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
     if status != "missing":
         broke(tmp_path, "thin_plate", "DIST", 0.1, status=status)
     broke(tmp_path, "thin_plate", "DVR", 0.1)
-    rows = made(tmp_path, stability_cost.make).data.set_index("row")
+    rows = made(tmp_path, stability.make_cost).data.set_index("row")
     assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
     if status != "missing":
         assert "DIST: worst on thin plate timeout" in " ".join(made(tmp_path, stability.make).notes)
@@ -124,7 +125,7 @@ def test_axes_stand_in_their_groups(tmp_path):
     records = read_records(tmp_path)[0]
     grid = atlas(choose(records, STABILITY, tmp_path))
     (row,) = grid.rows
-    assert (grid.axes, row.name, grid.group("wires")) == (["wires"], "DIST", "viewing")
+    assert (grid.axes, row.name, grid.stress("wires", "group")) == (["wires"], "DIST", "viewing")
     assert grid.cells["wires", row].place(0.1) == pytest.approx(0.5)
 
 

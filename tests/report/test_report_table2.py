@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from bench.records.read import read_records
 from bench.report.data import oracle
 from bench.report.data.completions import POINTS
 from bench.report.data.experiments import choose
-from bench.report.pages import priors, table2, table2_intervals
+from bench.report.pages import priors, table2
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
@@ -35,8 +36,9 @@ def completed(results, label, chamfer, **changed):
     )
 
 
-def made(results, page=table2):
-    return page.make(choose(read_records(results)[0], page.READS[0], results))
+def made(results, make=table2.make):
+    (selection,) = sys.modules[make.__module__].READS
+    return make(choose(read_records(results)[0], selection, results))
 
 
 def p_values(result):
@@ -126,7 +128,7 @@ def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
     for index, value in enumerate(size):
         completed(tmp_path, REFERENCE, value, index=index)
         completed(tmp_path, OTHER, 2 * value, index=index)
-    result = made(tmp_path, table2_intervals)
+    result = made(tmp_path, table2.make_intervals)
     data = result.data.set_index("row")
     for row in (REFERENCE, OTHER):
         assert data.loc[row, "iqm_low"] < data.loc[row, "iqm"] < data.loc[row, "iqm_high"]
@@ -145,15 +147,15 @@ def test_dropping_failed_runs_improves_no_rank(tmp_path, missing):
         completed(tmp_path, REFERENCE, value, index=index)
     for index, value in enumerate((2.0, 2.0, 2.0, None)):
         folder = completed(tmp_path, OTHER, value, index=index)
-    before = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+    before = float(cell(made(tmp_path, table2.make_intervals), OTHER, "Mean rank"))
     if missing == "deleted":
         (folder / "record.json").unlink()
         folder.rmdir()
-        after = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+        after = float(cell(made(tmp_path, table2.make_intervals), OTHER, "Mean rank"))
     else:
         text = (folder / "record.json").read_text().replace('"diverged"', '"not_run"')
         (folder / "record.json").write_text(text)
-        after = float(cell(made(tmp_path, table2_intervals), OTHER, "Mean rank"))
+        after = float(cell(made(tmp_path, table2.make_intervals), OTHER, "Mean rank"))
     assert after >= before
 
 
@@ -161,7 +163,7 @@ def test_a_shape_that_a_row_lacks_is_a_failure_in_its_rank_and_no_part_of_its_ra
     for index, value in enumerate((1.0, 9.0)):
         completed(tmp_path, REFERENCE, value, index=index)
     completed(tmp_path, OTHER, 2.0, index=1)
-    result = made(tmp_path, table2_intervals)
+    result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Mean rank") == "1.50"
     assert cell(result, OTHER, "Ratio to the reference") == "0.222"
     assert "Shapes per cell: 1 to 2." in result.notes
@@ -172,7 +174,7 @@ def test_a_method_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
         for points in ("dense", "100", "20"):
             completed(tmp_path, REFERENCE, 1.0 + index, index=index, points=points)
             completed(tmp_path, OTHER, None if points == "20" else 0.5, index=index, points=points)
-    result = made(tmp_path, table2_intervals)
+    result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Ratio to the reference").startswith("∞")
     assert cell(result, OTHER, "Shapes with a failure") == "100 % [61, 100]"
     assert p_values(result) == [f"{OTHER} is no better (0 of 6 shapes) than {REFERENCE}: p = 0.031"]
@@ -182,7 +184,7 @@ def test_a_row_without_some_points_has_no_ratio(tmp_path):
     for points in ("dense", "20"):
         completed(tmp_path, REFERENCE, 1.0, points=points)
     completed(tmp_path, OTHER, 2.0, points="dense")
-    result = made(tmp_path, table2_intervals)
+    result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Ratio to the reference") == ""
     assert cell(result, OTHER, "20 pts") == "–"
 
@@ -192,7 +194,7 @@ def test_the_points_of_a_shape_are_not_drawn_as_if_they_were_seeds(tmp_path):
         for index in range(6):
             completed(tmp_path, REFERENCE, mine, index=index, points=points)
             completed(tmp_path, OTHER, other, index=index, points=points)
-    assert cell(made(tmp_path, table2_intervals), OTHER, "Ratio to the reference") == "1.00 [1.00, 1.00]"
+    assert cell(made(tmp_path, table2.make_intervals), OTHER, "Ratio to the reference") == "1.00 [1.00, 1.00]"
 
 
 @pytest.mark.parametrize("changed", [{"evaluation": {"grid": 8}}, {"split": "validation"}, {"prior": {"shapes": 1}}])
@@ -269,7 +271,7 @@ def test_a_prior_is_shown_beside_its_floor(tmp_path):
     normals, hit = np.zeros((8, 8, 3)), np.ones((8, 8), dtype=bool)
     images = {"normals": normals, "reference_normals": normals, "hit": hit, "reference_hit": hit}
     np.savez(folder / "images.npz", **images, gradient_length=np.array([0.9, 1.0, 1.1]))
-    result = made(tmp_path, priors)
+    result = made(tmp_path, priors.make)
     row = result.table.iloc[0]
     assert (row["Fit"], row["Floor"], row["Fit / floor"], row["largest"]) == ("0.240", "0.200", "1.20", "2.50")
     assert row["|gradient|"] == "0.980"
@@ -281,7 +283,7 @@ def test_a_prior_is_shown_beside_its_floor(tmp_path):
 def test_a_prior_that_failed_on_a_shape_scores_worst_there(tmp_path):
     fitted(tmp_path, 0.2)
     fitted(tmp_path, 0.1, index=1, status="crashed")
-    row = made(tmp_path, priors).table.iloc[0]
+    row = made(tmp_path, priors.make).table.iloc[0]
     assert row["largest"] == "∞"
     assert row["Shapes"] == "2"
 

@@ -7,32 +7,45 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import spearmanr
 
 from bench.records.files import decoded
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, measured
 
+HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
 COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
 
 
 def read(folder: Path) -> tuple[pd.DataFrame, str]:
     """A row for each line of `curve.jsonl`, with `COLUMNS` as floats, nan for missing; and a warning, or ""."""
+    found = lines(folder)
+    sound = [line for line in found or [] if isinstance(line.get("iteration"), int | float)]
+    known = [[_number(line.get(name)) for name in COLUMNS] for line in sound]
+    if found is None:
+        warning = "no curve.jsonl"
+    elif len(known) < len(found):
+        warning = f"{len(found) - len(known)} lines of curve.jsonl cannot be read"
+    else:
+        warning = "" if found else "curve.jsonl is empty"
+    return pd.DataFrame(known, columns=COLUMNS, dtype=float).drop_duplicates("iteration", keep="last"), warning
+
+
+def lines(folder: Path) -> list[dict[str, Any]] | None:
+    """The lines of `curve.jsonl`, empty for those that cannot be read; None where there is no such file."""
     try:
         text = (folder / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return pd.DataFrame(columns=COLUMNS, dtype=float), "no curve.jsonl"
-    lines, bad = [], 0
-    for line in text.splitlines():
-        try:
-            found = decoded(json.loads(line))
-        except (ValueError, RecursionError):
-            found = None
-        if isinstance(found, dict) and isinstance(found.get("iteration"), int | float):
-            lines.append([_number(found.get(name)) for name in COLUMNS])
-        else:
-            bad += 1
-    warning = f"{bad} lines of curve.jsonl cannot be read" if bad else "" if lines else "curve.jsonl is empty"
-    return pd.DataFrame(lines, columns=COLUMNS, dtype=float).drop_duplicates("iteration", keep="last"), warning
+        return None
+    return [_line(line) for line in text.splitlines()]
+
+
+def _line(text: str) -> dict[str, Any]:
+    try:
+        found = decoded(json.loads(text))
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:
@@ -69,16 +82,22 @@ def history_of(experiment: Experiment, record: Record) -> pd.DataFrame:
     A line of a curve has the error before its step, but the costs after it, so a checkpoint gets the costs of the line
     before it.
     """
-    lines = read(experiment.folder(record))[0].sort_values("iteration")
-    costs = lines[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
-    history = costs.assign(iteration=lines["iteration"], error=SCALE * lines["chamfer_l2"], loss=lines["total"])
+    curve = read(experiment.folder(record))[0].sort_values("iteration")
+    costs = curve[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
+    history = costs.assign(iteration=curve["iteration"], error=SCALE * curve["chamfer_l2"], loss=curve["total"])
     history = history.dropna(subset=["error"])
-    if record["status"] == "ok" and len(lines) and (error := measured(record, "chamfer_l2")) is not None:
-        last = lines.iloc[-1]
+    if record["status"] == "ok" and len(curve) and (error := measured(record, "chamfer_l2")) is not None:
+        last = curve.iloc[-1]
         end = {"seconds": last["seconds"], "value_evaluations": last["value_evaluations"]}
         end |= {"iteration": last["iteration"] + 1, "error": SCALE * error, "loss": math.nan}
         history = pd.concat([history, pd.DataFrame([end])], ignore_index=True)
-    return history[["iteration", "seconds", "value_evaluations", "error", "loss"]]
+    return history[[*HISTORY]]
+
+
+def spearman(points: pd.DataFrame, first: str = "loss", second: str = "error") -> float | None:
+    """The rank correlation of two columns; None for fewer than three points, or where a column does not vary."""
+    varied = len(points) > 2 and all(points[column].nunique() > 1 for column in (first, second))
+    return float(spearmanr(points[first], points[second]).statistic) if varied else None
 
 
 def _number(value: Any) -> float:

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from bench.records.record import NEUTRAL_KEYS, requested, started
-from bench.report.data.records import Record, Row, family, index, row_of, setting
+from bench.report.data.records import Record, Row, family, grouped, index, row_of, setting
 
+seed = itemgetter("seed")
 # Keys of a configuration in which the rows of every experiment may differ.
 ROW_KEYS = {"renderer", "method", "label", "seed", "index"}
 NOT_SHARED = {*ROW_KEYS, *NEUTRAL_KEYS, "packages"}
@@ -24,6 +26,7 @@ class Selection:
         varies: keys of the configuration, in addition to `ROW_KEYS`, in which the runs differ.
         cell: settings of the task in which runs of one row differ.
         former: name of the experiment in older records.
+        setup: parts of the setup that captions name, where they are known.
     """
 
     experiment: str
@@ -31,6 +34,7 @@ class Selection:
     varies: tuple[str, ...] = ()
     cell: tuple[str, ...] = ()
     former: str = ""
+    setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
 
 
 @dataclass(frozen=True)
@@ -60,17 +64,11 @@ class Experiment:
 
     def rows(self) -> dict[Row, list[Record]]:
         """The records of each row."""
-        rows: dict[Row, list[Record]] = {}
-        for record in self.records:
-            rows.setdefault(row_of(record), []).append(record)
-        return rows
+        return grouped(self.records, row_of)
 
     def families(self) -> dict[str, list[Record]]:
         """The records of each family."""
-        families: dict[str, list[Record]] = {}
-        for record in self.records:
-            families.setdefault(family(record), []).append(record)
-        return families
+        return grouped(self.records, family)
 
     def named(self) -> list[Record]:
         """The records with their readable names under `name`."""
@@ -81,7 +79,7 @@ class Experiment:
 
         Rows with the same name but different renderer settings get these settings in their names.
         """
-        seeds, shapes, families = ({part(record) for record in self.records} for part in (_seed, index, family))
+        seeds, shapes, families = ({part(record) for record in self.records} for part in (seed, index, family))
         selection = self.selection
         return [
             row_of(record).name
@@ -92,7 +90,7 @@ class Experiment:
                 if isinstance(value := setting(record["config"], "task", key), str | int | float)
             )
             + (f", {family(record)}" if len(families) > 1 else "")
-            + (f", seed {_seed(record)}" if len(seeds) > 1 else "")
+            + (f", seed {record['seed']}" if len(seeds) > 1 else "")
             + (f", shape {index(record)}" if len(shapes) > 1 else "")
             for record in self.records
         ]
@@ -107,17 +105,14 @@ class Experiment:
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
         """The names of the rows by the machine that their times depend on: processor, accelerator, threads."""
-        found: dict[tuple[Any, ...], list[str]] = {}
-        for record in self.named():
-            if record["environment"]:
-                machine = tuple(record["environment"].get(key) for key in MACHINE)
-                found.setdefault(machine, []).append(record["name"])
-        return found
+        known = [record for record in self.named() if record["environment"]]
+        machines = grouped(known, lambda record: tuple(record["environment"].get(key) for key in MACHINE))
+        return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def of_newest_scene(self) -> "Experiment":
         """The experiment with only those records that have the seed and the shape of the one requested last."""
         newest = max(self.records, key=requested)
-        kept = [r for r in self.records if (_seed(r), index(r)) == (_seed(newest), index(newest))]
+        kept = [r for r in self.records if (seed(r), index(r)) == (seed(newest), index(newest))]
         return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
 
 
@@ -165,7 +160,7 @@ def _like_newest(records: list[Record], part: Callable[[Record], Any]) -> list[R
 
 def _key(record: Record, selection: Selection) -> Hashable:
     """The key that identifies a run within its experiment."""
-    key = (row_of(record), _seed(record), index(record), str(sorted(_renderer(record).items())), record["task"])
+    key = (row_of(record), seed(record), index(record), str(sorted(_renderer(record).items())), record["task"])
     cell = (str(setting(record["config"], "task", name)) for name in selection.cell)
     return (*key, family(record), *cell) if selection.varies else key
 
@@ -189,10 +184,6 @@ def _renderer(record: Record) -> dict[str, str]:
 
 def _task(task: dict[str, Any], selection: Selection) -> dict[str, Any]:
     return {key: value for key, value in task.items() if key not in selection.cell}
-
-
-def _seed(record: Record) -> Any:
-    return record["seed"]
 
 
 def _shared(record: Record, selection: Selection) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The runs of the parsimony experiment, one per scene, with their candidates, and the savings of `field=auto`."""
+"""The runs of the parsimony experiment, one per scene, with their candidates and the savings of `field=auto`."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, family, index, measured, row_of, setting
 
-PARSIMONY = Selection("parsimony", ("capacity",), ("dataset",))
+PARSIMONY = Selection("parsimony", ("capacity",), ("dataset",), setup=("scenes", "pixels", "machine"))
 NETWORK = "network_8x512"  # the papers' network: that of DeepSDF and DIST, without a code
 COSTS = ("seconds", "flops", "evaluations")
 REACHED, NOT_REACHED, FAILED, NOT_FITTED = "reached", "not reached", "failed", "not fitted"
@@ -33,7 +33,7 @@ NAMING: tuple[tuple[Callable[[Record], Any], str], ...] = (  # parts of a scene'
 
 @dataclass(frozen=True)
 class SceneRun:
-    """A run under the name of its scene; it has no candidates where it did not end ok."""
+    """A run under the name of its scene; it has no candidates and no numbers where it did not end ok."""
 
     name: str
     record: Record
@@ -53,19 +53,60 @@ class SceneRun:
         """The value of a metric; None where there is no such number, or the run did not end ok."""
         return measured(self.record, name) if self.ok else None
 
-    def word(self, name: str) -> str | None:
-        """The value of a metric that is text; None where there is no such text, or the run did not end ok."""
-        value = self.record["metrics"].get(name)
-        return value if self.ok and isinstance(value, str) else None
-
     def get(self, name: str) -> int | float | str | None:
-        """The value of a metric, a number or text."""
-        number = self.number(name)
-        return self.word(name) if number is None else number
+        """One of `ratios`, or the value of a metric; None where there is none, or the run did not end ok."""
+        if name in self.ratios:
+            return self.ratios[name]
+        value = self.record["metrics"].get(name) if self.ok else None
+        return value if isinstance(value, str) else self.number(name)
 
-    def in_footprints(self, error: float | None) -> float | None:
-        """An error in scene units as a multiple of half a pixel."""
-        return None if error is None else error / self.candidates.footprint
+    def failure(self, name: str) -> str:
+        """The status of a failed fit; empty for others."""
+        return (self.get(f"{name}.failed") or "").partition(":")[0]
+
+    @property
+    def state(self) -> str:
+        """Whether the papers' network reached the error of field=auto; empty where there is no such error."""
+        network = self.candidates.result(NETWORK)
+        if self.number("auto.error") is None:
+            return ""
+        if network is None:
+            return NOT_FITTED
+        if network.numbers.get("seconds_at_auto") is not None:
+            return REACHED
+        return FAILED if network.error is None else NOT_REACHED
+
+    @cached_property
+    def network(self) -> dict[str, float | None]:
+        """The network's costs until it reached that error, or of its whole fit where it did not."""
+        end = "_at_auto" if self.state == REACHED else ""
+        fitted = self.state not in ("", NOT_FITTED)
+        return {cost: self.number(f"{NETWORK}.{cost}{end}") if fitted else None for cost in COSTS}
+
+    @cached_property
+    def ratios(self) -> dict[str, float | None]:
+        """The network's costs, and what field=auto and pixel precision save, by their names in the CSV.
+
+        The ratios of costs are those of the network over those of `field=auto`, lower bounds where the error was not
+        reached. Numbers of the fit at pixel precision are over those of the plain fit; None where a fit failed. The
+        last is the share of evaluations that rendering held-out rays at pixel precision saves.
+        """
+        bound = self.network if self.state in (REACHED, NOT_REACHED) else dict.fromkeys(COSTS)
+        plain = self.candidates.chosen.numbers if self.number("frugal.error") is not None else {}
+        frugal = ("evaluations", "seconds", "error")
+        share = over(self.number("precision.evaluations_auto"), self.number("precision.evaluations"))
+        return {
+            **{f"network.{cost}": self.network[cost] for cost in COSTS},
+            **{f"ratio.{cost}": over(bound[cost], self.number(f"auto.{cost}")) for cost in COSTS},
+            **{f"frugal_over_plain.{name}": over(self.number(f"frugal.{name}"), plain.get(name)) for name in frugal},
+            "precision.saved": None if share is None else 1 - share,
+        }
+
+    @property
+    def errors(self) -> tuple[float | None, float | None]:
+        """The errors of the recommended candidate's plain fit and its fit at pixel precision, in half pixels."""
+        errors = (self.number(name) for name in ("recommended_error", "frugal.error"))
+        return tuple(None if error is None else error / self.candidates.footprint for error in errors)
 
 
 def scene_runs(experiment: Experiment) -> list[SceneRun]:
@@ -119,72 +160,3 @@ def factor(x: float | None, *, above: bool = False) -> str:
 def over(first: float | None, second: float | None) -> float | None:
     """The ratio of the two; None where one is missing, or the second is 0."""
     return None if first is None or not second else first / second
-
-
-@dataclass(frozen=True)
-class Saving:
-    """The savings of `field=auto` and of pixel precision on a scene."""
-
-    run: SceneRun
-
-    @property
-    def state(self) -> str:
-        """Whether the papers' network reached the error of field=auto; empty where there is no such error."""
-        network = self.run.candidates.result(NETWORK)
-        if not self.run.ok or self.run.number("auto.error") is None:
-            return ""
-        if network is None:
-            return NOT_FITTED
-        if network.numbers.get("seconds_at_auto") is not None:
-            return REACHED
-        return FAILED if network.error is None else NOT_REACHED
-
-    @cached_property
-    def network(self) -> dict[str, float | None]:
-        """The network's costs until it reached that error, or of its whole fit where it did not."""
-        names = {REACHED: "{}_at_auto", NOT_REACHED: "{}", FAILED: "{}"}
-        if self.state not in names:
-            return dict.fromkeys(COSTS)
-        return {cost: self.run.number(f"{NETWORK}.{names[self.state].format(cost)}") for cost in COSTS}
-
-    def ratio(self, cost: str) -> float | None:
-        """The network's cost over that of `field=auto`; a lower bound where the error was not reached."""
-        bounded = self.state in (REACHED, NOT_REACHED)
-        return over(self.network[cost], self.run.number(f"auto.{cost}")) if bounded else None
-
-    def pixel_precise(self, name: str) -> float | None:
-        """A number of the fit at pixel precision over that of the plain fit; None where a fit failed."""
-        chosen = self.run.candidates.chosen
-        if chosen is None or self.run.number("frugal.error") is None:
-            return None
-        return over(self.run.number(f"frugal.{name}"), chosen.numbers.get(name))
-
-    @property
-    def errors(self) -> tuple[float | None, float | None]:
-        """The errors of the recommended candidate's plain fit and its fit at pixel precision, in half pixels."""
-        plain, pixel_precise = (self.run.number(name) for name in ("recommended_error", "frugal.error"))
-        return self.run.in_footprints(plain), self.run.in_footprints(pixel_precise)
-
-    def failure(self, name: str) -> str:
-        """The status of a failed fit; empty for others."""
-        return (self.run.word(f"{name}.failed") or "").partition(":")[0]
-
-    @cached_property
-    def ratios(self) -> dict[str, float | None]:
-        """All of these numbers, by their names in the CSV."""
-        return {
-            **{f"network.{cost}": self.network[cost] for cost in COSTS},
-            **{f"ratio.{cost}": self.ratio(cost) for cost in COSTS},
-            **{f"frugal_over_plain.{name}": self.pixel_precise(name) for name in ("evaluations", "seconds", "error")},
-            "precision.saved": self.precision,
-        }
-
-    def get(self, name: str) -> int | float | str | None:
-        """One of `ratios`, or else a metric of the run."""
-        return self.ratios[name] if name in self.ratios else self.run.get(name)
-
-    @property
-    def precision(self) -> float | None:
-        """The share of evaluations that rendering held-out rays at pixel precision saves."""
-        share = over(self.run.number("precision.evaluations_auto"), self.run.number("precision.evaluations"))
-        return None if share is None else 1 - share

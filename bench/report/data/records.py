@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ FORMER = {
 }
 Record = dict[str, Any]
 RunKey = tuple[Hashable, Hashable]  # shape, seed
+Item, Key = TypeVar("Item"), TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -121,17 +122,18 @@ def run_key(record: Record) -> RunKey:
     return shape(record), record["seed"]
 
 
-def by_run(records: list[Record], value: Callable[[Record], float]) -> dict[RunKey, float]:
-    """A number of each run, by its shape and seed."""
-    return {run_key(record): value(record) for record in records}
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """The items of each key, with keys in the order in which they first occur."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
 def by_shape(values: dict[RunKey, float]) -> list[np.ndarray]:
     """The numbers of runs as an array per shape, with an entry per seed."""
-    shapes: dict[Hashable, list[float]] = {}
-    for (of, _), value in values.items():
-        shapes.setdefault(of, []).append(value)
-    return [np.array(group) for group in shapes.values()]
+    shapes = grouped(values, lambda run: run[0]).values()
+    return [np.array([values[run] for run in runs]) for runs in shapes]
 
 
 def definitions(records: list[Record], names: dict[str, str]) -> list[str]:

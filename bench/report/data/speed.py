@@ -16,11 +16,12 @@ from bench.report.data.records import (
     Row,
     RunKey,
     base_renderer,
-    by_run,
     by_shape,
     error,
+    grouped,
     loop_seconds,
     measured,
+    row_of,
     run_key,
     setting,
     value_evaluations,
@@ -119,7 +120,7 @@ class Setting:
             number = value(record) if record["status"] == "ok" else None
             return math.inf if number is None or math.isnan(number) else float(number)
 
-        found = by_run(self.records, sound)
+        found = {run_key(record): sound(record) for record in self.records}
         return by_shape({key: found.get(key, math.inf) for key in self.keys})
 
 
@@ -160,6 +161,11 @@ def front_line(panel: list[Placed]) -> list[Placed]:
     return sorted((point for point in panel if point.on_front), key=lambda point: point.x)
 
 
+def trials(*experiments: Experiment | None) -> list[list[Setting]]:
+    """The settings of each of `TRIALS`, none where it has no experiment."""
+    return [settings(experiment, trial) for experiment, trial in zip(experiments, TRIALS, strict=True)]
+
+
 def settings(experiment: Experiment | None, trial: Trial) -> list[Setting]:
     """The settings of a trial, in the order in which they started.
 
@@ -167,10 +173,10 @@ def settings(experiment: Experiment | None, trial: Trial) -> list[Setting]:
     """
     if experiment is None:
         return []
-    compared = {id(record) for record in _compared(experiment, trial)}
-    keys = sorted({run_key(record) for record in experiment.records if id(record) in compared}, key=str)
-    rows = {row: [r for r in records if id(r) in compared] for row, records in experiment.rows().items()}
-    return [Setting(row, base_renderer(kept[0]), trial, kept, keys) for row, kept in rows.items() if kept]
+    compared = _compared(experiment, trial)
+    keys = sorted(set(map(run_key, compared)), key=str)
+    rows = grouped(compared, row_of)
+    return [Setting(row, base_renderer(records[0]), trial, records, keys) for row, records in rows.items()]
 
 
 def _compared(experiment: Experiment, trial: Trial) -> list[Record]:

@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from bench.records import format
+
 Values = np.ndarray | Sequence[float]
 Groups = Sequence[np.ndarray]
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
@@ -27,6 +29,10 @@ class Interval:
     value: float
     low: float
     high: float
+
+    def __str__(self) -> str:
+        """The estimate, and its interval where there is one."""
+        return f"{format.number(self.value)} {format.interval(self.low, self.high)}".strip()
 
 
 @dataclass(frozen=True)

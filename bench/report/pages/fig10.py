@@ -7,9 +7,21 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import ONE_WAY, SCALE, Row, RunKey, by_shape, error, family, row_of, run_key, setting
+from bench.report.data.records import (
+    ONE_WAY,
+    SCALE,
+    Record,
+    Row,
+    by_shape,
+    error,
+    family,
+    grouped,
+    row_of,
+    run_key,
+    setting,
+)
 from bench.report.data.statistics import Interval, bootstrap, median
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, shown, text, to_data, to_table
 
@@ -43,13 +55,11 @@ def make(experiment: Experiment) -> Result:
         for (name, row, key, value), cell in cells.items()
     ]
     return Result(
-        title="Shape from many views under other focal lengths and starts.",
-        **captioned(
-            experiment,
-            "Median Chamfer distance from truth to prediction (squared scene units, times 1000).",
-            interval="95 % bootstrap intervals over shapes and seeds",
-            notes=NOTES,
-        ),
+        experiment,
+        "Shape from many views under other focal lengths and starts.",
+        "Median Chamfer distance from truth to prediction (squared scene units, times 1000).",
+        interval="95 % bootstrap intervals over shapes and seeds",
+        remarks=NOTES,
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
         figure=draw(cells),
@@ -58,23 +68,26 @@ def make(experiment: Experiment) -> Result:
 
 def _cells(experiment: Experiment) -> dict[Cell, Interval]:
     """The median for each family, method and value of a condition, with the other condition at its default."""
-    found: dict[Cell, dict[RunKey, float]] = {}
-    for record in experiment.records:
-        values = {key: float(setting(record["config"], "task", key)) for key in PANELS}
-        for key, value in values.items():
-            if all(values[other] == NEUTRAL for other in PANELS if other != key):
-                cell = found.setdefault((family(record), row_of(record), key, value), {})
-                cell[run_key(record)] = SCALE * error(record, ONE_WAY)
-    ordered = sorted(found.items(), key=lambda item: (item[0][0], item[0][1].name, *item[0][2:]))
-    return {cell: bootstrap(by_shape(errors), median, seed=0) for cell, errors in ordered}
+    cells: dict[Cell, Interval] = {}
+    for key in PANELS:
+        others = [other for other in PANELS if other != key]
+        alone = [r for r in experiment.records if all(_condition(r, other) == NEUTRAL for other in others)]
+        at = grouped(alone, lambda record, key=key: (family(record), row_of(record), key, _condition(record, key)))
+        for cell, records in at.items():
+            errors = {run_key(record): SCALE * error(record, ONE_WAY) for record in records}
+            cells[cell] = bootstrap(by_shape(errors), median, seed=0)
+    return dict(sorted(cells.items(), key=lambda item: (item[0][0], item[0][1].name, *item[0][2:])))
+
+
+def _condition(record: Record, key: str) -> float:
+    return float(setting(record["config"], "task", key))
 
 
 @style.styled
 def draw(cells: dict[Cell, Interval]) -> Figure:
     """Draws a row of panels per family, with a panel per condition and a line per method."""
     families = list(dict.fromkeys(name for name, *_ in cells))
-    figure = Figure(figsize=(style.WIDTH, 2.1 * len(families) + 0.5), layout="constrained")
-    axes = figure.subplots(len(families), len(PANELS), squeeze=False, sharey="row")
+    figure, axes = chart.sheet(2.1 * len(families) + 0.5, len(families), len(PANELS), sharey="row")
     for line, name in zip(axes, families, strict=True):
         for axis, key in zip(line, PANELS, strict=True):
             selected = {(row, x): cell for (n, row, k, x), cell in cells.items() if (n, k) == (name, key)}
@@ -89,10 +102,6 @@ def draw(cells: dict[Cell, Interval]) -> Figure:
 
 def _panel(axis: Axes, cells: dict[tuple[Row, float], Interval], edge: float) -> None:
     """Draws the medians of each row with their intervals; values beyond the edge are drawn at it."""
-    for row in dict.fromkeys(row for row, _ in cells):
-        points = [(x, cell) for (other, x), cell in cells.items() if other == row]
-        look, places = style.look(row.preset), [x for x, _ in points]
-        middles = [min(cell.value, edge) for _, cell in points]
-        axis.plot(places, middles, ls=look.line, color=look.colour, marker=look.marker, label=row.name)
-        ends = [min(cell.low, edge) for _, cell in points], [min(cell.high, edge) for _, cell in points]
-        axis.fill_between(places, *ends, color=look.colour, alpha=0.15, lw=0)
+    for row, keys in grouped(cells, lambda key: key[0]).items():
+        low, middle, high = ([min(getattr(cells[key], end), edge) for key in keys] for end in ("low", "value", "high"))
+        chart.line(axis, row.preset, [x for _, x in keys], middle, band=(low, high), label=row.name)

@@ -5,7 +5,6 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.write import pictures
-from bench.report.write.caption import captioned
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
 
@@ -18,9 +17,7 @@ NOTES = (
 MOST_COLUMNS = 5
 COLUMNS = (  # of a record and its cell of pictures
     *through(lambda line: line[0], *IDENTITY),
-    *through(
-        lambda line: line[1].images.counted() if line[1].images else {}, *(Column(name) for name in pictures.COUNTED)
-    ),
+    *through(lambda line: line[1].images.counted() if line[1].images else {}, *map(Column, pictures.COUNTED)),
     *through(lambda line: line[0], metric("depth_error_median")),
 )
 
@@ -30,13 +27,11 @@ def make(experiment: Experiment) -> Result:
     chosen = experiment.of_newest_scene()
     cells, missing = pictures.cells(chosen.named(), [chosen.folder(record) for record in chosen.records])
     return Result(
-        title="Errors of each strategy in the image.",
-        **captioned(
-            chosen,
-            "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
-            "normals.",
-            notes=(*missing, *NOTES),
-        ),
+        chosen,
+        "Errors of each strategy in the image.",
+        "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
+        "normals.",
+        remarks=(*missing, *NOTES),
         data=to_data(COLUMNS, zip(chosen.records, cells[1:], strict=True)),
         figure=draw(cells),
     )
@@ -49,6 +44,6 @@ def draw(cells: list[pictures.Cell]) -> Figure:
     columns = -(-len(cells) // lines)
     width = style.WIDTH - 0.7  # the rest is the colour bar's
     figure = Figure(figsize=(style.WIDTH, lines * (2 * width / max(columns, 3) + 0.35)), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
+    figure.get_layout_engine().set(**pictures.CLOSE)
     pictures.draw(figure, cells, columns)
     return figure

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import spearmanr
 
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, Row
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, to_data
 
@@ -51,19 +51,13 @@ def make(experiment: Experiment) -> Result:
     strategies = [_strategy(row, records, lines) for row, records in experiment.rows().items()]
     several = max(strategy.runs for strategy in strategies) > 1
     runs = ", ".join(f"{strategy.row.name} {strategy.runs}" for strategy in strategies)
-    about = (
-        "Lines are medians over a row's runs; after its end a failed run counts as infinite. Runs per row: "
-        + runs
-        + "."
-    )
+    about = f"Lines are medians over a row's runs; after its end a failed run counts as infinite. Runs per row: {runs}."
     return Result(
-        title="Loss and Chamfer distance as shapes are completed.",
-        **captioned(
-            experiment,
-            "Loss and Chamfer distance over iterations and seconds, and Chamfer distance over loss.",
-            interval="bands are the minimum and maximum over runs" if several else "one run per row, no interval",
-            notes=(*unread, about if several else "", *NOTES),
-        ),
+        experiment,
+        "Loss and Chamfer distance as shapes are completed.",
+        "Loss and Chamfer distance over iterations and seconds, and Chamfer distance over loss.",
+        interval="bands are the minimum and maximum over runs" if several else "one run per row, no interval",
+        remarks=(*unread, about if several else "", *NOTES),
         data=_data(experiment.records, lines, strategies),
         figure=draw(strategies),
     )
@@ -72,45 +66,36 @@ def make(experiment: Experiment) -> Result:
 @style.styled
 def draw(strategies: list[Strategy]) -> Figure:
     """Draws loss above and Chamfer below, over iterations and seconds; at the right Chamfer over loss, and a legend."""
-    figure = Figure(figsize=(style.WIDTH, 4.6), layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure, axes = chart.sheet(4.6, 2, 3)
     for row, quantity in zip(axes, QUANTITIES, strict=True):
         for axis, along in zip(row, ("iteration", "seconds"), strict=False):
-            for strategy in strategies:
-                _line(axis, strategy, quantity, along)
-            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration", ylabel=QUANTITIES[quantity])
-            _scale(axis, strategies, quantity, along)
+            _panel(axis, strategies, quantity, along)
     for strategy in strategies:
-        look, points = style.look(strategy.row.preset), strategy.points
-        loss, chamfer = (style.finite(points[quantity] * SCALES[quantity]) for quantity in QUANTITIES)
-        axes[0, 2].plot(loss, chamfer, look.marker, color=look.colour, alpha=0.75, markersize=3, label=_entry(strategy))
+        loss, chamfer = (style.finite(strategy.points[quantity] * SCALES[quantity]) for quantity in QUANTITIES)
+        label = f"{strategy.row.name}\n  ρ = {format.number(strategy.correlation)} (n = {len(strategy.points)})"
+        chart.points(axes[0, 2], strategy.row.preset, loss, chamfer, alpha=0.75, ms=3, label=label)
     axes[0, 2].set(xlabel=QUANTITIES["total"], ylabel=QUANTITIES["chamfer_l2"])
     for letter, quantity in (("x", "total"), ("y", "chamfer_l2")):
         style.log_axis(axes[0, 2], letter, [SCALES[quantity] * x for s in strategies for x in s.points[quantity]])
     axes[1, 2].axis("off")
-    handles, labels = axes[0, 2].get_legend_handles_labels()
-    axes[1, 2].legend(
-        handles, labels, loc="upper left", borderaxespad=0, labelspacing=0.7, markerscale=1.5, fontsize=6.5
-    )
+    how = {"borderaxespad": 0, "labelspacing": 0.7, "markerscale": 1.5, "fontsize": 6.5}
+    axes[1, 2].legend(*axes[0, 2].get_legend_handles_labels(), loc="upper left", **how)
     return figure
 
 
-def _line(axis: Any, strategy: Strategy, quantity: str, along: str) -> None:
-    shown, look, scale = strategy.medians[quantity], style.look(strategy.row.preset), SCALES[quantity]
-    middle, low, high = ([scale * x for x in style.finite(shown[name])] for name in ("median", "low", "high"))
-    places = style.finite(shown[along])
-    every = max(len(places) // 6, 1)
-    axis.plot(places, middle, linestyle=look.line, color=look.colour, marker=look.marker, markevery=every, ms=3.5)
-    if strategy.runs > 1:
-        axis.fill_between(places, low, high, color=look.colour, alpha=0.15, lw=0)
-
-
-def _scale(axis: Any, strategies: list[Strategy], quantity: str, along: str) -> None:
-    """Sets a logarithmic axis of values, and of seconds where some rows are much faster than others."""
-    style.log_axis(axis, "y", [x for s in strategies for x in s.medians[quantity]["median"] * SCALES[quantity]])
-    ends = [s.medians[quantity]["seconds"].max() for s in strategies if len(s.medians[quantity])]
-    if along == "seconds" and style.needs_log(ends):
-        style.log_axis(axis, "x", [x for s in strategies for x in s.medians[quantity]["seconds"]])
+def _panel(axis: Axes, strategies: list[Strategy], quantity: str, along: str) -> None:
+    """Draws a quantity; the axis of seconds is logarithmic where some rows are much faster than others."""
+    scale = SCALES[quantity]
+    for strategy in strategies:
+        shown = strategy.medians[quantity]
+        middle, low, high = ([scale * x for x in style.finite(shown[name])] for name in ("median", "low", "high"))
+        how = {"band": (low, high) if strategy.runs > 1 else None, "markevery": max(len(shown) // 6, 1), "ms": 3.5}
+        chart.line(axis, strategy.row.preset, style.finite(shown[along]), middle, **how)
+    axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration", ylabel=QUANTITIES[quantity])
+    everything = pd.concat([strategy.medians[quantity] for strategy in strategies])
+    style.log_axis(axis, "y", scale * everything["median"])
+    if along == "seconds" and style.needs_log(s.medians[quantity]["seconds"].max() for s in strategies):
+        style.log_axis(axis, "x", everything["seconds"])
 
 
 def _strategy(row: Row, records: list[Record], lines: dict[str, pd.DataFrame]) -> Strategy:
@@ -118,13 +103,7 @@ def _strategy(row: Row, records: list[Record], lines: dict[str, pd.DataFrame]) -
     runs = [lines[record["folder"]] for record in records]
     points = pd.concat(runs, ignore_index=True).dropna(subset=["total", "chamfer_l2"])
     medians = {quantity: curves.median(runs, failed, quantity) for quantity in QUANTITIES}
-    varied = len(points) > 2 and all(points[quantity].nunique() > 1 for quantity in QUANTITIES)
-    correlation = float(spearmanr(points["total"], points["chamfer_l2"]).statistic) if varied else None
-    return Strategy(row, len(records), points, medians, correlation)
-
-
-def _entry(strategy: Strategy) -> str:
-    return f"{strategy.row.name}\n  ρ = {format.number(strategy.correlation)} (n = {len(strategy.points)})"
+    return Strategy(row, len(records), points, medians, curves.spearman(points, *QUANTITIES))
 
 
 def _data(records: list[Record], lines: dict[str, pd.DataFrame], strategies: list[Strategy]) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """Fig. 6 of DIST in numbers: the success rate of camera pose over the initial error in rotation."""
 
 from collections.abc import Callable
-from typing import Any
+from itertools import chain
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,21 +13,22 @@ from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
     Record,
     Row,
+    grouped,
     loop_seconds,
     measured,
     median_of_known,
-    row_of,
     setting,
     shape,
     value_evaluations,
 )
 from bench.report.data.statistics import wilson
-from bench.report.write.caption import WITHOUT_NETWORK, captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
 
 PLACE = 60
-READS = (Selection("fig6", ("pose", "pose_icp"), ("dataset", "task"), ("degrees",)),)
+SETUP = ("scenes", "pixels", "machine")
+READS = (Selection("fig6", ("pose", "pose_icp"), ("dataset", "task"), ("degrees",), setup=SETUP),)
 PLOTTED = (
     "Share of runs that end within {degrees:g} degrees and {distance:g} scene units of the true pose, over the initial "
     "error in rotation."
@@ -43,82 +44,67 @@ RUNS = (
     *metrics("success", "rotation_error_deg", "translation_error", "mask_iou", "depth_mae"),
     *LOOP,
 )
-Cells = dict[tuple[Row, float], list[Record]]  # the runs of a method with an initial angle
+Runs = dict[Row, dict[float, list[Record]]]  # of each method, by the initial angle
 
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per method: its success rate at each angle, and its costs."""
-    cells = _cells(experiment)
+    runs = {row: grouped(records, _angle) for row, records in experiment.rows().items()}
+    angles = sorted({_angle(record) for record in experiment.records})
     columns = [
         text("method", "Method"),
-        *(Column(str(angle), f"{angle:g}°", show=_share) for angle in sorted({angle for _, angle in cells})),
+        *(Column(str(angle), f"{angle:g}°", show=_share) for angle in angles),
         Column("seconds", "Loop", show=format.seconds),
         Column("evaluations", "Evaluations", show=format.count),
     ]
-    config = experiment.requested()
+    lines = []
+    for row, records in experiment.rows().items():
+        ended = [record for record in records if record["status"] == "ok"]
+        costs = {"seconds": _median(ended, loop_seconds), "evaluations": _median(ended, value_evaluations)}
+        lines.append({"method": row.name, **{str(angle): of for angle, of in runs[row].items()}, **costs})
     names = {"degrees": "success_degrees", "distance": "success_distance", "shift": "shift"}
-    settings = {name: setting(config, "task", key) for name, key in names.items()}
+    settings = {name: setting(experiment.requested(), "task", key) for name, key in names.items()}
     scenes = len({shape(record) for record in experiment.records})
     return Result(
-        title="Camera pose from a depth image and a silhouette of a known shape.",
-        **captioned(
-            experiment,
-            PLOTTED.format(**settings),
-            interval="Wilson's 95 % intervals",
-            notes=[note.format(**settings, scenes=scenes) for note in NOTES],
-            parts=WITHOUT_NETWORK,
-        ),
+        experiment,
+        "Camera pose from a depth image and a silhouette of a known shape.",
+        PLOTTED.format(**settings),
+        interval="Wilson's 95 % intervals",
+        remarks=[note.format(**settings, scenes=scenes) for note in NOTES],
         data=to_data(RUNS, experiment.records),
-        table=to_table(columns, [_line(cells, row) for row in dict.fromkeys(row for row, _ in cells)]),
-        figure=draw(cells),
+        table=to_table(columns, lines),
+        figure=draw(runs, angles),
     )
 
 
-def _line(cells: Cells, row: Row) -> dict[str, Any]:
-    selected = [record for record in _of(cells, row) if record["status"] == "ok"]
-    costs = {"seconds": _median(selected, loop_seconds), "evaluations": _median(selected, value_evaluations)}
-    return {"method": row.name, **{str(angle): runs for (name, angle), runs in cells.items() if name == row}, **costs}
-
-
 @style.styled
-def draw(cells: Cells) -> Figure:
+def draw(runs: Runs, angles: list[float]) -> Figure:
     """Draws success over the initial angle, and over a method's median seconds."""
-    figure = Figure(figsize=(style.WIDTH, 3.0), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
-    rows = list(dict.fromkeys(row for row, _ in cells))
-    for place, row in enumerate(rows):
-        look, selected = style.look(row.preset), _of(cells, row)
-        _rates(left, cells, row, 0.5 * (place - len(rows) / 2))
+    figure, ((left, right),) = chart.sheet(3.0, 1, 2, width_ratios=(1.6, 1))
+    for place, (row, of_row) in enumerate(runs.items()):
+        _rates(left, row, of_row, 0.5 * (place - len(runs) / 2))
+        selected = list(chain(*of_row.values()))
         if (seconds := _median(selected, loop_seconds)) is not None:
-            right.plot(seconds, 100 * _found(selected) / len(selected), color=look.colour, marker=look.marker)
-    left.set(xlabel="initial error in rotation (degrees)", ylabel="poses found (%)", ylim=(-3, 103))
-    left.set_xticks(sorted({angle for _, angle in cells}))
+            chart.points(right, row.preset, seconds, 100 * _found(selected) / len(selected))
+    left.set(xlabel="initial error in rotation (degrees)", ylabel="poses found (%)", ylim=(-3, 103), xticks=angles)
     right.set(xlabel="loop, median (seconds)", ylabel="poses found, all angles together (%)", ylim=(-3, 103))
-    style.log_axis(right, "x", [_median(selected, loop_seconds) for selected in cells.values()])
+    style.log_axis(right, "x", [_median(of, loop_seconds) for of_row in runs.values() for of in of_row.values()])
     style.legend_below(figure, left)
     return figure
 
 
-def _rates(axis: Axes, cells: Cells, row: Row, offset: float) -> None:
+def _rates(axis: Axes, row: Row, runs: dict[float, list[Record]], offset: float) -> None:
     """Draws the success rate of a row at each angle, with a horizontal offset so that bars do not overlap."""
-    look, angles = style.look(row.preset), sorted(angle for name, angle in cells if name == row)
-    rates = [wilson(_found(cells[row, angle]), len(cells[row, angle])) for angle in angles]
+    look, angles = style.look(row.preset), sorted(runs)
+    rates = [wilson(_found(runs[angle]), len(runs[angle])) for angle in angles]
     shares, low, high = (100 * np.array([getattr(rate, end) for rate in rates]) for end in ("value", "low", "high"))
     bars = np.maximum([shares - low, high - shares], 0)
     how = {"color": look.colour, "marker": look.marker, "ls": look.line}
     axis.errorbar(np.array(angles) + offset, shares, bars, elinewidth=0.7, label=row.name, **how)
 
 
-def _cells(experiment: Experiment) -> Cells:
-    cells: Cells = {}
-    for record in experiment.records:
-        cells.setdefault((row_of(record), float(setting(record["config"], "task", "degrees"))), []).append(record)
-    return cells
-
-
-def _of(cells: Cells, row: Row) -> list[Record]:
-    """A method's runs at all angles."""
-    return [record for (name, _), selected in cells.items() if name == row for record in selected]
+def _angle(record: Record) -> float:
+    return float(setting(record["config"], "task", "degrees"))
 
 
 def _found(records: list[Record]) -> int:

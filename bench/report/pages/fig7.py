@@ -11,8 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, measured, setting
-from bench.report.write import pictures
-from bench.report.write.caption import captioned
+from bench.report.write import chart, pictures
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
 
@@ -22,7 +21,7 @@ NOTES = (
     "Erosion is the number of missed pixels over that of the reference's hits; dilation is the number of spurious "
     "pixels over the same. The depth error is over pixels that both hit. Epsilon is in scene units.",
 )
-MOST_COLUMNS = 8
+MOST_COLUMNS = 7
 # Lines of the chart: column, colour, fill of the marker, label.
 KINDS = (
     ("lost_share", style.MISSED, style.MISSED, "erosion"),
@@ -34,19 +33,18 @@ def make(experiment: Experiment) -> Result:
     """Makes the page, with a column of pictures and a point of the chart per epsilon, the largest first."""
     chosen = experiment.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
-    titled = [{**record, "name": _title(record)} for record in chosen.records]
+    several = len({record["renderer"] for record in chosen.records}) > 1
+    titled = [{**record, "name": _title(record, several=several)} for record in chosen.records]
     cells, missing = pictures.cells(titled, [chosen.folder(record) for record in chosen.records])
     data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, cells[1:]), strict=True))
     unplaced = int(data["epsilon"].isna().sum())
     missing += [f"Without an epsilon, and not in the chart: {unplaced} of {len(data)} rows."] if unplaced else []
     return Result(
-        title="Erosion and dilation of the image by the convergence threshold.",
-        **captioned(
-            chosen,
-            "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
-            "blue) above the angle to the reference's, and erosion, dilation and depth error over epsilon.",
-            notes=(*missing, *NOTES),
-        ),
+        chosen,
+        "Erosion and dilation of the image by the convergence threshold.",
+        "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
+        "blue) above the angle to the reference's, and erosion, dilation and depth error over epsilon.",
+        remarks=(*missing, *NOTES),
         data=data,
         figure=draw(cells, data),
     )
@@ -74,7 +72,6 @@ def _charts(figure: SubFigure, data: pd.DataFrame) -> None:
         style.log_axis(axis, "x", data["epsilon"])
         if len(data):
             axis.invert_xaxis()  # in the order of the pictures
-            axis.legend()
     percents = [100 * x for name in ("lost_share", "false_share") for x in style.finite(data[name])]
     if style.needs_log(percents):
         shares.set_yscale("symlog", linthresh=0.1)  # so that zero can be drawn
@@ -82,17 +79,18 @@ def _charts(figure: SubFigure, data: pd.DataFrame) -> None:
     shares.set(ylabel="pixels (% of the reference's hits)", ylim=(0, None))
     depth.set(ylabel="median depth error (scene units)")
     style.log_axis(depth, "y", data["depth_error_median"])
+    if len(data):
+        style.legend_below(figure, shares, depth, columns=6)
 
 
 def _lines(shares: Axes, depth: Axes, rows: pd.DataFrame, name: str, *, several: bool) -> None:
     """Draws a renderer's lines in both charts."""
-    look, epsilon = style.look(name), style.finite(rows["epsilon"])
+    epsilon = style.finite(rows["epsilon"])
     for key, colour, face, label in KINDS:
         percent = [100 * x for x in style.finite(rows[key])]
-        how = {"color": colour, "marker": look.marker, "mfc": face, "clip_on": False, "zorder": 3}
-        shares.plot(epsilon, percent, look.line, label=f"{label}, {name}" if several else label, **how)
-    error = style.finite(rows["depth_error_median"])
-    depth.plot(epsilon, error, look.line, marker=look.marker, color=look.colour, label=name)
+        how = {"color": colour, "mfc": face, "clip_on": False, "zorder": 3}
+        chart.line(shares, name, epsilon, percent, label=f"{label}, {name}" if several else label, **how)
+    chart.line(depth, name, epsilon, style.finite(rows["depth_error_median"]), label=name)
 
 
 def _counts(record: Record, cell: pictures.Cell) -> dict[str, Any]:
@@ -112,13 +110,15 @@ def _epsilon(record: Record) -> float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-def _title(record: Record) -> str:
+def _title(record: Record, *, several: bool) -> str:
+    """The epsilon of a picture, with its renderer where there are several."""
     epsilon = _epsilon(record)
-    return f"{record['renderer']}, no epsilon" if epsilon is None else f"{epsilon:.0e}".replace("e-0", "e-")
+    words = "no epsilon" if epsilon is None else f"{epsilon:.0e}".replace("e-0", "e-")
+    return f"{record['renderer']}, {words}" if several or epsilon is None else words
 
 
 COLUMNS = (  # of a record and its counts
     *through(lambda line: line[0], *IDENTITY, Column("epsilon", value=_epsilon)),
-    *through(lambda line: line[1], *(Column(name) for name in (*pictures.COUNTED, "lost_share", "false_share"))),
+    *through(lambda line: line[1], *map(Column, (*pictures.COUNTED, "lost_share", "false_share"))),
     *through(lambda line: line[0], metric("depth_error_median")),
 )

@@ -1,8 +1,6 @@
 """Errors of gradients against central differences, by renderer and by the angle between ray and surface."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +11,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions, measured, row_of
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table, whole
 
@@ -32,12 +30,12 @@ NOTES = (
 TITLES = ("gradient for the code", "gradient for the camera", "silhouette")  # of the figure's columns
 # Panels of the figure: metric, label of the axis, and the value of an exact gradient.
 PANELS = (
-    ("code_scale", "scale (ratio, right: 1)", 1.0),
-    ("camera_scale", "scale (ratio, right: 1)", 1.0),
-    ("image_scale", "scale (ratio, right: 1)", 1.0),
+    ("code_scale", "scale (ratio, exact: 1)", 1.0),
+    ("camera_scale", "scale (ratio, exact: 1)", 1.0),
+    ("image_scale", "scale (ratio, exact: 1)", 1.0),
     ("code_median_error", "median relative error (ratio)", None),
     ("camera_median_error", "median relative error (ratio)", None),
-    ("image_cosine", "cosine (right: 1)", 1.0),
+    ("image_cosine", "cosine (exact: 1)", 1.0),
 )
 
 
@@ -48,12 +46,10 @@ def make(experiment: Experiment) -> Result:
     zeros = sum((data[metric] == 0).sum() for metric, _, right in PANELS if right is None)
     unseen = f"{zeros} errors of exactly zero lie below the figure's logarithmic axes." if zeros else ""
     return Result(
-        title="Errors of the gradients.",
-        **captioned(
-            experiment,
-            "Cosine and scale of a renderer's gradient against the true one: both are 1 where it is exact.",
-            notes=(*NOTES, unseen, *definitions(experiment.records, {name: _heading(name) for name in NUMBERS})),
-        ),
+        experiment,
+        "Errors of the gradients.",
+        "Cosine and scale of a renderer's gradient against the true one: both are 1 where it is exact.",
+        remarks=(*NOTES, unseen, *definitions(experiment.records, {name: _heading(name) for name in NUMBERS})),
         data=data,
         table=to_table(COLUMNS, lines),
         figure=draw(data.assign(name=[r["name"] for r, _ in lines], preset=[row_of(r).preset for r, _ in lines])),
@@ -63,27 +59,24 @@ def make(experiment: Experiment) -> Result:
 @style.styled
 def draw(data: pd.DataFrame) -> Figure:
     """Draws scale above and median error below, by band, a marker per renderer; the silhouette in a third column."""
-    figure = Figure(figsize=(style.WIDTH, 4.4), layout="constrained")
-    axes = figure.subplots(2, 3, width_ratios=(3, 3, 2)).flat
+    figure, axes = chart.sheet(4.4, 2, 3, width_ratios=(3, 3, 2))
     names = list(dict.fromkeys(data["name"]))
-    for axis, (metric, label, right) in zip(axes, PANELS, strict=True):
+    for axis, (metric, label, right) in zip(axes.flat, PANELS, strict=True):
         bands = BANDS[3:] if metric.startswith("image") else BANDS[:3]
         for place, name in enumerate(names):
             _points(axis, data[data["name"] == name].set_index("band"), metric, bands, (place + 0.5) / len(names) - 0.5)
         _dress(axis, label, right, bands)
-    for axis, what in zip(figure.axes, TITLES, strict=False):
+    for axis, what in zip(axes[0], TITLES, strict=True):
         axis.set_title(what)
-    style.legend_below(figure, figure.axes[0], columns=min(len(names), 5))
+    style.legend_below(figure, axes[0, 0], columns=min(len(names), 5))
     return figure
 
 
 def _points(axis: Axes, rows: pd.DataFrame, metric: str, bands: tuple[str, ...], shift: float) -> None:
-    look = style.look(rows["preset"].iloc[0])
     values = style.finite(rows.loc[list(bands), metric])
-    places = np.arange(len(bands)) + 0.7 * shift
-    name, status = rows["name"].iloc[0], rows["status"].iloc[0]
+    name, status, preset = rows[["name", "status", "preset"]].iloc[0]
     label = name if status == "ok" else f"{name} ({status})"
-    axis.plot(places, values, look.marker, color=look.colour, label=label, markersize=5, clip_on=False)
+    chart.points(axis, preset, np.arange(len(bands)) + 0.7 * shift, values, label=label, ms=5, clip_on=False)
 
 
 def _dress(axis: Axes, label: str, right: float | None, bands: tuple[str, ...]) -> None:
@@ -94,7 +87,7 @@ def _dress(axis: Axes, label: str, right: float | None, bands: tuple[str, ...]) 
     values = np.concatenate([line.get_ydata() for line in axis.lines if line.get_marker() not in ("", "None")])
     values = values[np.isfinite(values)]
     if not values.size:
-        axis.text(0.5, 0.5, "no numbers", transform=axis.transAxes, ha="center", color="#777777")
+        chart.say(axis, "no numbers", va="baseline", color="#777777")
     if right is None:
         style.log_axis(axis, "y", values)
         return
@@ -102,10 +95,6 @@ def _dress(axis: Axes, label: str, right: float | None, bands: tuple[str, ...]) 
     if values.size and np.abs(values).max() > 5:
         axis.set_yscale("symlog", linthresh=2.0)
         axis.yaxis.set_major_formatter("{x:g}")
-
-
-def _of_band(name: str) -> Callable[[Any], Any]:
-    return lambda line: measured(line[0], f"{line[1]}.{name}")
 
 
 def _cosine(value: float | None) -> str:
@@ -118,16 +107,17 @@ def _heading(name: str) -> str:
     return name.replace("_", " ").capitalize()
 
 
-def _column(name: str) -> Column:
+def _column(name: str, heading: str = "") -> Column:
+    """A column of a number of each band."""
     show = whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
-    return Column(name, _heading(name), _of_band(name), show)
+    return Column(name, heading, lambda line: measured(line[0], f"{line[1]}.{name}"), show)
 
 
 COLUMNS = (  # of a record and a band
     shown("Renderer", lambda line: line[0]["name"]),
     *through(lambda line: line[0], *IDENTITY),
     text("band", "Band", lambda line: line[1]),
-    *(_column(name) for name in NUMBERS),
-    *(Column(name, value=_of_band(name)) for name in UNSHOWN),
+    *(_column(name, _heading(name)) for name in NUMBERS),
+    *map(_column, UNSHOWN),
     shown("Status", lambda line: line[0]["status"]),
 )

@@ -2,19 +2,17 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import spearmanr
 
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
-from bench.report.data.curves import history_of
+from bench.report.data.curves import history_of, spearman
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import Row, shape
+from bench.report.data.records import Row, by_shape, run_key
 from bench.report.data.speed import COMPLETION, SEED, Setting, main_settings, settings, sizes
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, to_data, to_table
 
@@ -39,13 +37,11 @@ def make(experiment: Experiment) -> Result:
     lines = [_line(row, histories[row.row]) for row in rows]
     clouds = {row: pd.concat(of_row, ignore_index=True) for row, of_row in histories.items()}
     return Result(
-        title="Correlation of loss and Chamfer distance.",
-        **captioned(
-            experiment,
-            "Spearman's rank correlation of loss and Chamfer distance over the checkpoints of a run.",
-            interval="95 % bootstrap intervals over shapes and seeds",
-            notes=(sizes(rows), *NOTES),
-        ),
+        experiment,
+        "Correlation of loss and Chamfer distance.",
+        "Spearman's rank correlation of loss and Chamfer distance over the checkpoints of a run.",
+        interval="95 % bootstrap intervals over shapes and seeds",
+        remarks=(sizes(rows), *NOTES),
         data=to_data(COLUMNS, lines),
         table=to_table(COLUMNS, lines),
         figure=draw(main_settings(rows), clouds),
@@ -53,35 +49,24 @@ def make(experiment: Experiment) -> Result:
 
 
 def _line(row: Setting, histories: list[pd.DataFrame]) -> dict[str, Any]:
-    within: dict[Any, list[float]] = {}
-    for record, history in zip(row.records, histories, strict=True):
-        if (rho := _spearman(history)) is not None:
-            within.setdefault(shape(record), []).append(rho)
-    groups = [np.array(values) for values in within.values()]
+    within = {run_key(record): spearman(h) for record, h in zip(row.records, histories, strict=True)}
+    groups = by_shape({run: rho for run, rho in within.items() if rho is not None})
     spread = statistics.bootstrap(groups, statistics.median, seed=SEED) if groups else None
     numbers = {"within": spread.value, "low": spread.low, "high": spread.high} if spread else {}
     cloud = pd.concat(histories, ignore_index=True)
-    pooled = {"together": _spearman(cloud), "looks": len(cloud), "runs": sum(map(len, groups))}
+    pooled = {"together": spearman(cloud), "looks": len(cloud), "runs": sum(map(len, groups))}
     return {"row": row.name, "renderer": row.renderer, **numbers, **pooled}
 
 
 @style.styled
 def draw(rows: list[Setting], clouds: dict[Row, pd.DataFrame]) -> Figure:
     """Draws the error over the loss of each renderer's main setting."""
-    figure = Figure(figsize=(style.WIDTH * 0.6, 3.0), layout="constrained")
-    axis = figure.subplots()
+    figure, ((axis,),) = chart.sheet(3.0, width=0.6 * style.WIDTH)
     for row in rows:
-        look, cloud = style.look(row.renderer), clouds[row.row]
-        axis.plot(
-            cloud["loss"], cloud["error"], look.marker, color=look.colour, ls="none", ms=3, alpha=0.7, label=row.name
-        )
+        cloud = clouds[row.row]
+        chart.points(axis, row.renderer, cloud["loss"], cloud["error"], ms=3, alpha=0.7, label=row.name)
     for letter, column in (("x", "loss"), ("y", "error")):
         style.log_axis(axis, letter, [x for row in rows for x in clouds[row.row][column]])
     axis.set(xlabel="weighted loss", ylabel=COMPLETION.heading)
     figure.legend(loc="outside right upper")
     return figure
-
-
-def _spearman(cloud: pd.DataFrame) -> float | None:
-    varied = len(cloud) > 2 and all(cloud[column].nunique() > 1 for column in ("loss", "error"))
-    return float(spearmanr(cloud["loss"], cloud["error"]).statistic) if varied else None

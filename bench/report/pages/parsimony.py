@@ -1,7 +1,11 @@
-"""Model selection: the recommended candidate of each scene, and its savings over the papers' network."""
+"""Model selection: each candidate's error over its parameters and over the FLOPs of a query, and a scene's need.
+
+A scene's need is the size of its recommended field; its complexity is measured as the error of the best single part.
+"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 import pandas as pd
@@ -12,12 +16,15 @@ from bench.pictures import style
 from bench.pictures.size_chart import AXES, KINDS, CandidateResult, panel
 from bench.records import format
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import PARSIMONY, SceneRun, factor, failures, named_settings, scene_runs, spread
-from bench.report.write.caption import WITHOUT_NETWORK, captioned
+from bench.report.data.parsimony import PARSIMONY, SceneRun, factor, failures, named_settings, over, scene_runs, spread
+from bench.report.data.records import grouped
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, percent, shown, text, thousandfold, through, to_data, to_table
 
 PLACE = 160
+PLACE_FLOPS = 170
+PLACE_NEEDS = 180
 READS = (PARSIMONY,)
 INTERVAL = "± and bars are one standard error, by the jackknife over views"
 NOTES = (
@@ -39,6 +46,16 @@ TABLE = (
     "Chamfer distance to the true surface is computed afterwards and takes no part in the choice; as points are "
     "sampled on both surfaces, it is not 0 for the true shape.",
 )
+QUERY = (
+    "A query computes one value of the field; its floating-point operations are counted for networks, and estimated "
+    "for formulas and grids."
+)
+MOST_ERROR = 10.0  # half pixels: largest error of a ray
+NEEDS_NOTES = (
+    "A single part is a sphere or a kind of box with at most 11 parameters: the error of the best one measures the "
+    f"complexity of the scene from the data alone. The error of a ray is at most {MOST_ERROR:g} half pixels.",
+    "The dashed line is the size of the papers' network, the dotted one a tenth of it.",
+)
 MOST = 4  # most panels in a row
 
 
@@ -47,26 +64,56 @@ def make(experiment: Experiment) -> Result:
     runs = scene_runs(experiment)
     about = named_settings(experiment)
     return Result(
-        title="The smallest sufficient field for each scene.",
-        **captioned(
-            experiment,
-            "Held-out error of each candidate over its parameters, a panel per scene.",
-            interval=INTERVAL,
-            notes=(*(note.format(**about) for note in (*NOTES, *TABLE)), *failures(runs, _failed)),
-            parts=WITHOUT_NETWORK,
-        ),
-        data=to_data(CANDIDATES, candidate_lines(runs)),
-        table=scene_table(COLUMNS, runs, lambda run: run),
+        experiment,
+        "The smallest sufficient field for each scene.",
+        "Held-out error of each candidate over its parameters, a panel per scene.",
+        interval=INTERVAL,
+        remarks=(*(note.format(**about) for note in (*NOTES, *TABLE)), *failures(runs, _failed)),
+        data=to_data(CANDIDATES, _candidate_lines(runs)),
+        table=scene_table(COLUMNS, runs),
         figure=draw(runs, "parameters"),
     )
 
 
-def candidate_lines(runs: list[SceneRun]) -> list[tuple[SceneRun, CandidateResult | None]]:
+def make_flops(experiment: Experiment) -> Result:
+    """Makes the page with a panel per scene over FLOPs per query."""
+    runs = scene_runs(experiment)
+    about = named_settings(experiment)
+    return Result(
+        experiment,
+        "Error over the cost of a query of the field.",
+        "Held-out error of each candidate over its FLOPs per query, a panel per scene.",
+        interval=INTERVAL,
+        remarks=(QUERY, *(note.format(**about) for note in NOTES)),
+        data=to_data(FLOPS, _candidate_lines(runs)),
+        figure=draw(runs, "flops_per_query"),
+    )
+
+
+def make_needs(experiment: Experiment) -> Result:
+    """Makes the page with a point per scene: the size of its recommended field over its complexity."""
+    runs = scene_runs(experiment)
+    lines = [(run, _need(run)) for run in runs]
+    needs = [need for _, need in lines if need]
+    unknown = [run.name for run, need in lines if run.ok and not need]
+    return Result(
+        experiment,
+        "Parameters that each scene needs over its complexity.",
+        "Number of parameters of the recommended field over the held-out error of the best single part, in half "
+        f"pixels; {len(needs)} of {len(runs)} scenes are drawn.",
+        interval=INTERVAL,
+        remarks=(f"Not drawn, as no single part was fitted: {', '.join(unknown)}." if unknown else "", *NEEDS_NOTES),
+        data=to_data(NEEDS, lines),
+        figure=draw_needs(needs, papers_size(runs)),
+    )
+
+
+def _candidate_lines(runs: list[SceneRun]) -> list[tuple[SceneRun, CandidateResult | None]]:
     """A line of the CSV for each candidate of each run; one with None for a run that did not end ok."""
     return [(run, result) for run in runs for result in (run.candidates.results if run.ok else [None])]
 
 
-def of_candidate(line: tuple[SceneRun, CandidateResult | None]) -> dict[str, Any]:
+def _of_candidate(line: tuple[SceneRun, CandidateResult | None]) -> dict[str, Any]:
     """The name, kind and numbers of a line's candidate; empty where it has none."""
     run, result = line
     if result is None:
@@ -75,15 +122,9 @@ def of_candidate(line: tuple[SceneRun, CandidateResult | None]) -> dict[str, Any
     return {**result.numbers, "rung": result.name, "kind": KINDS[result.kind][0], **marks}
 
 
-def scene_table(columns: Sequence[Column], runs: list[SceneRun], line: Callable[[SceneRun], Any]) -> pd.DataFrame:
-    """The readable table of all runs; those that did not end ok come last, with their status and no numbers.
-
-    Args:
-        columns: columns of the table.
-        runs: a run per scene.
-        line: gives the line of a run.
-    """
-    table = to_table(columns, [line(run) for run in runs if run.ok])
+def scene_table(columns: Sequence[Column], runs: list[SceneRun]) -> pd.DataFrame:
+    """The readable table of all runs; those that did not end ok come last, with their status and no numbers."""
+    table = to_table(columns, [run for run in runs if run.ok])
     rest = [[run.name, run.status, *[format.MISSING] * (table.shape[1] - 2)] for run in runs if not run.ok]
     return pd.DataFrame([*table.to_numpy().tolist(), *rest], columns=table.columns)
 
@@ -94,10 +135,10 @@ def draw(runs: list[SceneRun], key: str) -> Figure:
     columns = min(MOST, len(runs))
     lines = math.ceil(len(runs) / columns)
     left_over = lines * columns - len(runs)
-    figure = Figure(figsize=(style.WIDTH, 1.75 * lines + (0.25 if left_over else 0.65)), layout="constrained")
-    axes = list(figure.subplots(lines, columns, squeeze=False, sharex=True).flat)
+    figure, axes = chart.sheet(1.75 * lines + (0.25 if left_over else 0.65), lines, columns, sharex=True)
+    axes = list(axes.flat)
     for axis, run in zip(axes, runs, strict=False):
-        (_panel if run.ok else _failed_panel)(axis, run, key)
+        _panel(axis, run, key)
     for axis in axes[len(runs) :]:
         axis.axis("off")
     for axis in axes:  # all of them, since they share x
@@ -118,6 +159,13 @@ def draw(runs: list[SceneRun], key: str) -> Figure:
 
 
 def _panel(axis: Axes, run: SceneRun, key: str) -> None:
+    """Draws the candidates of a run; where it did not end ok, writes its status."""
+    if not run.ok:
+        axis.set_title(f"{run.name}\n")
+        axis.tick_params(left=False, labelleft=False)
+        axis.grid(False)
+        chart.say(axis, run.status, color="#666666")
+        return
     panel(axis, run.candidates, key)
     axis.set_title(f"{run.name}\nneeds {run.candidates.chosen.label}")
     failed = _failed_fits(run)
@@ -125,14 +173,6 @@ def _panel(axis: Axes, run: SceneRun, key: str) -> None:
         axis.plot(result.numbers[key], 0.97, "x", color=KINDS[result.kind][1], transform=axis.get_xaxis_transform())
     if failed:
         axis.plot([], [], "x", color="#444444", label="failed fit")
-
-
-def _failed_panel(axis: Axes, run: SceneRun, key: str) -> None:
-    """Writes the status of a run that did not end ok."""
-    axis.set_title(f"{run.name}\n")
-    axis.tick_params(left=False, labelleft=False)
-    axis.grid(False)
-    axis.text(0.5, 0.5, run.status, ha="center", va="center", color="#666666", transform=axis.transAxes)
 
 
 def _failed_fits(run: SceneRun) -> list[CandidateResult]:
@@ -154,8 +194,48 @@ def _error(result: CandidateResult) -> str:
     return spread(result.error, result.numbers.get("standard_error"))
 
 
-def _failed_count(run: SceneRun) -> str:
-    return f"{len(_failed_fits(run))} of {len(run.candidates.results)}"
+def papers_size(runs: list[SceneRun]) -> float | None:
+    """The number of parameters of the papers' network, computed from the runs' savings; None where unknown."""
+    known = ((run.number("saved_parameters"), run.number("recommended_parameters")) for run in runs)
+    return next((saved * size for saved, size in known if saved and size), None)
+
+
+@style.styled
+def draw_needs(needs: list[dict[str, Any]], papers: float | None) -> Figure:
+    """Draws the size over the complexity, with a colour per kind of candidate."""
+    figure, ((axes,),) = chart.sheet(3.4)
+    of_kind = grouped(needs, itemgetter("kind"))
+    for kind, (label, colour, marker) in KINDS.items():
+        if kind in of_kind:
+            x, y, bars = ([need[key] for need in of_kind[kind]] for key in ("complexity", "parameters", "spread"))
+            axes.errorbar(x, y, xerr=bars, fmt=marker, color=colour, ms=6, elinewidth=0.7, label=label)
+    if papers is not None:
+        for size, line, label in ((papers, "--", "papers' network"), (papers / 10, ":", "a tenth of it")):
+            axes.axhline(size, color="#777777", lw=0.9, ls=line, label=label)
+    axes.axvline(1.0, color="#bbbbbb", lw=0.8, zorder=0)
+    small = {"textcoords": "offset points", "fontsize": 6, "color": "#777777", "va": "center"}
+    axes.annotate("half a pixel", (1.0, 0.45), (3, 0), xycoords=("data", "axes fraction"), **small)
+    axes.set(xlim=(-0.5, MOST_ERROR + 0.5), xlabel="held-out error of the best single part (half pixels)", yscale="log")
+    axes.set_ylabel("parameters of the recommended field")
+    axes.margins(y=0.1)
+    style.legend_below(figure, axes, columns=6)
+    chart.name_points(axes, [(need["name"], need["complexity"], need["parameters"]) for need in needs])
+    return figure
+
+
+def _need(run: SceneRun) -> dict[str, Any]:
+    """The complexity with its standard error, in half pixels, and the size and kind of the recommended candidate.
+
+    Empty where the run did not end ok, or no single part was fitted.
+    """
+    parts = [result for result in run.candidates.results if result.kind == "" and result.error is not None]
+    if not run.ok or not parts:
+        return {}
+    best = min(parts, key=lambda result: result.error)
+    footprint, chosen = run.candidates.footprint, run.candidates.chosen
+    spread = (best.numbers.get("standard_error") or 0.0) / footprint
+    need = {"name": run.name, "kind": chosen.kind, "parameters": chosen.numbers["parameters"]}
+    return {**need, "complexity": best.error / footprint, "spread": spread}
 
 
 SAVED = ("parameters", "flops_per_query", "bytes", "seconds")
@@ -165,10 +245,10 @@ SEEDS = ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")
 # Columns that identify a scene, for runs, and a candidate, for dictionaries.
 SCENE = (text("scene", "Scene", lambda run: run.name), *through(lambda run: run.record, *IDENTITY))
 CANDIDATE = tuple(map(Column, ("rung", "kind", "recommended", "best")))
-_OF_CANDIDATE = ("parameters", "bytes", "flops_per_query", "error", "standard_error", *SPENT, "failed")
+_CANDIDATE_NUMBERS = ("parameters", "bytes", "flops_per_query", "error", "standard_error", *SPENT, "failed")
 CANDIDATES = (
     *through(lambda line: line[0], *SCENE, *map(Column, (*OF_SCENE, *SEEDS, *(f"saved_{name}" for name in SAVED)))),
-    *through(of_candidate, *CANDIDATE, *map(Column, (*_OF_CANDIDATE, *(f"{name}_at_auto" for name in SPENT)))),
+    *through(_of_candidate, *CANDIDATE, *map(Column, (*_CANDIDATE_NUMBERS, *(f"{name}_at_auto" for name in SPENT)))),
 )
 COLUMNS = (
     SCENE[0],
@@ -186,5 +266,18 @@ COLUMNS = (
     Column("saved_bytes", "Saved bytes", show=factor),
     Column("saved_seconds", "Saved fit seconds", show=factor),
     Column("chamfer_l2", "Chamfer × 1000", show=thousandfold),
-    shown("Failed candidates", _failed_count),
+    shown("Failed candidates", lambda run: f"{len(_failed_fits(run))} of {len(run.candidates.results)}"),
+)
+FLOPS = (
+    *through(lambda line: line[0], *SCENE, Column("footprint")),
+    *through(_of_candidate, *CANDIDATE, *map(Column, ("flops_per_query", "error", "standard_error", "failed"))),
+)
+NEEDS = (  # of a run and its need
+    *through(lambda line: line[0], *SCENE),
+    Column("single_part_error_footprints", value=lambda line: line[1].get("complexity")),
+    Column("single_part_standard_error_footprints", value=lambda line: line[1].get("spread")),
+    *through(lambda line: line[0], Column("footprint"), Column("recommended_field")),
+    Column("kind", value=lambda line: KINDS[line[1]["kind"]][0] if line[1] else None),
+    *through(lambda line: line[0], Column("recommended_parameters")),
+    Column("share_of_papers_network", value=lambda line: over(1.0, line[0].number("saved_parameters"))),
 )

@@ -9,25 +9,13 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.pictures.size_chart import KINDS
 from bench.records import format
+from bench.report.data import parsimony
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import (
-    COSTS,
-    FAILED,
-    NETWORK,
-    NOT_REACHED,
-    PARSIMONY,
-    REACHED,
-    Saving,
-    SceneRun,
-    factor,
-    failures,
-    scene_runs,
-    spread,
-)
+from bench.report.data.parsimony import COSTS, FAILED, NOT_REACHED, PARSIMONY, REACHED, SceneRun, factor, scene_runs
 from bench.report.pages.parsimony import SCENE, scene_table
-from bench.report.write.caption import WITHOUT_NETWORK, captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import Column, percent, text, thousandfold, through, to_data
+from bench.report.write.table import Column, percent, text, thousandfold, to_data
 
 PLACE = 190
 READS = (PARSIMONY,)
@@ -63,90 +51,78 @@ _HOLLOW: dict[str, Any] = {"mfc": "none", "mew": 1.1}
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per scene."""
     runs = scene_runs(experiment)
-    savings = [Saving(run) for run in runs]
     return Result(
-        title="Savings of field=auto and of pixel precision.",
-        **captioned(
-            experiment,
-            "Costs of field=auto and of the papers' network to the same error, and costs and error of a fit at pixel "
-            "precision over those of the plain fit.",
-            interval="± is one standard error, by the jackknife over views",
-            notes=(_held(savings), *NOTES, *failures(runs, _failed)),
-            parts=WITHOUT_NETWORK,
-        ),
-        data=to_data(COLUMNS, savings),
-        table=scene_table(COLUMNS, runs, Saving),
-        figure=draw(savings),
+        experiment,
+        "Savings of field=auto and of pixel precision.",
+        "Costs of field=auto and of the papers' network to the same error, and costs and error of a fit at pixel "
+        "precision over those of the plain fit.",
+        interval="± is one standard error, by the jackknife over views",
+        remarks=(_held(runs), *NOTES, *parsimony.failures(runs, _failed)),
+        data=to_data(COLUMNS, runs),
+        table=scene_table(COLUMNS, runs),
+        figure=draw(runs),
     )
 
 
-def _held(savings: list[Saving]) -> str:
+def _held(runs: list[SceneRun]) -> str:
     """The number of scenes on which field=auto kept its budget, without and with evaluation, as a note."""
-    known = [saving.run for saving in savings if saving.run.number("auto.overhead") is not None]
-    held = [
-        sum((run.number(name) or 0) <= TARGET for run in known) for name in ("auto.overhead", "auto.overhead_judged")
-    ]
+    known = [run for run in runs if run.number("auto.overhead") is not None]
+    names = ("auto.overhead", "auto.overhead_judged")
+    held = [sum((run.number(name) or 0) <= TARGET for run in known) for name in names]
     return f"The overhead is at most {TARGET:g} on {held[0]} of {len(known)} scenes; with evaluation, on {held[1]}."
 
 
 @style.styled
-def draw(savings: list[Saving]) -> Figure:
+def draw(runs: list[SceneRun]) -> Figure:
     """Draws, left, operations of field=auto and the network to the same error; right, the fit at pixel precision."""
-    figure = Figure(figsize=(style.WIDTH, 0.24 * len(savings) + 1.5), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.25, 1))
-    for place, saving in enumerate(savings):
-        if saving.run.ok:
-            _operations(left, saving, place)
-            _precision(right, saving, place)
+    figure, ((left, right),) = chart.sheet(0.24 * len(runs) + 1.5, 1, 2, sharey=True, width_ratios=(1.25, 1))
+    for place, run in enumerate(runs):
+        if run.ok:
+            _operations(left, run, place)
+            _precision(right, run, place)
         else:
-            _note(left, place, saving.run.status)
-    reach = [x for s in savings for x in (s.run.number("auto.flops"), s.network["flops"]) if x]
+            _note(left, place, run.status)
+    reach = [x for run in runs for x in (run.number("auto.flops"), run.network["flops"]) if x]
     style.log_axis(left, "x", reach)
-    ratios = [s.pixel_precise(name) for s in savings for name in ("evaluations", "error")]
+    ratios = [run.get(f"frugal_over_plain.{name}") for run in runs for name in ("evaluations", "error")]
     style.log_axis(right, "x", [x for x in ratios if x])
     left.margins(x=0.1)
     right.axvline(1, color="#777777", lw=0.9)
-    left.set(xlabel="FLOPs to the error of field=auto", ylim=(len(savings) - 0.5, -0.5))
+    left.set(xlabel="FLOPs to the error of field=auto", ylim=(len(runs) - 0.5, -0.5))
     right.set(xlabel="fit at pixel precision / plain fit")
-    left.set_yticks(range(len(savings)), [saving.run.name for saving in savings])
-    figure.legend(*_legend(left), loc="outside lower left", ncols=2)
-    figure.legend(*_legend(right), loc="outside lower right")
+    left.set_yticks(range(len(runs)), [run.name for run in runs])
+    for axis, side, columns in ((left, "left", 2), (right, "right", 1)):
+        named = dict(sorted(style.labelled(axis).items()))
+        figure.legend(named.values(), named.keys(), loc=f"outside lower {side}", ncols=columns)
     return figure
 
 
-def _legend(axis: Axes) -> tuple[list[Any], list[str]]:
-    """Handles and labels of a legend, each label once, in alphabetical order."""
-    named = style.labelled(axis)
-    return [named[label] for label in sorted(named)], sorted(named)
-
-
-def _operations(axis: Axes, saving: Saving, place: int) -> None:
-    auto, network = saving.run.number("auto.flops"), saving.network["flops"]
-    if not saving.state or auto is None:
-        return _note(axis, place, f"field=auto failed: {saving.failure('auto')}")
+def _operations(axis: Axes, run: SceneRun, place: int) -> None:
+    auto, network = run.number("auto.flops"), run.network["flops"]
+    if not run.state or auto is None:
+        return _note(axis, place, f"field=auto failed: {run.failure('auto')}")
     _, colour, marker = KINDS["network"]
     if network is None:
         _note(axis, place, "network not fitted")
     else:
         axis.plot([auto, network], [place, place], color="#bbbbbb", lw=1, zorder=1)
-        label = LABELS[saving.state]
-        how = {} if saving.state == REACHED else _HOLLOW
-        axis.plot(
-            network, place, marker if saving.state != FAILED else "x", color=colour, ls="none", label=label, **how
-        )
-    if saving.state == NOT_REACHED:
-        axis.annotate("", (network, place), (14, 0), textcoords="offset points", arrowprops=_arrow(colour))
+        label = LABELS[run.state]
+        how = {} if run.state == REACHED else _HOLLOW
+        axis.plot(network, place, marker if run.state != FAILED else "x", color=colour, ls="none", label=label, **how)
+    if run.state == NOT_REACHED:
+        arrow = {"arrowstyle": "<-", "color": colour, "lw": 0.9, "shrinkA": 0, "shrinkB": 3}
+        axis.annotate("", (network, place), (14, 0), textcoords="offset points", arrowprops=arrow)
     axis.plot(auto, place, AUTO[1], color=AUTO[0], ls="none", label="field=auto, all trials")
     return None
 
 
-def _precision(axis: Axes, saving: Saving, place: int) -> None:
-    evaluations, error = saving.pixel_precise("evaluations"), saving.pixel_precise("error")
+def _precision(axis: Axes, run: SceneRun, place: int) -> None:
+    evaluations, error = (run.get(f"frugal_over_plain.{name}") for name in ("evaluations", "error"))
     if evaluations is None or error is None:
-        return _note(axis, place, f"fit at pixel precision failed: {saving.failure('frugal')}")
+        return _note(axis, place, f"fit at pixel precision failed: {run.failure('frugal')}")
     axis.plot([evaluations, error], [place, place], color="#bbbbbb", lw=1, zorder=1)
     axis.plot(evaluations, place, EVALUATIONS[1], color=EVALUATIONS[0], ls="none", label="evaluations")
-    above = (saving.errors[1] or 0) > 1
+    above = (run.errors[1] or 0) > 1
     label = f"error, {'above' if above else 'under'} half a pixel"
     axis.plot(error, place, ERROR[1], color=ERROR[0], ls="none", ms=5, label=label, **(_HOLLOW if above else {}))
     return None
@@ -158,31 +134,27 @@ def _note(axis: Axes, place: int, text: str) -> None:
     axis.annotate(text, (0.99, place), (0, 4), fontsize=6, color="#666666", **how)
 
 
-def _arrow(colour: str) -> dict[str, Any]:
-    return {"arrowstyle": "<-", "color": colour, "lw": 0.9, "shrinkA": 0, "shrinkB": 3}
-
-
-def _network(cost: str, show: Callable[[Any], str]) -> Callable[[Saving], str]:
+def _network(cost: str, show: Callable[[Any], str]) -> Callable[[SceneRun], str]:
     """The text of the network's cost, with its state where it did not reach the error."""
 
-    def words(saving: Saving) -> str:
-        spent = show(saving.network[cost])
-        return f"{saving.state} ({spent})" if saving.state in (NOT_REACHED, FAILED) else spent
+    def words(run: SceneRun) -> str:
+        spent = show(run.network[cost])
+        return f"{run.state} ({spent})" if run.state in (NOT_REACHED, FAILED) else spent
 
     return words
 
 
-def _ratio(cost: str) -> Callable[[Saving], str]:
-    return lambda saving: factor(saving.ratio(cost), above=saving.state == NOT_REACHED)
+def _ratio(cost: str) -> Callable[[SceneRun], str]:
+    return lambda run: factor(run.ratios[f"ratio.{cost}"], above=run.state == NOT_REACHED)
 
 
-def _auto_error(saving: Saving) -> str:
-    return spread(saving.run.number("auto.error"), saving.run.number("auto.standard_error"))
+def _auto_error(run: SceneRun) -> str:
+    return parsimony.spread(run.number("auto.error"), run.number("auto.standard_error"))
 
 
-def _errors(saving: Saving) -> str:
-    plain, pixel_precise = saving.errors
-    return f"{format.number(plain)}, {saving.failure('frugal') or format.number(pixel_precise)}"
+def _errors(run: SceneRun) -> str:
+    plain, pixel_precise = run.errors
+    return f"{format.number(plain)}, {run.failure('frugal') or format.number(pixel_precise)}"
 
 
 def _field(name: str | None) -> str:
@@ -190,12 +162,12 @@ def _field(name: str | None) -> str:
 
 
 def _failed(run: SceneRun) -> dict[str, str | None]:
-    fits = {"field=auto": "auto", "the fit at pixel precision": "frugal", "the papers' network": NETWORK}
-    return {fit: run.word(f"{name}.failed") for fit, name in fits.items()}
+    fits = {"field=auto": "auto", "the fit at pixel precision": "frugal", "the papers' network": parsimony.NETWORK}
+    return {fit: run.get(f"{name}.failed") for fit, name in fits.items()}
 
 
-COLUMNS = (  # of a saving
-    *through(lambda saving: saving.run, *SCENE),
+COLUMNS = (  # of a run
+    *SCENE,
     Column("auto.field", "Choice of field=auto", show=_field),
     *(Column("auto.error", "Error × 1000", words=_auto_error), Column("auto.standard_error")),
     Column("recommended_field", "Recommended among all", show=_field),
@@ -205,7 +177,7 @@ COLUMNS = (  # of a saving
     Column("auto.flops", "FLOPs", show=format.count),
     Column("auto.evaluations", "Evaluations", show=format.count),
     *(Column("auto.overhead", "Overhead"), Column("auto.overhead_judged", "Overhead with evaluation")),
-    text("network", value=lambda saving: saving.state),
+    text("network", value=lambda run: run.state),
     Column("network.seconds", "Network: seconds", words=_network("seconds", format.seconds)),
     Column("network.flops", "Network: FLOPs", words=_network("flops", format.count)),
     Column("network.evaluations", "Network: evaluations", words=_network("evaluations", format.count)),

@@ -1,5 +1,8 @@
 """The oracle of each prior: its best fit to unseen shapes, with pictures and the length of its gradient."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,11 +12,10 @@ from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import PRIORS
-from bench.report.data.records import SCALE, Record, definitions, measured
-from bench.report.write import pictures
-from bench.report.write.caption import captioned
+from bench.report.data.records import Record, definitions, measured
+from bench.report.write import chart, pictures
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, shown, text, to_data, to_table
+from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, text, thousandfold, to_data, to_table
 
 PLACE = 70
 READS = (PRIORS,)
@@ -38,31 +40,25 @@ def _ratio(record: Record) -> float | None:
     return None if fit is None or not floor else fit / floor
 
 
-def _worst(value: float | None, record: Record) -> float:
-    return np.inf if value is None or record["status"] != "ok" else value
+def _values(line: tuple[str, list[Record]], value: Callable[[Record], float | None]) -> list[float]:
+    """A number of each run of a family; infinite where a run did not end ok, or has none."""
+    found = [value(record) if record["status"] == "ok" else None for record in line[1]]
+    return [np.inf if x is None else x for x in found]
 
 
-def _ratios(line: tuple[str, list[Record]]) -> list[float]:
-    return [_worst(_ratio(record), record) for record in line[1]]
-
-
-def _median(name: str, scale: float = 1.0) -> Column:
+def _median(name: str, show: Callable[[float], str] = format.number) -> Column:
     """A column with the median of a metric over a family's shapes."""
-
-    def median(line: tuple[str, list[Record]]) -> str:
-        values = [_worst(measured(record, name), record) for record in line[1]]
-        return format.number(float(statistics.median(values)), scale)
-
-    return shown(DEFINED[name], median)
+    value = partial(measured, name=name)
+    return Column("", DEFINED[name], lambda line: float(statistics.median(_values(line, value))), show)
 
 
 RUNS = (FAMILY, *IDENTITY, *metrics(*DEFINED), Column("ratio", value=_ratio))
 COLUMNS = (  # of a family and its records
     text("", "Family", lambda line: line[0]),
     text("", "Shapes", lambda line: len(line[1])),
-    *(_median("chamfer_l2", SCALE), _median("floor_chamfer_l2", SCALE)),
-    Column("", "Fit / floor", lambda line: float(statistics.median(_ratios(line)))),
-    Column("", "largest", lambda line: max(_ratios(line))),
+    *(_median("chamfer_l2", thousandfold), _median("floor_chamfer_l2", thousandfold)),
+    Column("", "Fit / floor", lambda line: float(statistics.median(_values(line, _ratio)))),
+    Column("", "largest", lambda line: max(_values(line, _ratio))),
     *(_median("distance_error"), _median("slope_median"), _median("slope_p99")),
 )
 
@@ -71,13 +67,11 @@ def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per family: the fit of its shapes, and the floor."""
     families = experiment.families()
     return Result(
-        title="The best fit of each prior to unseen shapes.",
-        **captioned(
-            experiment,
-            "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its floor; medians over "
-            "shapes.",
-            notes=(*NOTES, *definitions(experiment.records, DEFINED)),
-        ),
+        experiment,
+        "The best fit of each prior to unseen shapes.",
+        "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its floor; medians over "
+        "shapes.",
+        remarks=(*NOTES, *definitions(experiment.records, DEFINED)),
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, families.items()),
         figure=draw(experiment, families),
@@ -87,17 +81,16 @@ def make(experiment: Experiment) -> Result:
 @style.styled
 def draw(experiment: Experiment, families: dict[str, list[Record]]) -> Figure:
     """Draws a line per family: pairs of pictures, then the histogram."""
-    figure = Figure(figsize=(style.WIDTH, 1.05 * len(families) + 0.45), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
-    ratios = {"width_ratios": [1] * 2 * SHOWN + [1.7]}
-    axes = figure.subplots(len(families), 2 * SHOWN + 1, squeeze=False, gridspec_kw=ratios)
+    ratios = [1] * 2 * SHOWN + [1.7]
+    figure, axes = chart.sheet(1.05 * len(families) + 0.45, len(families), len(ratios), width_ratios=ratios)
+    figure.get_layout_engine().set(**pictures.CLOSE)
     for line, (name, records) in zip(axes, families.items(), strict=True):
         for axis in line[:-1]:
             style.bare(axis)
         line[0].set_ylabel(name)
         for place, record in enumerate(records[:SHOWN]):
             _pair(line[2 * place], line[2 * place + 1], experiment, record)
-        _histogram(line[-1], [_lengths(experiment, record) for record in records])
+        _histogram(line[-1], experiment, records)
     for axis, title in zip(axes[0], ("truth", "fit") * SHOWN, strict=False):
         axis.set_title(title)
     axes[0, -1].set_title("length of the gradient")
@@ -107,7 +100,7 @@ def draw(experiment: Experiment, families: dict[str, list[Record]]) -> Figure:
 def _pair(true: Axes, found: Axes, experiment: Experiment, record: Record) -> None:
     images, why = pictures.load(experiment.folder(record))
     if images is None:
-        found.text(0.5, 0.5, why or record["status"], ha="center", va="center", fontsize=5, transform=found.transAxes)
+        chart.say(found, why, fontsize=5)
         return
     both = ((true, images.reference_normals, images.reference_hit), (found, images.normals, images.hit))
     for axis, normals, hit in both:
@@ -116,15 +109,11 @@ def _pair(true: Axes, found: Axes, experiment: Experiment, record: Record) -> No
     found.set_xlabel("" if ratio is None else f"{format.number(ratio)} × floor", fontsize=6, labelpad=1)
 
 
-def _histogram(axis: Axes, lengths: list[np.ndarray]) -> None:
-    together = np.concatenate(lengths)
-    if together.size:
-        axis.hist(together.clip(0, 2), bins=np.linspace(0, 2, 41), color="#0072b2", density=True)
+def _histogram(axis: Axes, experiment: Experiment, records: list[Record]) -> None:
+    found = [pictures.arrays(experiment.folder(record), ("gradient_length",))[0] for record in records]
+    lengths = np.concatenate([np.asarray(arrays.get("gradient_length", ()), dtype=float) for arrays in found])
+    lengths = lengths[np.isfinite(lengths)]
+    if lengths.size:
+        axis.hist(lengths.clip(0, 2), bins=np.linspace(0, 2, 41), color="#0072b2", density=True)
     axis.axvline(1.0, color="#777777", lw=0.8, ls=":")
     axis.set(yticks=[], xlim=(0, 2))
-
-
-def _lengths(experiment: Experiment, record: Record) -> np.ndarray:
-    arrays, _ = pictures.arrays(experiment.folder(record), ("gradient_length",))
-    found = np.asarray(arrays.get("gradient_length", ()), dtype=float)
-    return found[np.isfinite(found)]

@@ -10,13 +10,12 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data import statistics
-from bench.report.data.curves import history_of
+from bench.report.data.curves import HISTORY, history_of
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, Row, loop_seconds
 from bench.report.data.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
-from bench.report.write import interactive
-from bench.report.write.caption import captioned
+from bench.report.data.statistics import kaplan_meier
+from bench.report.write import chart, interactive
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, text, through, to_data, to_table
 
@@ -34,10 +33,7 @@ Reached = tuple[float, bool]  # seconds, and whether the target was reached then
 Histories = dict[Row, list[pd.DataFrame]]  # of the runs of each setting
 POINTS = (  # of a record and a point of its history
     *through(lambda line: line[0], *IDENTITY, FAMILY),
-    *through(
-        lambda line: line[1],
-        *(Column(name) for name in ("iteration", "seconds", "value_evaluations", "error", "loss")),
-    ),
+    *through(lambda line: line[1], *map(Column, HISTORY)),
 )
 COLUMNS = (
     *(text("setting", "Setting"), text("runs", "Runs"), text("reached", "Reached")),
@@ -58,13 +54,11 @@ def make(experiment: Experiment) -> Result:
         for point in history.astype(object).to_dict("records")
     ]
     return Result(
-        title="Error over time and over field values.",
-        **captioned(
-            experiment,
-            "Error over seconds and over field values, and the share of runs that have not reached the target.",
-            interval="bands are the quartiles of the runs",
-            notes=(sizes(rows), *NOTES),
-        ),
+        experiment,
+        "Error over time and over field values.",
+        "Error over seconds and over field values, and the share of runs that have not reached the target.",
+        interval="bands are the quartiles of the runs",
+        remarks=(sizes(rows), *NOTES),
         data=to_data(POINTS, points),
         table=to_table(COLUMNS, [_line(row, of_row) for row, of_row in times.items()]),
         figure=draw(main_settings(rows), shown, times),
@@ -81,15 +75,13 @@ def _line(row: Row, times: list[Reached]) -> dict[str, Any]:
 @style.styled
 def draw(rows: list[Setting], shown: Histories, times: dict[Row, list[Reached]]) -> Figure:
     """Draws the error over seconds and over evaluations, and the share of runs that have not reached the target."""
-    figure = Figure(figsize=(style.WIDTH, 2.9), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure, (axes,) = chart.sheet(2.9, 1, 3)
     for axis, (along, label) in zip(axes, ALONG.items(), strict=False):
         everything = []  # positions with finite medians: a logarithmic axis needs a point
         for row in rows:
             where, low, middle, high = band(shown[row.row], [r["status"] != "ok" for r in row.records], along)
-            look = style.look(row.renderer)
-            axis.plot(where, style.finite(middle), color=look.colour, ls=look.line, label=row.name)
-            axis.fill_between(where, style.finite(low), style.finite(high), color=look.colour, alpha=0.15, lw=0)
+            how = {"band": (style.finite(low), style.finite(high)), "marker": "", "label": row.name}
+            chart.line(axis, row.renderer, where, style.finite(middle), **how)
             everything += [*where] if np.isfinite(middle).any() else []
         errors = [x for row in rows for history in shown[row.row] for x in history["error"]]
         style.log_axis(axis, "x", everything)
@@ -105,21 +97,21 @@ def _survival(axis: Axes, times: dict[Setting, list[Reached]]) -> None:
     known = [time for row in times.values() for time, _ in row if math.isfinite(time)]
     latest = max(known, default=1.0)
     for row, reached in times.items():
-        look = style.look(row.renderer)
-        left = survival(reached, latest)
+        colour = style.look(row.renderer).colour
+        # Those with an infinite time, which failed, remain until `latest`.
+        left = kaplan_meier([min(time, latest) for time, _ in reached], [hit for _, hit in reached])
         end = max(min(time, latest) for time, _ in reached)
         where, share = np.append(left.times, end), np.append(left.remaining, left.remaining[-1])
-        axis.step(where, share, where="post", color=look.colour)
+        axis.step(where, share, where="post", color=colour)
         ticks = [time for time, hit in reached if not hit and math.isfinite(time)]
         at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in ticks]
-        axis.plot(ticks, at, "|", color=look.colour, ms=6)
-    axis.set(xlabel="time (seconds)", ylabel=f"share not yet at {SCALE * TARGET:g}", ylim=(-0.03, 1.03))
+        axis.plot(ticks, at, "|", color=colour, ms=6)
+    axis.set(
+        xlabel="time (seconds)",
+        ylabel=f"share of runs\nnot yet at Chamfer × 1000 = {SCALE * TARGET:g}",
+        ylim=(-0.03, 1.03),
+    )
     style.log_axis(axis, "x", known)
-
-
-def survival(reached: list[Reached], latest: float) -> statistics.Survival:
-    """Kaplan and Meier's curve of runs; those with an infinite time, which failed, remain until `latest`."""
-    return statistics.kaplan_meier([min(time, latest) for time, _ in reached], [hit for _, hit in reached])
 
 
 def band(

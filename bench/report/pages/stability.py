@@ -1,4 +1,7 @@
-"""The breakdown of each renderer on each axis of the stress test, as a table and a heat map."""
+"""The breakdown of each renderer on each axis of the stress test, as a table and a heat map; and robustness over cost.
+
+Robustness is a renderer's mean rank over the axes, cost its number of field values per ray.
+"""
 
 import math
 from collections import Counter
@@ -9,14 +12,16 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
+from bench.report.data.atlas import FAILED, STABILITY, Atlas, atlas, title
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import Row, measured, setting
-from bench.report.write.caption import captioned
+from bench.report.data.records import Row, median_of_known, setting
+from bench.report.data.statistics import rank
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table
 
 PLACE = 120
+PLACE_COST = 130
 READS = (STABILITY,)
 NOTES = (
     "The adaptive search makes {share:.0f} % of a full grid's trials; every renderer gets the same trials at a "
@@ -27,78 +32,93 @@ NOTES = (
     "a gradient whose cosine is at least {cosine:g} and whose relative length is within {scale:g} of 1; a fit within "
     "{surface_error:g} scene units of the surface.",
 )
+COST_NOTES = (
+    "Axes: the {axes} that evaluate renderings and that every renderer supports. Rank 1 is the best; equal breakdowns "
+    "share their mean rank; a run that did not end ok, or is missing, has the worst.",
+    "At once: number of axes on which it breaks at the mildest severity; none: on which it does not break at the "
+    "severest.",
+)
+CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
 WORST = 3
+COLUMNS = (  # of an axis and a cell
+    text("axis", value=lambda line: line[0]),
+    text("group", value=lambda line: str(line[1].stress("group"))),
+    text("unit", value=lambda line: str(line[1].stress("sweep", "unit"))),
+    *through(lambda line: line[1].record, *IDENTITY),
+)
+COSTS = (
+    text("row", "Renderer"),
+    Column("axes"),
+    Column("rank", "Mean rank"),
+    text("at_once", "At once"),
+    text("never", "None"),
+    Column("cost", "Field values per ray"),
+)
+FAILURES = text(
+    "failures", value=lambda line: "; ".join(f"{count} {kind}" for kind, count in line[1].failures().items())
+)
 
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per axis and a column per renderer."""
     grid = atlas(experiment)
-    lines = [(grid, axis, row) for axis in grid.axes for row, _ in grid.on(axis)]
-    cells = [grid.cells[axis, row].record for _, axis, row in lines]
-    trials, full = (sum(measured(record, name) or 0 for record in cells) for name in ("trials", "grid_trials"))
-    about = {"share": 100 * trials / max(full, 1), **_criteria(experiment)}
-    columns = [
-        shown("Axis", title),
-        shown("Unit", grid.unit),
-        *(shown(row.name, lambda axis, row=row: _full(grid, axis, row)) for row in grid.rows),
+    lines = [(axis, cell) for axis in grid.axes for _, cell in grid.on(axis)]
+    trials, full = (sum(cell.number(name) or 0 for _, cell in lines) for name in ("trials", "grid_trials"))
+    task = experiment.requested().get("task")
+    about = {name: float(setting(task, "criteria", name) or math.nan) for name in CRITERIA}
+    about |= {"share": 100 * trials / max(full, 1), "resolution": setting(task, "resolution")}
+    metrics = dict.fromkeys(name for cell in grid.cells.values() for name in cell.record["metrics"])
+    numbers = [
+        Column(name, value=lambda line, name=name: line[1].record["metrics"].get(name))
+        for name in metrics
+        if not name.startswith(FAILED)
     ]
+    cells = [shown(row.name, lambda axis, row=row: grid.cell(axis, row).full()) for row in grid.rows]
     return Result(
-        title="The severity at which each renderer breaks.",
-        **captioned(
-            experiment,
-            "The severity at which half of the trials succeed.",
-            n=f"{int(trials)} trials in all, of {len(grid.axes)} axes and {len(grid.rows)} renderers",
-            interval="95 % credible intervals, the milder end first",
-            notes=(
-                *(note.format(**about) for note in NOTES),
-                *(_worst(grid, row) for row in grid.rows),
-                *_theory(grid),
-            ),
-            parts=("machine",),
-        ),
-        data=to_data([*COLUMNS, *_measured(grid), FAILURES], lines),
-        table=to_table(columns, grid.axes),
+        experiment,
+        "The severity at which each renderer breaks.",
+        "The severity at which half of the trials succeed.",
+        n=f"{int(trials)} trials in all, of {len(grid.axes)} axes and {len(grid.rows)} renderers",
+        interval="95 % credible intervals, the milder end first",
+        remarks=[*(note.format(**about) for note in NOTES), *(_worst(grid, row) for row in grid.rows), *_theory(grid)],
+        data=to_data([*COLUMNS, *numbers, FAILURES], lines),
+        table=to_table([shown("Axis", title), shown("Unit", grid.unit), *cells], grid.axes),
         figure=draw(grid),
     )
 
 
-def _cell(line: tuple[Atlas, str, Row]) -> Cell:
-    grid, axis, row = line
-    return grid.cells[axis, row]
-
-
-def _measured(grid: Atlas) -> list[Column]:
-    """A column for each metric of the cells, except the failures."""
-    metrics = dict.fromkeys(name for cell in grid.cells.values() for name in cell.record["metrics"])
-    names = [name for name in metrics if not name.startswith("failed_")]
-    return [Column(name, value=lambda line, name=name: _cell(line).record["metrics"].get(name)) for name in names]
-
-
-COLUMNS = (  # of the grid, an axis and a row
-    text("axis", value=lambda line: line[1]),
-    text("group", value=lambda line: line[0].group(line[1])),
-    text("unit", value=lambda line: line[0].unit(line[1])),
-    *through(lambda line: _cell(line).record, *IDENTITY),
-)
-FAILURES = text(
-    "failures", value=lambda line: "; ".join(f"{count} {kind}" for kind, count in _cell(line).failures().items())
-)
+def make_cost(experiment: Experiment) -> Result:
+    """Makes the page, with a line and a point per renderer."""
+    grid = atlas(experiment)
+    rendered = [axis for axis in grid.axes if grid.stress(axis, "measure") == "rendering"]
+    shared = [axis for axis in rendered if not any(cell.unsupported for _, cell in grid.on(axis))]
+    # A run that did not end ok, or is missing, has no shade, so it ranks last.
+    ranks = rank({row: {axis: 1.0 - grid.cell(axis, row).shade for axis in shared} for row in grid.rows})
+    lines = {row: {**_cost(grid, row, shared), "rank": ranks[row]} for row in grid.rows}
+    return Result(
+        experiment,
+        "Robustness over cost.",
+        "Mean rank of the breakdowns over the median, over axes, of the field values per ray at the mild end.",
+        n=f"{len(shared)} axes and {len(grid.rows)} renderers",
+        remarks=[note.format(axes=len(shared)) for note in COST_NOTES],
+        data=to_data(COSTS, lines.values()),
+        table=to_table(COSTS, lines.values()),
+        figure=draw_cost(lines),
+    )
 
 
 @style.styled
 def draw(grid: Atlas) -> Figure:
     """Draws the heat map: red where a renderer breaks at a mild severity, green where it does not break."""
-    figure = Figure(figsize=(style.WIDTH, 0.19 * len(grid.axes) + 1.7), layout="constrained")
-    axes = figure.subplots()
-    shades = np.array([[_shade(grid, axis, row) for row in grid.rows] for axis in grid.axes])
+    figure, ((axes,),) = chart.sheet(0.19 * len(grid.axes) + 1.7)
+    shades = np.array([[grid.cell(axis, row).shade for row in grid.rows] for axis in grid.axes])
     shown = axes.imshow(np.ma.masked_invalid(shades), cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
     axes.set_facecolor("#f2f2f2")
     for line, axis in enumerate(grid.axes):
-        for column, row in enumerate(grid.rows):
-            cell = grid.cells.get((axis, row))
-            if cell is not None:
-                ink = "white" if cell.shade in (0.0, 1.0) else "black"
-                axes.text(column, line, cell.short(), ha="center", va="center", fontsize=5.5, color=ink)
+        for row, cell in grid.on(axis):
+            words, dark = cell.short(), cell.shade < 0.1 or cell.shade > 0.9
+            how = {"color": "white" if dark else "black", "fontsize": 5.5 if len(words) < 8 else 4.5}
+            axes.text(grid.rows.index(row), line, words, ha="center", va="center", **how)
     axes.set_xticks(
         range(len(grid.rows)), [row.name for row in grid.rows], rotation=35, ha="left", rotation_mode="anchor"
     )
@@ -106,7 +126,7 @@ def draw(grid: Atlas) -> Figure:
     axes.set_yticks(range(len(grid.axes)), [f"{title(axis)} ({grid.unit(axis)})" for axis in grid.axes])
     axes.tick_params(length=0, labelsize=6)
     axes.grid(False)
-    groups = [grid.group(axis) for axis in grid.axes]
+    groups = [grid.stress(axis, "group") for axis in grid.axes]
     for line in range(1, len(groups)):
         if groups[line] != groups[line - 1]:
             axes.axhline(line - 0.5, color="#222222", lw=0.8)
@@ -115,33 +135,16 @@ def draw(grid: Atlas) -> Figure:
     return figure
 
 
-def _criteria(experiment: Experiment) -> dict[str, Any]:
-    """The criteria of success, and the resolution of a rendering."""
-    names = ("hits", "false_hits", "cosine", "scale", "surface_error")
-    config = experiment.requested()
-    criteria = {name: float(setting(config, "task", "criteria", name) or math.nan) for name in names}
-    return {**criteria, "resolution": setting(config, "task", "resolution")}
-
-
-def _full(grid: Atlas, axis: str, row: Row) -> str:
-    cell = grid.cells.get((axis, row))
-    return cell.full() if cell is not None else ""
-
-
-def _shade(grid: Atlas, axis: str, row: Row) -> float:
-    cell = grid.cells.get((axis, row))
-    return cell.shade if cell is not None else math.nan
-
-
 def _worst(grid: Atlas, row: Row) -> str:
     """A note on a row's mildest breakdowns, runs that did not end ok first, and on the kinds of its failed trials."""
-    cells = [(axis, cell) for axis, cell in grid.of(row) if not cell.unsupported]
-    worst = sorted(cells, key=lambda item: (item[1].level if item[1].known else -math.inf, item[0]))[:WORST]
+    cells = [(axis, grid.cells[axis, row]) for axis in grid.axes if (axis, row) in grid.cells]
+    tried = [(axis, cell) for axis, cell in cells if not cell.unsupported]
+    worst = sorted(tried, key=lambda item: (item[1].level if item[1].known else -math.inf, item[0]))[:WORST]
     axes = [f"{title(axis)} {cell.full()}{' ' + grid.unit(axis) if cell.known else ''}" for axis, cell in worst]
     kinds: Counter[str] = Counter()
-    for _, cell in grid.of(row):
+    for _, cell in cells:
         kinds.update(cell.failures())
-    failed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    failed = ", ".join(f"{count} {style.PIXEL_NAMES.get(kind, kind)}" for kind, count in kinds.most_common())
     return f"{row.name}: worst on {'; '.join(axes) or 'no axis'}. Failed trials: {failed or 'none'}."
 
 
@@ -153,8 +156,34 @@ def _theory(grid: Atlas) -> list[str]:
             f"{row.name} {format.number(predicted)}{'' if cell.covers(predicted) else ' (outside)'}, "
             f"measured {cell.full()}"
             for row, cell in grid.on(axis)
-            if cell.known and (predicted := measured(cell.record, "predicted")) is not None
+            if cell.known and (predicted := cell.number("predicted")) is not None
         ]
         if rows:
             lines.append(f"Predicted, {title(axis)}: {'; '.join(rows)}.")
     return lines
+
+
+@style.styled
+def draw_cost(lines: dict[Row, dict[str, Any]]) -> Figure:
+    """Draws the mean rank over the field values per ray."""
+    figure, ((axes,),) = chart.sheet(3.2)
+    places = Counter()
+    for row, line in lines.items():
+        place = line["cost"], line["rank"]
+        chart.points(
+            axes, row.preset, *place, label=row.name, ms=7 / (1 + 0.4 * places[place])
+        )  # so that none is hidden
+        places[place] += 1
+    style.log_axis(axes, "x", [line["cost"] for line in lines.values()])
+    axes.set(xlabel="field values per ray at the mild end, median over axes", ylabel="mean rank over axes (1 is best)")
+    axes.set_ylim(max(line["rank"] for line in lines.values()) + 0.5, 0.5)
+    figure.legend(loc="outside right upper")
+    return figure
+
+
+def _cost(grid: Atlas, row: Row, axes: list[str]) -> dict[str, Any]:
+    cells = [grid.cells[axis, row] for axis in axes if (axis, row) in grid.cells]
+    right = [cell for cell in cells if not cell.at_once]  # a renderer that breaks there may be cheap but find nothing
+    cost = median_of_known(cell.number("evaluations_per_ray") for cell in right)
+    ends = {"at_once": sum(cell.at_once for cell in cells), "never": sum(cell.never for cell in cells)}
+    return {"row": row.name, "axes": len(cells), **ends, "cost": math.nan if cost is None else cost}

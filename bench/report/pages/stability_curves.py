@@ -1,6 +1,5 @@
 """The stress test as curves: the share of successful trials over the severity, and theoretical predictions."""
 
-import json
 import math
 
 import numpy as np
@@ -9,11 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
+from bench.report.data import curves
 from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import Record, Row, measured
+from bench.report.data.records import Record, Row, grouped
 from bench.report.data.statistics import wilson
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data
 
@@ -41,15 +41,12 @@ def make(experiment: Experiment) -> Result:
         for share in table.astype(object).to_dict("records")
     ]
     return Result(
-        title="Probability of success over severity.",
-        **captioned(
-            experiment,
-            "Probability of success over the severity, mild to severe from left to right.",
-            n=f"{len(grid.axes)} axes and {len(grid.rows)} renderers",
-            interval="bars at 50 %: 95 % credible intervals of the breakdowns",
-            notes=NOTES,
-            parts=("machine",),
-        ),
+        experiment,
+        "Probability of success over severity.",
+        "Probability of success over the severity, mild to severe from left to right.",
+        n=f"{len(grid.axes)} axes and {len(grid.rows)} renderers",
+        interval="bars at 50 %: 95 % credible intervals of the breakdowns",
+        remarks=NOTES,
         data=to_data(COLUMNS, lines),
         figure=draw(grid, shares),
     )
@@ -59,13 +56,12 @@ def make(experiment: Experiment) -> Result:
 def draw(grid: Atlas, shares: Shares) -> Figure:
     """Draws panels in four columns, with one legend."""
     lines = -(-len(grid.axes) // PANELS)
-    figure = Figure(figsize=(style.WIDTH, 1.35 * lines + 1.0), layout="constrained")
-    panels = np.atleast_2d(figure.subplots(lines, PANELS, squeeze=False)).ravel()
-    for panel, axis in zip(panels, grid.axes, strict=False):
+    figure, panels = chart.sheet(1.35 * lines + 1.0, lines, PANELS)
+    for panel, axis in zip(panels.flat, grid.axes, strict=False):
         _panel(panel, grid, axis, shares)
-    for panel in panels[len(grid.axes) :]:
+    for panel in panels.flat[len(grid.axes) :]:
         panel.set_visible(False)
-    style.legend_below(figure, *panels)
+    style.legend_below(figure, *panels.flat)
     return figure
 
 
@@ -75,8 +71,7 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: Shares) -> None:
         _curve(panel, row, cell, table, 0.7 * (place - (len(drawn) - 1) / 2))
     panel.set_title(title(axis), fontsize=7, pad=2)
     if not drawn:
-        style.bare(panel)
-        panel.text(0.5, 0.5, "no run", ha="center", va="center", transform=panel.transAxes)
+        chart.say(style.bare(panel), "no run")
         return
     sweep = drawn[0][1]
     mild, severe = sweep.ends
@@ -95,38 +90,28 @@ def _panel(panel: Axes, grid: Atlas, axis: str, shares: Shares) -> None:
 
 def _curve(panel: Axes, row: Row, cell: Cell, table: pd.DataFrame, above: float) -> None:
     """Draws a renderer's shares, curve and interval, shifted up by some per cent so that equal curves can be seen."""
-    look = style.look(row.preset)
-    panel.plot(table["severity"], 100 * table["share"] + above, look.marker, color=look.colour, ms=1.5, alpha=0.5)
+    colour = style.look(row.preset).colour
+    chart.points(panel, row.preset, table["severity"], 100 * table["share"] + above, ms=1.5, alpha=0.5)
     levels, along = np.linspace(0, 1, 200), (np.geomspace if cell.log else np.linspace)(*cell.ends, 200)
-    apart = (levels - (cell.level or 0.0)) / (measured(cell.record, "width") or 0.01)
+    apart = (levels - cell.level) / (cell.number("width") or 0.01)
     chance = 1 / (1 + np.exp(np.clip(apart, -50, 50)))
-    panel.plot(along, 100 * chance + above, color=look.colour, lw=1, ls=look.line, label=row.name)
-    if None not in [measured(cell.record, f"level_{end}") for end in ("low", "high")]:
-        ends = [np.interp(measured(cell.record, f"level_{end}"), levels, along) for end in ("low", "high")]
-        panel.plot(ends, [50 + 4 * above] * 2, color=look.colour, lw=2, solid_capstyle="butt")
+    chart.line(panel, row.preset, along, 100 * chance + above, marker="", lw=1, label=row.name)
+    ends = [cell.number(f"level_{end}") for end in ("low", "high")]
+    if None not in ends:
+        panel.plot(np.interp(ends, levels, along), [50 + 4 * above] * 2, color=colour, lw=2, solid_capstyle="butt")
     for name, line in (("predicted", "--"), ("predicted_1", ":")):
-        if (predicted := measured(cell.record, name)) is not None:
-            panel.axvline(predicted, color=look.colour, ls=line, lw=0.6)
+        if (predicted := cell.number(name)) is not None:
+            panel.axvline(predicted, color=colour, ls=line, lw=0.6)
 
 
 def _shares(experiment: Experiment, record: Record) -> pd.DataFrame:
     """Successes, trials, their share and its interval for each level that was tried, mild to severe."""
-    counts: dict[float, list[float]] = {}
-    try:
-        text = (experiment.folder(record) / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        text = ""
-    for line in text.splitlines():
-        try:
-            trial = json.loads(line)
-            entry = counts.setdefault(float(trial["level"]), [float(trial["severity"]), 0, 0])
-        except (ValueError, KeyError, TypeError):
-            continue
-        entry[1] += bool(trial.get("success"))
-        entry[2] += 1
+    lines = curves.lines(experiment.folder(record)) or []
+    trials = [t for t in lines if all(isinstance(t.get(name), int | float) for name in ("level", "severity"))]
     rows = []
-    for level, (severity, successes, n) in sorted(counts.items()):
+    for level, tried in sorted(grouped(trials, lambda trial: float(trial["level"])).items()):
+        severity, successes = float(tried[0]["severity"]), sum(bool(trial.get("success")) for trial in tried)
         if math.isfinite(severity):
-            rate = wilson(successes, n)
-            rows.append([level, severity, successes, n, rate.value, rate.low, rate.high])
+            rate = wilson(successes, len(tried))
+            rows.append([level, severity, successes, len(tried), rate.value, rate.low, rate.high])
     return pd.DataFrame(rows, columns=SHARES)

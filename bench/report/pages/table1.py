@@ -7,7 +7,6 @@ from typing import Any
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, definitions, measured, repeated, row_of, setting
-from bench.report.write.caption import captioned
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, configured, shown, to_data, to_table, whole
 
@@ -33,7 +32,7 @@ DEFINED = {
     "hits": "Hits",
     "lost": "Missed",
     "false": "Spurious",
-    "wrong": "Wrong",
+    "wrong": "Wrong depth",
     "depth_error_median": "Depth error",
     "depth_error_max": "Depth error",
 }
@@ -51,18 +50,15 @@ Show = Callable[[float | None], str]
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per strategy: the paper's in its order, then others in the order of their runs."""
-    order = list(PUBLISHED)
-    place = {preset: number for number, preset in enumerate(order)}
-    lines = sorted(experiment.named(), key=lambda record: place.get(row_of(record).preset, len(order)))
+    place = {preset: number for number, preset in enumerate(PUBLISHED)}
+    lines = sorted(experiment.named(), key=lambda record: place.get(row_of(record).preset, len(place)))
     times = repeated(lines)
     return Result(
-        title="The cost of each strategy of sphere tracing.",
-        **captioned(
-            experiment,
-            "Computed field values (queries), times, peak memory and errors of one rendering and its gradient"
-            + (f", times as medians of {times} repeats." if times else "."),
-            notes=(*NOTES, *definitions(lines, DEFINED)),
-        ),
+        experiment,
+        "The cost of each strategy of sphere tracing.",
+        "Computed field values (queries), times, peak memory and errors of one rendering and its gradient"
+        + (f", times as medians of {times} repeats." if times else "."),
+        remarks=(*NOTES, *definitions(lines, DEFINED)),
         data=to_data(COLUMNS, lines),
         table=to_table(COLUMNS, lines),
     )
@@ -116,9 +112,6 @@ def _together(show: Show, *names: str) -> Callable[[Record], str]:
     return shown_together
 
 
-_DEPTH = _together(format.number, "depth_error_median", "depth_error_max")
-
-
 def _step(record: Record) -> str:
     """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
     middle, low, high = (measured(record, f"step_seconds{end}") for end in ("", "_low", "_high"))
@@ -145,9 +138,12 @@ COLUMNS = (
     *(_cost(name) for name in ("repeats", "forward_gemm", "step_gemm", "rays")),
     _cost("peak_memory_bytes", "Peak memory", format.size),
     _cost("hits", "Hits", whole),
-    replace(_cost("lost", "Missed / spurious / wrong"), words=_together(whole, "lost", "false", "wrong")),
+    replace(_cost("lost", "Missed / spurious / wrong depth"), words=_together(whole, "lost", "false", "wrong")),
     *(_cost("false"), _cost("wrong"), _cost("depth_error_p99"), _cost("depth_error_max")),
-    replace(_cost("depth_error_median", "Depth error median / max"), words=_DEPTH),
+    replace(
+        _cost("depth_error_median", "Depth error median / max"),
+        words=_together(format.number, "depth_error_median", "depth_error_max"),
+    ),
     *(Column("published_size", value=_published(0)), Column("published_steps", value=_published(1))),
     Column("published_queries", "Published queries", _published(2), lambda queries: queries or ""),
     Column("published_time", "Published time", _published(3), lambda time: time or ""),

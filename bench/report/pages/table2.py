@@ -1,22 +1,32 @@
-"""Table 2 of DIST: shape completion over the sparsity of the depth image, measured and published."""
+"""Table 2 of DIST: shape completion over the sparsity of the depth image, measured and published; with intervals.
 
+The second page has interquartile means, failures, paired ratios, ranks and tests.
+"""
+
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.report.data.completions import ERROR, POINTS, TABLE2, Completions, heading, shapes_per_cell
+from bench.records.record import NOT_RUN
+from bench.report.data import statistics
+from bench.report.data.completions import ERROR, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import LABEL, NOTE, oracles
-from bench.report.data.records import iterations_of, row_of
-from bench.report.write.caption import captioned
+from bench.report.data.records import Row, RunKey, by_shape, grouped, iterations_of, row_of
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
 
 PLACE = 20
+PLACE_INTERVALS = 30
 READS = (TABLE2,)
+REFERENCE = "dist_mask"  # the preset with which the other rows are compared
+SEED = 0  # of the bootstrap
 # DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of POINTS.
 PUBLISHED = {
     "sofa": {
@@ -42,6 +52,15 @@ NOTES = (
     "“Published” is DIST, Table 2: 200 shapes of ShapeNet, with another prior and camera, and another number of points "
     "per share, so it cannot be compared directly with the measured rows.",
 )
+INTERVAL_NOTES = (
+    "Shapes with a failure: the share of shapes with a run, at any number of points, that did not end ok, with "
+    "Wilson's interval.",
+    "The ratio is the interquartile mean of the row over that of {reference}, for each shape's geometric mean over all "
+    "numbers of points, paired by shape; it is infinite where a failure is in the middle half.",
+    "The rank is the mean over shapes and points; a failed or missing run ranks last.",
+    "Below: p-values of Wilcoxon's signed-rank test on these geometric means over the shapes of all families, adjusted "
+    "for the number of tests (Holm).",
+)
 RUNS = (
     FAMILY,
     configured("points", "task", "points"),
@@ -62,12 +81,10 @@ def make(experiment: Experiment) -> Result:
         text("failed", "Failed"),
     ]
     return Result(
-        title="Shape completion from one depth image, over its sparsity.",
-        **captioned(
-            experiment,
-            "Median error of shapes and seeds over the number of given depth points.",
-            notes=(ERROR, shapes_per_cell(runs), _given(runs), _iterations(experiment), *NOTES),
-        ),
+        experiment,
+        "Shape completion from one depth image, over its sparsity.",
+        "Median error of shapes and seeds over the number of given depth points.",
+        remarks=(ERROR, shapes_per_cell(runs), _given(runs), _iterations(experiment), *NOTES),
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, [line for name in runs.families for line in _lines(runs, name, oracle.get(name))]),
         figure=draw(runs, oracle),
@@ -90,14 +107,12 @@ def draw(runs: Completions, oracle: dict[str, float]) -> Figure:
     """Draws a panel per family: medians over the number of given points, and the oracle."""
     columns = min(len(runs.families), 4)
     lines = -(-len(runs.families) // columns)
-    figure = Figure(figsize=(style.WIDTH, 2.4 * lines + 0.7), layout="constrained")
-    axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
+    figure, axes = chart.sheet(2.4 * lines + 0.7, lines, columns, sharey=True)
     everything = []
     for axis, name in zip(axes.flat, runs.families, strict=False):
         everything += _panel(axis, runs, name)
         if name in oracle:
-            axis.axhline(oracle[name], color="#777777", lw=0.9, label=LABEL)
-            axis.axhline(1.5 * oracle[name], color="#777777", lw=0.9, ls=":", label="1.5 times that")
+            chart.reference(axis.axhline, oracle[name], 1.5, LABEL)
     for axis in axes.flat[len(runs.families) :]:
         axis.axis("off")
     for axis in axes[:, 0]:
@@ -115,9 +130,7 @@ def _panel(axis: Axes, runs: Completions, name: str) -> list[float]:
     for row in runs.rows_of(name):
         medians = style.finite(runs.median(name, row, points) for points in runs.points)
         everything += medians
-        look = style.look(row.preset)
-        how = {"linestyle": look.line, "color": look.colour, "marker": look.marker, "label": row.name}
-        axis.plot([places[i] for i in order], [medians[i] for i in order], **how)
+        chart.line(axis, row.preset, [places[i] for i in order], [medians[i] for i in order], label=row.name)
     axis.set(title=name, xlabel="depth points given")
     style.log_axis(axis, "x", [] if None in given else places)
     return everything
@@ -135,12 +148,91 @@ def _given(runs: Completions) -> str:
 
 def _iterations(experiment: Experiment) -> str:
     """A note on the rows' iterations: the most frequent number, then the rows with another one."""
-    found: dict[Any, list[str]] = {}
-    for record in experiment.records:
-        names = found.setdefault(iterations_of(record), [])
-        if row_of(record).name not in names:
-            names.append(row_of(record).name)
-    known = {count: names for count, names in found.items() if count is not None}
+    found = grouped(experiment.records, iterations_of)
+    names = {count: list(dict.fromkeys(row_of(record).name for record in records)) for count, records in found.items()}
+    known = {count: rows for count, rows in names.items() if count is not None}
     most = max(known, key=lambda count: len(known[count]), default=None)
-    others = [f"{', '.join(names)} {count}" for count, names in known.items() if count != most]
+    others = [f"{', '.join(rows)} {count}" for count, rows in known.items() if count != most]
     return f"Iterations: {most}{'; '.join(['', *others])}." if known else ""
+
+
+def make_intervals(experiment: Experiment) -> Result:
+    """Makes the page of Table 2 with interquartile means, intervals, ratios to the reference row, and failure rates."""
+    runs = Completions(experiment)
+    means = {cell: _mean(errors) for cell, errors in runs.errors.items()}
+    reference = next((row for row in runs.rows if row.preset == REFERENCE), Row(REFERENCE, REFERENCE))
+    columns = [
+        *(text("family", "Family"), text("row", "Method")),
+        *(text(points, heading(points)) for points in runs.points),
+        text("failed", "Shapes with a failure"),
+        text("ratio", "Ratio to the reference"),
+        Column("rank", "Mean rank"),
+    ]
+    notes = [note.format(reference=f"“{reference.name}”") for note in INTERVAL_NOTES]
+    return Result(
+        experiment,
+        "Shape completion from one depth image, with intervals.",
+        "Interquartile mean of the error at each number of depth points.",
+        interval="95 % bootstrap intervals over shapes and seeds (expanded percentiles, 2,000 draws)",
+        remarks=(ERROR, shapes_per_cell(runs), *notes, *_tests(runs, reference)),
+        data=pd.DataFrame([_statistics(runs, cell, mean) for cell, mean in means.items()], dtype=object),
+        table=to_table(columns, [line for name in runs.families for line in _intervals(runs, name, means, reference)]),
+    )
+
+
+def _mean(errors: dict[RunKey, float]) -> statistics.Interval:
+    return statistics.bootstrap(by_shape(errors), statistics.interquartile_mean, seed=SEED)
+
+
+def _intervals(
+    runs: Completions, name: str, means: dict[Cell, statistics.Interval], reference: Row
+) -> Iterator[dict[str, Any]]:
+    """The lines of a family, one per row. Ranks are over shapes and points.
+
+    A missing run counts in the rank as a failure, so that it gives no advantage.
+    """
+    errors = {
+        row: {(p, run): e for p in runs.points for run, e in runs.errors.get((name, row, p), {}).items()}
+        for row in runs.rows_of(name)
+    }
+    ranks = statistics.rank(errors)
+    for row in errors:
+        share = statistics.wilson(*runs.failed_shapes(name, row))
+        first, second = runs.pair(name, row, reference)
+        compared = row != reference and first
+        yield {
+            **{"family": name, "row": row.name, "rank": ranks[row]},
+            **{points: means.get((name, row, points)) for points in runs.points},
+            "failed": f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]",
+            "ratio": statistics.paired_bootstrap(first, second, statistics.interquartile_mean, seed=SEED)
+            if compared
+            else "",
+        }
+
+
+def _statistics(runs: Completions, cell: Cell, mean: statistics.Interval) -> dict[str, Any]:
+    """All statistics of a cell: a line of the CSV."""
+    errors, statuses = runs.errors[cell], runs.statuses[cell]
+    failed = statuses.total() - statuses["ok"]
+    share = statistics.wilson(failed, statuses.total())
+    return {
+        **{"family": cell[0], "row": cell[1].name, "points": cell[2]},
+        **{"shapes": len(by_shape(errors)), "runs": len(errors)},
+        **{"median": runs.median(*cell), "mean": float(np.mean([*errors.values()]))},
+        **{"iqm": mean.value, "iqm_low": mean.low, "iqm_high": mean.high},
+        **{"failed": failed, "failed_low": share.low, "failed_high": share.high, "not_run": statuses[NOT_RUN]},
+    }
+
+
+def _tests(runs: Completions, reference: Row) -> list[str]:
+    """A note for each row: whether it is better than the reference over the shapes of all families, Holm's p-value."""
+    found: dict[str, float] = {}
+    for row in runs.rows:
+        pairs = [runs.pair(name, row, reference) for name in runs.families]
+        first, second = ([group for pair in pairs for group in pair[side]] for side in (0, 1))
+        if row != reference and first:
+            wins = sum(statistics.median(a) < statistics.median(b) for a, b in zip(first, second, strict=True))
+            better = f"{'better' if 2 * wins > len(first) else 'no better'} ({wins} of {len(first)} shapes)"
+            found[f"{row.name} is {better} than {reference.name}"] = statistics.compare(first, second)
+    adjusted = statistics.holm([*found.values()]) if found else []
+    return [f"{test}: p = {p:.2g}" for test, p in zip(found, adjusted, strict=True)]

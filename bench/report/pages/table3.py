@@ -14,16 +14,17 @@ from bench.report.data.records import (
     ONE_WAY,
     SCALE,
     Record,
-    by_run,
     by_shape,
     error,
+    grouped,
     loop_seconds,
     median_of_known,
     row_of,
+    run_key,
     value_evaluations,
 )
 from bench.report.data.statistics import bootstrap, interquartile_mean, median, wilson
-from bench.report.write.caption import captioned
+from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, to_data, to_table
 
@@ -66,28 +67,24 @@ COLUMNS = (
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per family and method."""
     oracle = oracles(experiment, ONE_WAY)
-    lines = [line for name in experiment.families() for line in _lines(experiment, name, oracle.get(name))]
+    families = experiment.families().items()
+    lines = [line for name, records in families for line in _lines(name, records, oracle.get(name))]
     return Result(
-        title="Shape from many views, without a mask.",
-        **captioned(
-            experiment,
-            "Median initial and final error over shapes and seeds, and its cost.",
-            interval="95 % bootstrap intervals of interquartile means over shapes and seeds, Wilson's of failures",
-            notes=NOTES,
-        ),
+        experiment,
+        "Shape from many views, without a mask.",
+        "Median initial and final error over shapes and seeds, and its cost.",
+        interval="95 % bootstrap intervals of interquartile means over shapes and seeds, Wilson's of failures",
+        remarks=NOTES,
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
         figure=draw(experiment, oracle),
     )
 
 
-def _lines(experiment: Experiment, name: str, oracle: float | None) -> list[dict[str, Any]]:
+def _lines(name: str, records: list[Record], oracle: float | None) -> list[dict[str, Any]]:
     """The lines of a family: the rows, the oracle, and the published ones."""
-    records = experiment.families()[name]
-    lines = [
-        {"method": row.name, **_line([record for record in records if row_of(record) == row], oracle)}
-        for row in dict.fromkeys(map(row_of, records))
-    ]
+    rows = grouped(records, row_of)
+    lines = [{"method": row.name, **_line(of_row, oracle)} for row, of_row in rows.items()]
     lines += [] if oracle is None else [{"method": LABEL, "end": oracle}]
     lines += [{"method": f"published: {row}", "end": number} for row, number in PUBLISHED.get(name, {}).items()]
     return [{"family": name, **line} for line in lines]
@@ -95,7 +92,7 @@ def _lines(experiment: Experiment, name: str, oracle: float | None) -> list[dict
 
 def _line(records: list[Record], oracle: float | None) -> dict[str, Any]:
     starts, ends = [_start(record) for record in records], [_end(record) for record in records]
-    middle = bootstrap(by_shape(by_run(records, _end)), interquartile_mean, seed=0)
+    middle = bootstrap(by_shape({run_key(record): _end(record) for record in records}), interquartile_mean, seed=0)
     finished = [record for record in records if record["status"] == "ok"]
     failed = len(records) - len(finished)
     rate = wilson(failed, len(records))
@@ -104,7 +101,7 @@ def _line(records: list[Record], oracle: float | None) -> dict[str, Any]:
     return {
         "start": format.number(float(median(starts))),
         "end": last,
-        "middle": f"{format.number(middle.value)} {format.interval(middle.low, middle.high)}",
+        "middle": str(middle),
         "of_start": format.number(left),
         "of_oracle": format.number(last / oracle if oracle else None),
         "failed": f"{failed} of {len(records)} {format.interval(100 * rate.low, 100 * rate.high)} %",
@@ -130,15 +127,14 @@ def _share(end: float, start: float) -> float:
 def draw(experiment: Experiment, oracle: dict[str, float]) -> Figure:
     """Draws a panel per family with a line per method: each run's initial (grey) and final error."""
     families, rows = experiment.families(), list(experiment.rows())
-    figure = Figure(figsize=(style.WIDTH, 0.28 * len(rows) + 1.1), layout="constrained")
-    axes = figure.subplots(1, len(families), squeeze=False, sharey=True)[0]
+    figure, (axes,) = chart.sheet(0.28 * len(rows) + 1.1, 1, len(families), sharey=True)
     for axis, (name, records) in zip(axes, families.items(), strict=True):
+        of_row = grouped(records, row_of)
         for place, row in enumerate(rows):
-            _row(axis, place, [record for record in records if row_of(record) == row])
+            _row(axis, place, row.preset, of_row.get(row, []))
         axis.plot([], [], "D", color="#444444", ms=3.5, label="end")
         if name in oracle:
-            axis.axvline(oracle[name], color="#777777", lw=0.9, label="oracle")
-            axis.axvline(3 * oracle[name], color="#777777", lw=0.9, ls=":", label="3 times that")
+            chart.reference(axis.axvline, oracle[name], 3, "oracle")
         style.log_axis(axis, "x", [value for record in records for value in (_start(record), _end(record))])
         axis.set(title=name, xlabel="Chamfer, truth to prediction × 1000 (scene units²)")
     axes[0].set_yticks(range(len(rows)), [row.name for row in rows])
@@ -147,13 +143,11 @@ def draw(experiment: Experiment, oracle: dict[str, float]) -> Figure:
     return figure
 
 
-def _row(axis: Axes, place: int, records: list[Record]) -> None:
+def _row(axis: Axes, place: int, preset: str, records: list[Record]) -> None:
     """Draws the runs of a row, one above the other."""
     starts, ends = (style.finite(map(value, records)) for value in (_start, _end))
     spread = place + np.linspace(-0.25, 0.25, len(records)) if len(records) > 1 else np.full(len(records), place)
     axis.plot(starts, spread, ".", color="#b0b0b0", ms=3, label="start" if place == 0 else None)
-    if records:
-        look = style.look(row_of(records[0]).preset)
-        axis.plot(ends, spread, look.marker, color=look.colour, ms=3.5)
-        lost = [where for where, end in zip(spread, ends, strict=True) if np.isnan(end)]
-        axis.plot([0.99] * len(lost), lost, "x", color=look.colour, transform=axis.get_yaxis_transform())
+    chart.points(axis, preset, ends, spread, ms=3.5)
+    lost = [where for where, end in zip(spread, ends, strict=True) if np.isnan(end)]
+    chart.points(axis, preset, [0.99] * len(lost), lost, marker="x", transform=axis.get_yaxis_transform())

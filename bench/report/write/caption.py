@@ -2,7 +2,6 @@
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterable
 from typing import Any
 
 from bench.report.data.experiments import Experiment
@@ -10,73 +9,53 @@ from bench.report.data.records import Record, setting, shape
 
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 MOST_FAILURES = 4  # most failed runs that a caption lists one by one
-WITHOUT_NETWORK = ("scenes", "pixels", "machine")  # parts of the setup for pages without a prior
 
 
-def captioned(
-    experiment: Experiment,
-    plotted: str,
-    *,
-    n: str = "",
-    interval: str = "",
-    notes: Iterable[str] = (),
-    parts: tuple[str, ...] = ("scenes", "pixels", "network", "machine"),
-) -> dict[str, Any]:
-    """The caption of a page, in four sentences, and its notes, as fields of a `Result`.
+def caption(experiment: Experiment, plotted: str, *, n: str = "", interval: str = "") -> str:
+    """The caption of a page, in four sentences.
 
     Args:
         experiment: the experiment that the page shows.
         plotted: what is plotted, as a sentence.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
-        notes: further notes; empty ones are left out.
-        parts: parts of the setup to name, where they are known.
     """
     sample = (n or _sample(experiment)) + (f"; {interval}" if interval else "") + "."
-    setup = "; ".join(found for name in parts if (found := _SETUP[name](experiment)))
-    warnings = (_compared(experiment), _loaded(experiment), _omitted(experiment))
+    setup = _setup(experiment)
     sentences = [plotted, f"n = {sample}", _outcome(experiment), f"{setup}." if setup else ""]
-    return {
-        "caption": " ".join(filter(None, sentences)),
-        "notes": [note for note in (*warnings, *notes) if note],
-    }
+    return " ".join(filter(None, sentences))
+
+
+def warnings(experiment: Experiment) -> list[str]:
+    """Notes on times that cannot be compared or are doubtful, and on runs that are not shown."""
+    return [note for note in (_compared(experiment), _loaded(experiment), _omitted(experiment)) if note]
 
 
 def _sample(experiment: Experiment) -> str:
     """The numbers of runs, shapes and seeds."""
-    counts = {
-        "run": len(experiment.records),
-        "shape": len({shape(record) for record in experiment.records}),
-        "seed": len({record["seed"] for record in experiment.records}),
-    }
-    runs, shapes, seeds = (f"{count} {_plural(word, count)}" for word, count in counts.items())
-    return f"{runs} ({shapes}, {seeds})"
+    shapes = {shape(record) for record in experiment.records}
+    seeds = {record["seed"] for record in experiment.records}
+    runs = _plural("run", len(experiment.records))
+    return f"{runs} ({_plural('shape', len(shapes))}, {_plural('seed', len(seeds))})"
 
 
-def _scenes(experiment: Experiment) -> str:
+def _setup(experiment: Experiment) -> str:
+    """The parts of the setup that are known: the scenes, the resolution and prior that all runs have, the machine."""
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in experiment.records))
     known = [scene for scene in scenes if scene] or [experiment.records[0]["dataset"]]
-    return f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}"
-
-
-def _pixels(experiment: Experiment) -> str:
-    """The requested resolution, where all runs have the same."""
     sizes = {setting(record["config"], "view", "resolution") for record in experiment.records}
     resolution = sizes.pop() if len(sizes) == 1 else None
-    return f"{resolution}×{resolution} pixels" if resolution else ""
-
-
-def _network(experiment: Experiment) -> str:
-    """The layers and width of the prior's decoder."""
     config = experiment.requested()
     network = setting(config, "prior", "network") or setting(config, "scale", "network")
     layers, width = setting(network, "layers"), setting(network, "width")
-    return f"decoder of {layers} layers of {width}" if layers and width else ""
-
-
-def _machines(experiment: Experiment) -> str:
     machines = [_machine(*machine) for machine in experiment.machines()]
-    return f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines)
+    parts = {
+        "scenes": f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",
+        "pixels": f"{resolution}×{resolution} pixels" if resolution else "",
+        "network": f"decoder of {layers} layers of {width}" if layers and width else "",
+        "machine": f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines),
+    }
+    return "; ".join(parts[name] for name in experiment.selection.setup if parts[name])
 
 
 def _outcome(experiment: Experiment) -> str:
@@ -98,7 +77,7 @@ def _omitted(experiment: Experiment) -> str:
     """The number of records of this experiment that are not shown, and the reason; empty where all are shown."""
     count = experiment.left_out
     reason = "of this experiment with another scene, setting or machine"
-    return f"Not shown: {count} {_plural('run', count)} {reason}." if count else ""
+    return f"Not shown: {_plural('run', count)} {reason}." if count else ""
 
 
 def _compared(experiment: Experiment) -> str:
@@ -120,7 +99,7 @@ def _loaded(experiment: Experiment) -> str:
 
 def _machine(cpu: Any, device: Any, threads: Any) -> str:
     parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
-    return "; ".join([" + ".join(parts), *([f"{threads} {_plural('thread', threads)}"] if threads else [])])
+    return "; ".join([" + ".join(parts), *([_plural("thread", threads)] if threads else [])])
 
 
 def _failure(record: Record) -> str:
@@ -133,7 +112,4 @@ def _listed(names: list[str], most: int = 4) -> str:
 
 
 def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
-
-
-_SETUP = {"scenes": _scenes, "pixels": _pixels, "network": _network, "machine": _machines}
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"

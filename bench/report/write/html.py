@@ -1,16 +1,14 @@
 """Writes `index.html`: the tables and figures of the experiments, then a row and details for every run."""
 
-import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bench.records import format
 from bench.records.read import read_records
-from bench.report.write.paper import find_paper
+from bench.report.write.paper import find_paper, link
 
 # Colours of statuses; a status that is not listed is shown as bad.
 TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute", "not_run": "mute"}
@@ -70,9 +68,9 @@ def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
         "evaluations": {name: _number(record["evaluations"], name) for name in ("value", "gradient", "per_ray")},
         "machine": machine,
         "threads": threads,
-        "files": {name: _link(folder / name) for name in FILES if (folder / name).is_file()},
-        "thumb": next((_link(path) for path in pictures if path.name in THUMBS), None),
-        "pictures": {picture.name: _link(picture) for picture in pictures},
+        "files": {name: link("runs", folder.name, name) for name in FILES if (folder / name).is_file()},
+        "thumb": next((link("runs", folder.name, path.name) for path in pictures if path.name in THUMBS), None),
+        "pictures": {picture.name: link("runs", folder.name, picture.name) for picture in pictures},
     }
 
 
@@ -109,8 +107,3 @@ def _number(values: dict[str, Any], name: str) -> int | float | None:
     """The number of that name; None, shown as missing, where there is none."""
     value = values.get(name)
     return value if isinstance(value, int | float) else None
-
-
-def _link(path: Path) -> str:
-    """The address of a file of a run folder as seen from the page, percent-encoded byte for byte."""
-    return "/".join(quote(os.fsencode(part), safe="") for part in ("runs", path.parent.name, path.name))

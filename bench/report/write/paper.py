@@ -1,4 +1,4 @@
-"""Writes the tables and figures of all experiments from run folders, and reads them back for index.html."""
+"""Writes the tables and figures of all experiments and their README, and reads them back for index.html."""
 
 import html
 import os
@@ -9,22 +9,40 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from bench.records.files import write_text
+
 FOLDER = "paper"
 SUFFIXES = (".html", ".pdf", ".csv", ".md", ".tex")
-PAGES = Path(__file__).parents[1] / "pages"  # a module per table or figure; its name is that of the written files
+PAGES = Path(__file__).parents[1] / "pages"
+PLACE = re.compile(r"^PLACE(_[A-Z_]+)? = (\d+)$", re.MULTILINE)
+
+HEAD = """# Results
+
+Written by `python -m bench.report` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in
+scene units), Markdown and LaTeX, each figure as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs that
+a page reads; the README of `conf` lists the experiments and how long they take.
+
+"""
 
 
 @cache
-def page_names() -> tuple[str, ...]:
-    """The names of all pages, in the order of the numbers that their files assign to `PLACE`.
+def page_names() -> dict[str, tuple[str, str]]:
+    """The names of all pages in their order, each with the module and the function that make it.
 
-    The files are read as text, not imported: they load matplotlib, which is not needed to find their output.
+    A file of `PAGES` makes the page of its name with `make`; its place among all pages is the number `PLACE`. Further
+    pages of the file have a suffix: `PLACE_COST` and `make_cost` are those of FILE_cost. The files are read as text,
+    not imported: they load matplotlib, which is not needed to find their output.
 
     Raises:
         ValueError: where a file has no such number.
     """
-    places = {path.stem: _place(path) for path in PAGES.glob("*.py") if path.stem != "__init__"}
-    return tuple(sorted(places, key=lambda name: (places[name], name)))
+    places: list[tuple[int, str, str, str]] = []
+    for path in PAGES.glob("[!_]*.py"):
+        found = [(suffix.lower(), int(place)) for suffix, place in PLACE.findall(path.read_text(encoding="utf-8"))]
+        if not found:
+            raise ValueError(f"{path.name} must have a line such as PLACE = 10, its place among the pages; found none")
+        places += [(place, path.stem + suffix, path.stem, f"make{suffix}") for suffix, place in found]
+    return {name: (module, function) for _, name, module, function in sorted(places)}
 
 
 def write_paper(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
@@ -33,11 +51,11 @@ def write_paper(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
     from bench.report.write.result import write
 
     written = []
-    for name in page_names():
-        page = import_module(f"bench.report.pages.{name}")
+    for name, (module, function) in page_names().items():
+        page = import_module(f"bench.report.pages.{module}")
         found = [choose(records, selection, results_dir) for selection in page.READS]
         if any(experiment is not None for experiment in found):
-            written.append(write(page.make(*found), results_dir / FOLDER / name)[0])
+            written.append(write(getattr(page, function)(*found), results_dir / FOLDER / name)[0])
     return written
 
 
@@ -48,20 +66,28 @@ def find_paper(results_dir: Path) -> list[dict[str, Any]]:
     """
     folder = results_dir / FOLDER
     seen = {path.stem for path in folder.glob("*") if path.suffix in (*SUFFIXES, ".png") and path.is_file()}
-    names = [*(name for name in page_names() if name in seen), *sorted(seen - set(page_names()))]
+    names = [*(name for name in page_names() if name in seen), *sorted(seen - {*page_names()})]
     return [_found(folder, name) for name in names if not name.startswith(".")]
 
 
-def _place(page: Path) -> int:
-    found = re.search(r"^PLACE = (\d+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    if found is None:
-        raise ValueError(f"{page.name} must have a line such as PLACE = 10, its place among the pages; found none")
-    return int(found[1])
+def write_readme(results_dir: Path) -> Path | None:
+    """Writes `results_dir/README.md` with all tables and figures, so that no number is copied by hand.
+
+    Gives its path; None where `results_dir/paper` has no table or figure.
+    """
+    found = [page for page in find_paper(results_dir) if page["title"]]
+    if not found:
+        return None
+    contents = [f"- [{page['title'].rstrip('.')}](#{page['name']})" for page in found]
+    parts = [_section(results_dir / FOLDER / f"{page['name']}.md", page["name"]) for page in found]
+    path = results_dir / "README.md"
+    write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
+    return path
 
 
 def _found(folder: Path, name: str) -> dict[str, Any]:
     files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
-    links = {suffix: _link(path) for suffix, path in files.items() if path.is_file()}
+    links = {suffix: link(FOLDER, path.name) for suffix, path in files.items() if path.is_file()}
     text = files[".md"].read_text(encoding="utf-8", errors="replace") if ".md" in links else ""
     picture = links.get(".png")
     links.pop(".png", None)
@@ -88,5 +114,14 @@ def _cells(line: str) -> list[str]:
     return [html.unescape(cell.strip()) for cell in line.strip().strip("|").split("|")]
 
 
-def _link(path: Path) -> str:
-    return "/".join(quote(os.fsencode(part), safe="") for part in (FOLDER, path.name))
+def link(*parts: str) -> str:
+    """The address of a file as seen from the results folder, percent-encoded byte for byte."""
+    return "/".join(quote(os.fsencode(part), safe="") for part in parts)
+
+
+def _section(path: Path, name: str) -> str:
+    """A page's Markdown under a heading, with folded notes and links relative to the folder above."""
+    text = path.read_text(encoding="utf-8", errors="replace").replace(f"]({name}.png)", f"]({FOLDER}/{name}.png)")
+    text = re.sub(r"((?:^- .*\n)+)", r"<details><summary>Notes</summary>\n\n\1\n</details>\n", text, flags=re.MULTILINE)
+    title, rest = re.fullmatch(r"\*\*(.*?)\*\*\s*(.*)", text, re.DOTALL).groups()
+    return f'## <a id="{name}"></a>{title}\n\n{rest}'

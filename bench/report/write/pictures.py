@@ -15,8 +15,10 @@ from matplotlib.patches import Patch
 
 from bench.pictures import style
 from bench.report.data.records import Record
+from bench.report.write import chart
 
 LARGEST_SHARP = 256  # most pixels per side at which a picture is drawn without averaging
+CLOSE = {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}  # layout of a figure of pictures
 NAMES = ("normals", "reference_normals", "hit", "reference_hit")
 COUNTED = ("size", "hits", "lost", "false", "angle_median", "angle_p99", "angle_max")
 
@@ -120,74 +122,55 @@ def coloured(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
 
 
 def draw(figure: Figure | SubFigure, shown: list[Cell], columns: int) -> None:
-    """Draws normals above and differences below, with a colour bar of the angle and a legend of wrong pixels."""
+    """Draws normals above and differences below, with a colour bar of the angle and a legend of wrong pixels.
+
+    All pictures show the square part that contains all hits, with a margin. The scale of angles ends at the 99th
+    percentile over all pixels, rounded up.
+    """
     blocks = -(-len(shown) // columns)
     axes = figure.subplots(2 * blocks, columns, squeeze=False)
-    window, top = _window(shown), _top(shown)
+    known = [cell.images for cell in shown if cell.images is not None]
+    top, left, side = style.window([images.hit | images.reference_hit for images in known]) if known else (0, 0, 1)
+    angles = [cell.images.angles() for cell in shown if cell.images is not None and not cell.reference]
+    together = np.concatenate([a[np.isfinite(a)] for a in angles]) if angles else np.empty(0)
+    largest = style.rounded_up(float(np.percentile(together, 99))) if together.size else 90.0
     for axis in axes.flat:
         axis.axis("off")
     image = None
     for place, cell in enumerate(shown):
         row, column = 2 * (place // columns), place % columns
-        above, below = axes[row, column], axes[row + 1, column]
+        above, below = axes[row : row + 2, column]
         above.set_title(cell.title, fontsize=7)
-        image = _pair(above, below, cell, window, top) or image
+        image = _pair(above, below, cell, largest) or image
+        for axis in (above, below) if cell.images is not None else ():
+            axis.set(xlim=(left, left + side), ylim=(top + side, top))
     if image is not None:
         label = "angle between\nnormals (degrees)"
         figure.colorbar(image, ax=axes, label=label, shrink=0.9 / blocks, aspect=25, extend="max", pad=0.01)
 
 
-def _pair(above: Any, below: Any, cell: Cell, window: dict[str, Any], top: float) -> AxesImage | None:
+def _pair(above: Any, below: Any, cell: Cell, largest: float) -> AxesImage | None:
+    """Draws the normals, and below them the angles, which it gives; below the reference's a legend."""
     images = cell.images
+    style.bare(above).axis("on")
     if cell.reference:
         how = {"handlelength": 0.9, "handletextpad": 0.4, "borderpad": 0, "borderaxespad": 0, "fontsize": 6.5}
-        below.legend(handles=_legend(), loc="upper left", **how).set_in_layout(False)
+        missed = Patch(color=style.MISSED, label="missed: only the\nreference hits")
+        spurious = Patch(color=style.SPURIOUS, label="spurious: only\nthe row hits")
+        below.legend(handles=[missed, spurious], loc="upper left", **how).set_in_layout(False)
     if images is None:
-        style.bare(above).axis("on")
-        above.text(0.5, 0.5, "no picture", ha="center", va="center", color="#777777", transform=above.transAxes)
+        chart.say(above, "no picture", color="#777777")
         above.set_box_aspect(1)
         return None
-    normals, hit = images.normals, images.hit
+    # A large picture is averaged, so that single pixels stay visible.
+    sharp = "nearest" if images.hit.shape[0] <= LARGEST_SHARP else "auto"
+    where = {"extent": (0, 1, 1, 0), "interpolation": sharp}
     if cell.reference:
-        normals, hit = images.reference_normals, images.reference_hit
-    style.bare(above).axis("on")
-    above.imshow(coloured(normals, hit), **_placed(images))
-    above.set(**window)
-    return None if cell.reference else _difference(below, images, window, top)
-
-
-def _difference(axis: Any, images: Images, window: dict[str, Any], top: float) -> AxesImage:
-    style.bare(axis).axis("on")
-    where = _placed(images)
-    shown = axis.imshow(images.angles(), cmap=style.error_colours(), vmin=0, vmax=top, **where)
+        above.imshow(coloured(images.reference_normals, images.reference_hit), **where)
+        return None
+    above.imshow(coloured(images.normals, images.hit), **where)
+    style.bare(below).axis("on")
+    shown = below.imshow(images.angles(), cmap=style.error_colours(), vmin=0, vmax=largest, **where)
     for mask, colour in ((images.missed, style.MISSED), (images.spurious, style.SPURIOUS)):
-        axis.imshow(np.where(mask[..., None], to_rgba(colour), 0.0), **where)
-    axis.set(**window)
+        below.imshow(np.where(mask[..., None], to_rgba(colour), 0.0), **where)
     return shown
-
-
-def _placed(images: Images) -> dict[str, Any]:
-    """The extent and interpolation of a picture; a large one is averaged, so that single pixels stay visible."""
-    how = "nearest" if images.hit.shape[0] <= LARGEST_SHARP else "auto"
-    return {"extent": (0, 1, 1, 0), "interpolation": how}
-
-
-def _legend() -> list[Patch]:
-    return [
-        Patch(color=style.MISSED, label="missed: only the\nreference hits"),
-        Patch(color=style.SPURIOUS, label="spurious: only\nthe row hits"),
-    ]
-
-
-def _window(shown: list[Cell]) -> dict[str, Any]:
-    """Limits of the square part of the pictures that contains all hits, with a margin, in shares of a picture."""
-    masks = [cell.images.hit | cell.images.reference_hit for cell in shown if cell.images is not None]
-    top, left, side = style.window(masks) if masks else (0, 0, 1)
-    return {"xlim": (left, left + side), "ylim": (top + side, top)}
-
-
-def _top(shown: list[Cell]) -> float:
-    """The end of the scale of angles: the 99th percentile over all pixels, rounded up."""
-    angles = [cell.images.angles() for cell in shown if cell.images is not None and not cell.reference]
-    together = np.concatenate([a[np.isfinite(a)] for a in angles]) if angles else np.empty(0)
-    return style.rounded_up(float(np.percentile(together, 99))) if together.size else 90.0

@@ -1,7 +1,9 @@
 """The result of a page, and its output as CSV, Markdown, LaTeX, PNG, PDF and HTML."""
 
 import html
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
-from bench.report.write import interactive
+from bench.report.data.experiments import Experiment
+from bench.report.write import caption, interactive
 
 # Special characters of LaTeX, and characters that its standard fonts lack.
 _LATEX = {
@@ -44,18 +47,41 @@ _SPARED = "_"  # within words, where it has no meaning in Markdown
 
 @dataclass(frozen=True)
 class Result:
-    """A table, a figure or both, made from records.
+    """A table, a figure or both, made from the records of an experiment.
 
-    `data` has the raw numbers, including those that the figure plots; `table` has them as text for readers.
+    Args:
+        experiment: the experiment that it shows.
+        title: its title, as a sentence.
+        plotted: what is plotted, as a sentence.
+        n: the sample as text; by default the numbers of runs, shapes and seeds.
+        interval: the kind of interval; empty for none.
+        remarks: notes of its own; empty ones are left out.
+        data: the raw numbers, including those that the figure plots.
+        table: the numbers as text for readers.
+        figure: the figure.
+        page: the same as an interactive figure of Plotly.
     """
 
+    experiment: Experiment
     title: str
-    caption: str
+    plotted: str
     data: pd.DataFrame
-    notes: list[str] = field(default_factory=list)
+    n: str = ""
+    interval: str = ""
+    remarks: Iterable[str] = ()
     table: pd.DataFrame | None = None
     figure: Figure | None = None
-    page: Any = None  # the same as an interactive figure of Plotly
+    page: Any = None
+
+    @cached_property
+    def caption(self) -> str:
+        """What is plotted, n, the interval, what failed, and the machine."""
+        return caption.caption(self.experiment, self.plotted, n=self.n, interval=self.interval)
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Warnings, then the notes of its own."""
+        return [*caption.warnings(self.experiment), *filter(None, self.remarks)]
 
 
 def write(result: Result, base: Path) -> list[Path]:
@@ -82,10 +108,9 @@ def markdown(result: Result, name: str) -> str:
     """The Markdown text of a result: title, caption, table, picture and notes."""
     parts = [f"**{_md(result.title)}** {_md(result.caption)}"]
     if result.table is not None:
-        rows = [list(result.table.columns), ["---", *["---:"] * (result.table.shape[1] - 1)], *result.table.to_numpy()]
-        rule = rows.pop(1)
-        lines = [f"| {' | '.join(_md(cell) for cell in row)} |" for row in rows]
-        parts.append("\n".join([lines[0], f"| {' | '.join(rule)} |", *lines[1:]]))
+        head, *rows = ([_md(cell) for cell in row] for row in (result.table.columns, *result.table.to_numpy()))
+        rule = ["---", *["---:"] * (len(head) - 1)]
+        parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if result.figure is not None:
         parts.append(f"![{_md(result.title)}]({name}.png)")
     if result.notes:

@@ -1,4 +1,4 @@
-"""The Pareto front of error and time, with each setting's probability to be on it."""
+"""The Pareto front of error and time, and the hypervolume that each renderer's settings dominate in their plane."""
 
 from typing import Any
 
@@ -10,13 +10,14 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment, together
-from bench.report.data.speed import SEED, TRIALS, Placed, Setting, front_line, left_out, resolution, settings, sizes
-from bench.report.write import interactive
-from bench.report.write.caption import captioned
+from bench.report.data.records import grouped
+from bench.report.data.speed import SEED, TRIALS, Placed, Setting, front_line, left_out, resolution, sizes, trials
+from bench.report.write import chart, interactive
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, to_data, to_table
 
-PLACE = 80
+PLACE_FRONT = 80
+PLACE_VOLUME = 100
 READS = tuple(trial.selection for trial in TRIALS)
 NOTES = (
     "Final error of a completion over the seconds of its loop, and depth error of one rendering (95th percentile over "
@@ -29,25 +30,42 @@ NOTES = (
 )
 
 
-def make(completion: Experiment | None, rendering: Experiment | None) -> Result:
+def make_front(completion: Experiment | None, rendering: Experiment | None) -> Result:
     """Makes the page, with a point per setting: its median error and seconds, and its probability on the front."""
-    trials = [settings(runs, trial) for runs, trial in zip((completion, rendering), TRIALS, strict=True)]
-    panels = [place(rows) for rows in trials if rows]
+    settings = trials(completion, rendering)
+    panels = [place(rows) for rows in settings if rows]
     points = [point for panel in panels for point in panel]
     names = dict.fromkeys(name for point in points for name in _settings(point))
     columns = [*COLUMNS, *(Column(f"renderer.{name}", value=lambda p, n=name: _settings(p).get(n)) for name in names)]
     return Result(
-        title="Error over time.",
-        **captioned(
-            together(completion, rendering),
-            "Median error of each setting over its median time, over shapes and seeds.",
-            interval="in the CSV, 95 % bootstrap intervals of interquartile means over shapes and seeds",
-            notes=(left_out(rendering), sizes(*trials), *NOTES),
-        ),
+        together(completion, rendering),
+        "Error over time.",
+        "Median error of each setting over its median time, over shapes and seeds.",
+        interval="in the CSV, 95 % bootstrap intervals of interquartile means over shapes and seeds",
+        remarks=(left_out(rendering), sizes(*settings), *NOTES),
         data=to_data([*columns, text("resolution", value=lambda point: resolution(point.row.records[0]))], points),
         table=to_table(columns, points),
         figure=draw(panels),
         page=interactive.front(panels),
+    )
+
+
+def make_volume(completion: Experiment | None, rendering: Experiment | None) -> Result:
+    """Makes the page, with a line per renderer: the area that its settings dominate, with its interval."""
+    settings = trials(completion, rendering)
+    lines = [line for rows in settings for line in _volumes(rows)]
+    return Result(
+        together(completion, rendering),
+        "Area that each renderer dominates in the plane of error and time.",
+        "Area dominated by the medians of a renderer's settings, in powers of ten of seconds times powers of ten of "
+        "error, up to twice the largest finite median of either; larger is better.",
+        interval="95 % bootstrap intervals over shapes and seeds",
+        remarks=(
+            "More settings can only add to the area: it does not rank renderers with different numbers of settings.",
+            sizes(*settings),
+        ),
+        data=to_data(VOLUME, lines),
+        table=to_table(VOLUME, lines),
     )
 
 
@@ -68,30 +86,22 @@ def place(rows: list[Setting]) -> list[Placed]:
 @style.styled
 def draw(panels: list[list[Placed]]) -> Figure:
     """Draws a panel per trial."""
-    figure = Figure(figsize=(style.WIDTH, 3.9), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    figure, (axes,) = chart.sheet(3.9, 1, len(panels))
     for axis, panel in zip(axes, panels, strict=True):
         _panel(axis, panel)
     for renderer in dict.fromkeys(point.row.renderer for panel in panels for point in panel):
-        look = style.look(renderer)
-        axes[0].plot([], [], look.marker, color=look.colour, ls="none", label=renderer)
+        chart.points(axes[0], renderer, [], [], label=renderer)
     style.legend_below(figure, axes[0], columns=5)
+    for axis, panel in zip(axes, panels, strict=True):
+        named = [(point.label if point.on_front or point.infinite else "", point.x, point.y) for point in panel]
+        chart.name_points(axis, named, size=5.5)
     return figure
 
 
 def _panel(axis: Axes, panel: list[Placed]) -> None:
-    middle = np.exp(np.mean(np.log([min(point.x for point in panel), max(point.x for point in panel)])))
-    for number, point in enumerate(sorted(panel, key=lambda point: point.x)):
-        look = style.look(point.row.renderer)
-        how = {"color": look.colour, "mfc": look.colour if point.on_front else "none", "ls": "none", "ms": 5}
-        axis.plot(point.x, point.y, "x" if point.infinite else look.marker, **how)
-        words = {"textcoords": "offset points", "fontsize": 5.5}
-        if point.infinite:
-            axis.annotate(point.label, (point.x, point.y), (2, 4), rotation=30, **words)
-        elif point.on_front:
-            side = "left" if point.x < middle else "right"
-            at = (4 if side == "left" else -4, 4 if number % 2 else -8)
-            axis.annotate(point.label, (point.x, point.y), at, ha=side, **words)
+    for point in panel:
+        how = {"marker": "x"} if point.infinite else {} if point.on_front else {"mfc": "none"}
+        chart.points(axis, point.row.renderer, point.x, point.y, ms=5, **how)
     line = front_line(panel)
     how = {"where": "post", "color": "#999999", "lw": 0.8, "zorder": 0}
     axis.step([point.x for point in line], [point.y for point in line], **how)
@@ -100,6 +110,22 @@ def _panel(axis: Axes, panel: list[Placed]) -> None:
         style.log_axis(axis, letter, [getattr(point, letter) for point in panel])
     axis.margins(x=0.08, y=0.1)
     axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
+
+
+def _volumes(rows: list[Setting]) -> list[dict[str, Any]]:
+    """The lines of a trial, one per renderer; none where all medians are infinite."""
+    finite = np.array([row.point for row in rows if np.isfinite(row.point).all()])
+    if not len(finite):
+        return []
+    reference = tuple(float(x) for x in 2 * finite.max(axis=0))
+    lines = []
+    for renderer, of_renderer in grouped(rows, lambda row: row.renderer).items():
+        points = [(row.costs, row.errors) for row in of_renderer]
+        area = statistics.hypervolume_interval(points, reference=reference, seed=SEED)
+        identity = {"trial": rows[0].trial.title, "renderer": renderer, "settings": len(points)}
+        numbers = {"hypervolume": area.value, "low": area.low, "high": area.high}
+        lines.append({**identity, **numbers, "reference_seconds": reference[0], "reference_error": reference[1]})
+    return lines
 
 
 def _settings(point: Placed) -> dict[str, Any]:
@@ -134,4 +160,10 @@ COLUMNS = (  # of a point
     shown("Failed", _failed),
     Column("on_front", "P(on the front)", lambda point: point.chance),
     Column("dominated", value=lambda point: point.dominated),
+)
+VOLUME = (
+    *(text("trial", "Trial"), text("renderer", "Renderer"), text("settings", "Settings")),
+    *(Column("hypervolume", "Hypervolume"), Column("low"), Column("high")),
+    shown("95 % interval", lambda line: format.interval(line["low"], line["high"])),
+    *(Column("reference_seconds"), Column("reference_error")),
 )

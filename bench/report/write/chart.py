@@ -1,0 +1,92 @@
+"""Pieces that the figures share: a sheet with axes, a grid of panels, the line of a row."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
+
+from bench.pictures import style
+
+# Places of a name relative to its point: offsets in points, and the alignment.
+SIDES = ((0, 9, "center"), (0, -9, "center"), (6, 0, "left"), (-6, 0, "right"), (3, 9, "left"), (-3, 9, "right"))
+SIDES += ((3, -9, "left"), (-3, -9, "right"), (0, 18, "center"), (0, -18, "center"), (0, 27, "center"))
+LETTER, LINE = 0.6, 1.14  # approximate width of a letter, and height of a line, in sizes of the type
+
+
+def sheet(
+    height: float, lines: int = 1, columns: int = 1, *, width: float = style.WIDTH, **how: Any
+) -> tuple[Figure, np.ndarray]:
+    """A figure of that size in inches, and its axes [lines, columns]."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(lines, columns, squeeze=False, **how)
+
+
+def line(axis: Axes, preset: str, x: Any, y: Any, *, band: Any = None, **how: Any) -> None:
+    """Draws the line of a row in the look of its preset, and a band between two ends around it.
+
+    Args:
+        axis: where it is drawn.
+        preset: the row's preset.
+        x, y: positions and values.
+        band: the lower and the upper ends of the band; None for no band.
+        how: settings of the line that replace those of the look.
+    """
+    look = style.look(preset)
+    axis.plot(x, y, **{"color": look.colour, "marker": look.marker, "ls": look.line, **how})
+    if band is not None:
+        axis.fill_between(x, *band, color=look.colour, alpha=0.15, lw=0)
+
+
+def points(axis: Axes, preset: str, x: Any, y: Any, **how: Any) -> None:
+    """Draws the points of a row with the marker and colour of its preset."""
+    line(axis, preset, x, y, ls="none", **how)
+
+
+def say(axis: Axes, text: str, **how: Any) -> None:
+    """Writes a text in the middle of an axis that has nothing to show."""
+    axis.text(0.5, 0.5, text, **{"ha": "center", "va": "center", "transform": axis.transAxes, **how})
+
+
+def reference(draw: Callable[..., Any], value: float, times: float, label: str) -> None:
+    """Draws a line at a value and a dotted one at a multiple of it, by an axis's `axhline` or `axvline`."""
+    draw(value, color="#777777", lw=0.9, label=label)
+    draw(times * value, color="#777777", lw=0.9, ls=":", label=f"{times:g} times that")
+
+
+def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: float = 7) -> None:
+    """Writes a name next to each point, on the first side where it covers no point, name or edge of the axes.
+
+    Args:
+        axes: axes with their final limits.
+        named: name and position of each point; an empty name is not written.
+        size: of the letters.
+    """
+    figure = axes.figure
+    figure.draw_without_rendering()  # places the axes
+    scale = 72 / figure.dpi  # points per pixel
+    points = axes.transData.transform([(x, y) for _, x, y in named] or np.empty((0, 2))) * scale
+    inside = Bbox(axes.get_window_extent().get_points() * scale)
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in points]
+    for (name, *where), at, this in zip(named, points, list(taken), strict=True):
+        if not name:
+            continue
+        boxes = [_box(at, side, len(name), size) for side in SIDES]
+        others = [box for box in taken if box is not this]
+        free = [inside.x0 <= box.x0 and box.x1 <= inside.x1 and not any(map(box.overlaps, others)) for box in boxes]
+        place = free.index(True) if True in free else 0
+        dx, dy, side = SIDES[place]
+        how = {"ha": side, "va": "center", "fontsize": size, "textcoords": "offset points"}
+        axes.annotate(name, where, (dx, dy), path_effects=[withStroke(linewidth=2, foreground="white")], **how)
+        taken.append(boxes[place])
+
+
+def _box(at: np.ndarray, side: tuple[int, int, str], letters: int, size: float) -> Bbox:
+    """The approximate box of a name of so many letters of a size, in points."""
+    dx, dy, align = side
+    width, height = LETTER * size * letters, LINE * size
+    left = at[0] + dx - {"left": 0.0, "center": width / 2, "right": width}[align]
+    return Bbox.from_bounds(left, at[1] + dy - height / 2, width, height)
