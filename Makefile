@@ -2,7 +2,7 @@
 PYTHON ?=
 BIN := .venv/bin
 
-.PHONY: demo test test-slow benchmark lint setup clean
+.PHONY: demo test test-slow benchmark mutants lint setup clean
 
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
@@ -15,6 +15,9 @@ test-slow: .venv/ready-dev ## the minutes-long tests
 
 benchmark: .venv/ready-dev ## speed and memory against the machine's own limits; on a quiet machine
 	$(BIN)/python -m pytest -o addopts="-q -s -p no:dash" tests/benchmarks
+
+mutants: .venv/ready-dev ## plants mistakes one at a time and prints those that no test finds (some minutes)
+	ONLY="$(ONLY)" $(BIN)/python -m tests.mutants
 
 lint: .venv/ready-dev ## ruff (lint and format) and pyright
 	$(BIN)/ruff check .

@@ -10,7 +10,7 @@ import dataclasses
 import importlib.util
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from math import inf
@@ -150,6 +150,7 @@ class Config:
     renderer: Any = MISSING
     dataset: Any = MISSING
     stress: Any = MISSING
+    silhouette: Any = MISSING
     prior: Any = MISSING
     scale: Any = MISSING
     tracker: Any = MISSING
@@ -207,10 +208,16 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
     if config.evaluation.film is not None and config.evaluation.picture is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
+    if not config.silhouette._target_.endswith(".Own") and not _reads_silhouette(config.task):
+        raise ValueError("silhouette is read by task=completion, pose, capacity and stability alone: leave it out")
     for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
         if isinstance(value, int) and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
+
+
+def _reads_silhouette(task: DictConfig) -> bool:
+    return "silhouette" in task or "silhouette" in task.get("fit", {})
 
 
 def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (), target: str = "") -> Any:
@@ -245,7 +252,7 @@ def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (
         if key not in names:
             new = renamed(f"{name}.{key}", [f"{name}.{known}" for known in names])
             raise ValueError(f"{name} has no key {key!r}{new or nearest(str(key), names)}")
-    return _typed(cls, arguments, name)
+    return _typed(cls, arguments, name, packages)
 
 
 def load(group: str, name: str, **arguments: Any) -> Any:
@@ -297,24 +304,31 @@ def _with_defaults(path: Path) -> DictConfig:
     return cast(DictConfig, OmegaConf.merge(*parts))
 
 
-def _typed(cls: type, arguments: dict, name: str) -> Any:
+def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | list[str]) -> Any:
     """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
     types = get_type_hints(cls)
-    classes = {key: _node_class(types[key]) for key in arguments if arguments[key] is not None}
-    nested = {key: found for key, found in classes.items() if found is not None}
-    schema = OmegaConf.structured(cls)
-    OmegaConf.set_readonly(schema, False)  # frozen dataclasses give read-only nodes
+    nested = {key: _node_class(types[key]) for key, value in arguments.items() if OmegaConf.is_dict(value)}
+    nested = {key: found for key, found in nested.items() if found or "_target_" in arguments[key]}
+    given = {key: value for key, value in arguments.items() if key not in nested}
+    schema = OmegaConf.structured(make_dataclass(cls.__name__, [(key, types[key]) for key in given]))
     try:
-        flat = OmegaConf.merge(schema, {key: value for key, value in arguments.items() if key not in nested})
+        flat = OmegaConf.merge(schema, given)
     except OmegaConfBaseException as error:
         wanted = _type_name(types.get(str(error.full_key).split(".")[0], ""))
         raise ValueError(f"{name}.{error.full_key}: {str(error).splitlines()[0]} (expected {wanted})") from None
-    values: Any = OmegaConf.to_container(flat, throw_on_missing=False)
+    values: Any = OmegaConf.to_container(flat)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
-    values |= {key: build(arguments[key], f"{name}.{key}", target=_path(found)) for key, found in nested.items()}
-    missing = [key for key, value in values.items() if value == MISSING]
-    if missing:
-        raise ValueError(f"{name}.{missing[0]} must be given: set {name}.{missing[0]}=...")
+    values |= {
+        key: build(arguments[key], f"{name}.{key}", packages, target=_path(found) if found else "")
+        for key, found in nested.items()
+    }
+    for item in fields(cls):
+        if (
+            item.name not in values
+            and item.default is dataclasses.MISSING
+            and item.default_factory is dataclasses.MISSING
+        ):
+            raise ValueError(f"{name}.{item.name} must be given: set {name}.{item.name}=...")
     try:
         return cls(**values)
     except ValueError as error:  # a class within another does not know where it stands

@@ -18,20 +18,21 @@ class Hits:
 
 
 class Truth:
-    """Ray casting and signed distances of a closed mesh, on the CPU, in float32."""
+    """Ray casting and signed distances of a mesh, on the CPU, in float32."""
 
-    def __init__(self, mesh: Mesh):
+    def __init__(self, mesh: Mesh, *, closed: bool = True):
         """Builds the search tree.
 
         Args:
-            mesh: closed, wound outward and free of overlaps, as `load_mesh` returns it.
+            mesh: wound outward and free of overlaps, as `load_mesh` returns it.
+            closed: False takes an open mesh as well, of which first hits have a meaning and signed distances have not.
 
         Raises:
             ValueError: the mesh is not watertight, so that inside and outside have no meaning.
         """
         import open3d
 
-        if not mesh.watertight:
+        if closed and not mesh.watertight:
             raise ValueError(
                 f"mesh: must be watertight to have an inside, found {mesh.faces.shape[0]} faces that do not close; "
                 "load it with datasets.meshes.load_mesh, which repairs it"

@@ -13,7 +13,7 @@ from renderers.field import Field, Kind, steepest
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import Capabilities, Rendering
-from renderers.silhouette import hinge_silhouette_loss
+from renderers.silhouette import Hinge
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class DIST:
         coarse_to_fine: begin with one ray per 4 x 4 pixels.
         n_gradient_samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
-        silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
+        silhouette_signed, silhouette_average: see `silhouette.Hinge`.
     """
 
     steps: int
@@ -86,13 +86,8 @@ class DIST:
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        return hinge_silhouette_loss(
-            rendering.closest,
-            mask,
-            epsilon=self.epsilon,
-            signed=self.silhouette_signed,
-            average=self.silhouette_average,
-        )
+        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
+        return hinge.of(rendering.closest, mask)
 
     def _slope(self, field: Field, rays: Rays) -> float:
         if not self.slope_samples:

@@ -6,14 +6,14 @@ from typing import ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from renderers.bracket import REFINEMENTS, first_crossing, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind, occupancy_logits
+from renderers.field import Field, Kind
 from renderers.gradients import fixed_samples, implicit
 from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.silhouette import Occupancy
 
 BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
@@ -39,9 +39,7 @@ class DVR:
         early_stop: evaluate the samples of a ray from front to back up to the first that is occupied; else all of them,
             as in the paper.
         least_slope, keep_slope_sign: see `gradients.implicit`.
-        occupancy_width: length in scene units over which a distance turns from occupied to free in the mask losses;
-            see `field.occupancy_logits`. Occupancy networks do not use it.
-        mask_weight: of both mask losses; 1 leaves them as the paper's equations have them.
+        occupancy_width, mask_weight: of both mask losses; see `silhouette.Occupancy`.
         sphere_radius: of the volume of interest, a sphere about the origin.
     """
 
@@ -102,20 +100,9 @@ class DVR:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """DVR, Eqs. 14 and 15, summed, divided by the number of rays, and weighted.
-
-        On the background, the hit or else a point drawn on the ray should be free; on the foreground without a hit, a
-        point drawn on the ray should be occupied. Points are drawn from PyTorch's own generator, evenly.
-        """
-        flat, hit, wanted = rays.flat(), rendering.hit.flatten(), mask.flatten()
-        entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
-        drawn = entry + torch.rand_like(entry) * (leave - entry)
-        distance = torch.where(hit, rendering.distance.detach().flatten(), drawn)
-        judged = meets & ~(wanted & hit)
-        values = field(flat[judged].at(distance[judged]))
-        logits = occupancy_logits(field, values, width=self.occupancy_width)
-        total = softplus(torch.where(wanted[judged], -logits, logits)).sum()
-        return self.mask_weight * total / max(wanted.numel(), 1)
+        """DVR, Eqs. 14 and 15; see `silhouette.Occupancy`."""
+        occupancy = Occupancy(self.occupancy_width, self.mask_weight, self.sphere_radius)
+        return occupancy.of(field, rays, rendering, mask)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""

@@ -6,7 +6,6 @@ from typing import ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
@@ -14,6 +13,7 @@ from renderers.field import Field, Kind
 from renderers.gradients import fixed_samples, implicit
 from renderers.march import Front, Stepping, march
 from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.silhouette import CrossEntropy
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class IDR:
         steps: most marching steps per ray.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
         least_slope: see `gradients.implicit`.
-        mask_sharpness: of the mask loss, for a length of one scene unit; the paper begins at 50 and doubles it.
-        mask_weight: of the mask loss, rho in the paper, which takes 100.
+        mask_sharpness, mask_weight: of the mask loss; see `silhouette.CrossEntropy`.
         sphere_radius: of the sphere about the origin that holds the shape.
     """
 
@@ -78,8 +77,5 @@ class IDR:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value, over all rays but correct hits (Sec. 3.3), weighted."""
-        logits = -self.mask_sharpness * rendering.closest
-        entropy = softplus(torch.where(mask, -logits, logits))
-        total = (entropy * ~(mask & rendering.hit)).sum()
-        return self.mask_weight * total / (self.mask_sharpness * max(mask.numel(), 1))
+        """Cross entropy of a sigmoid of the least field value (Sec. 3.3); see `silhouette.CrossEntropy`."""
+        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)

@@ -13,7 +13,7 @@ from renderers.field import Field, Kind
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march
 from renderers.rendering import Capabilities, Rendering, Status, assemble
-from renderers.silhouette import hinge_silhouette_loss
+from renderers.silhouette import Hinge
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Naive:
         n_gradient_samples: K of the approximate gradient; None with the unrolled one, which has no such number.
         serial: march the rays one after the other.
         sphere_radius: of the sphere about the origin that holds the shape.
-        silhouette_signed, silhouette_average: see `silhouette.hinge_silhouette_loss`.
+        silhouette_signed, silhouette_average: see `silhouette.Hinge`.
     """
 
     steps: int
@@ -85,13 +85,8 @@ class Naive:
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        return hinge_silhouette_loss(
-            rendering.closest,
-            mask,
-            epsilon=self.epsilon,
-            signed=self.silhouette_signed,
-            average=self.silhouette_average,
-        )
+        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
+        return hinge.of(rendering.closest, mask)
 
     def _approximate(self, field: Field, rays: Rays) -> Rendering:
         with torch.no_grad():

@@ -1,30 +1,156 @@
-"""The silhouette loss of methods whose soft silhouette is the least field value on a ray (DIST, Eq. 11)."""
+"""Silhouette losses: of each paper one, for the rendering of any renderer, so that renderers can be compared under one.
+
+`Own` is the renderer's own. The other three weigh a rendering by what every renderer gives: `hit`, `distance` and
+`closest`.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import softplus
+
+from renderers import boundary
+from renderers.camera import Rays, sphere_span
+from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.field import Field, occupancy_logits
+from renderers.rendering import Renderer, Rendering
 
 
-def hinge_silhouette_loss(
-    closest: Float[Tensor, "*rays"],
-    mask: Bool[Tensor, "*rays"],
-    *,
-    epsilon: float,
-    signed: bool,
-    average: str,
-) -> Float[Tensor, ""]:
+@runtime_checkable
+class SilhouetteLoss(Protocol):
+    """A loss between a rendering and a binary mask."""
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The loss.
+
+        Args:
+            renderer, field, rays: of which `rendering` is the outcome.
+            rendering: of the field.
+            mask: true on the foreground.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Own:
+    """The renderer's own silhouette loss, checked by `boundary.silhouette_loss`."""
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """See `SilhouetteLoss`."""
+        return boundary.silhouette_loss(renderer, field, rays, rendering, mask)
+
+
+@dataclass(frozen=True)
+class Hinge:
     """DIST, Eq. 11: the soft silhouette should be at most 0 on the foreground and at least 0 on the background.
 
     Args:
-        closest: the field's value of least magnitude on each ray, with its sign.
-        mask: true on the foreground.
         epsilon: the threshold between them, in scene units.
         signed: False takes the magnitude of `closest`, as the paper does. A background ray that stops just inside the
             shape is then pushed deeper. True keeps the sign, which avoids that.
         average: over "all" rays, or over those that are "violating". With all, a missed pixel weighs next to nothing,
             and an optimiser can lower the depth loss by losing hits.
+        weight: of the loss.
     """
-    soft = (closest if signed else closest.abs()) - epsilon
-    violation = torch.where(mask, soft, -soft).clamp_min(0)
-    count = torch.full_like(mask, True) if average == "all" else violation > 0
-    return violation.sum() / count.sum().clamp_min(1)
+
+    epsilon: float
+    signed: bool
+    average: str
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
+        check_choice("average", self.average, ("all", "violating"))
+        check_at_least("weight", self.weight, 0, "0 switches the loss off")
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """See `SilhouetteLoss`."""
+        return self.of(rendering.closest, mask)
+
+    def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        """The loss of the field's values of least magnitude on each ray, with their sign."""
+        soft = (closest if self.signed else closest.abs()) - self.epsilon
+        violation = torch.where(mask, soft, -soft).clamp_min(0)
+        count = torch.full_like(mask, True) if self.average == "all" else violation > 0
+        return self.weight * violation.sum() / count.sum().clamp_min(1)
+
+
+@dataclass(frozen=True)
+class CrossEntropy:
+    """IDR, Sec. 3.3: cross entropy of a sigmoid of the least field value, over all rays but correct hits.
+
+    Args:
+        sharpness: of the sigmoid, for a length of one scene unit; the paper begins at 50 and doubles it.
+        weight: rho in the paper, which takes 100.
+    """
+
+    sharpness: float
+    weight: float
+
+    def __post_init__(self) -> None:
+        check_positive("sharpness", self.sharpness, "the paper begins at 50")
+        check_at_least("weight", self.weight, 0, "the paper uses 100")
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """See `SilhouetteLoss`."""
+        return self.of(rendering, mask)
+
+    def of(self, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        """The loss of a rendering."""
+        logits = -self.sharpness * rendering.closest
+        entropy = softplus(torch.where(mask, -logits, logits))
+        total = (entropy * ~(mask & rendering.hit)).sum()
+        return self.weight * total / (self.sharpness * max(mask.numel(), 1))
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """DVR, Eqs. 14 and 15, summed and divided by the number of rays.
+
+    On the background, the hit or else a point drawn on the ray should be free; on the foreground without a hit, a point
+    drawn on the ray should be occupied. Points are drawn evenly, from PyTorch's own generator.
+
+    Args:
+        width: length in scene units over which a distance turns from occupied to free; see `field.occupancy_logits`.
+            Occupancy networks do not use it.
+        weight: of both terms; 1 leaves them as the paper's equations have them.
+        sphere_radius: of the sphere about the origin on whose chords points are drawn.
+    """
+
+    width: float
+    weight: float
+    sphere_radius: float
+
+    def __post_init__(self) -> None:
+        check_positive("width", self.width, "0.02 suits distances in the unit sphere")
+        check_at_least("weight", self.weight, 0, "1 keeps the paper's equations")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """See `SilhouetteLoss`."""
+        return self.of(field, rays, rendering, mask)
+
+    def of(self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        """The loss of a rendering of the field along the rays."""
+        flat, hit, wanted = rays.flat(), rendering.hit.flatten(), mask.flatten()
+        entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
+        drawn = entry + torch.rand_like(entry) * (leave - entry)
+        distance = torch.where(hit, rendering.distance.detach().flatten(), drawn)
+        judged = meets & ~(wanted & hit)
+        values = field(flat[judged].at(distance[judged]))
+        logits = occupancy_logits(field, values, width=self.width)
+        total = softplus(torch.where(wanted[judged], -logits, logits)).sum()
+        return self.weight * total / max(wanted.numel(), 1)

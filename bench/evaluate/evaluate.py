@@ -15,14 +15,24 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.extract import extract
 from datasets.mesh import Mesh
-from datasets.scene import View
-from datasets.truth import sample_surface
+from datasets.scene import View, see
+from datasets.truth import Truth, sample_surface
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
 from renderers.fields.analytic import Shape, sphere
 
+OWN = "own_"  # prefix of the metrics of what the renderer under test sees
 REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
+DEPTH_CAP = 0.1  # scene units
+IMAGE = {
+    "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
+    " predicted and the true mask, in scene units; infinite if there is no such pixel.",
+    "depth_error_capped": "Mean absolute difference of camera-z depth, at most 0.1, over the pixels that are foreground"
+    " in at least one of the two masks, in scene units; a pixel of one mask alone counts 0.1, two empty masks give 0.",
+    "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
+    " in at least one, from 0 to 1; two empty masks give 1.",
+}
 DEFINITIONS: dict[str, str] = {
     "chamfer_l2": "Sum of the mean squared distance from each point sampled on the prediction to the nearest"
     " point sampled on the truth and the same from truth to prediction (DIST), in squared scene units.",
@@ -40,10 +50,8 @@ DEFINITIONS: dict[str, str] = {
     "normal_consistency": "Mean absolute cosine between the normal at each sampled point and the normal at"
     " the nearest point sampled on the other surface, averaged over both directions (Occupancy Networks),"
     " from 0 to 1.",
-    "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
-    " predicted and the true mask, in scene units; infinite if there is no such pixel.",
-    "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
-    " in at least one, from 0 to 1; two empty masks give 1.",
+    **{name: f"{text} By exact first hits of the extracted mesh, for every renderer." for name, text in IMAGE.items()},
+    **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE.items()},
 }
 
 # The score of a run without a surface: the worst.
@@ -124,7 +132,7 @@ def image_metrics(
     truth_depth: Float[np.ndarray, "h w"],
     truth_mask: Bool[np.ndarray, "h w"],
 ) -> dict[str, float]:
-    """`depth_mae` and `mask_iou` of `DEFINITIONS`, unscaled.
+    """The metrics of `IMAGE`, unscaled.
 
     Depth is camera z and is read only where both masks are true. A predicted depth there that is not a number
     counts as infinitely wrong.
@@ -144,8 +152,10 @@ def image_metrics(
     common, either = predicted_mask & truth_mask, predicted_mask | truth_mask
     error = np.abs(predicted_depth[common].astype(np.float64) - truth_depth[common])
     error[np.isnan(error)] = np.inf
+    one_only = DEPTH_CAP * float(either.sum() - common.sum())
     return {
         "depth_mae": float(error.mean()) if common.any() else np.inf,
+        "depth_error_capped": (np.minimum(error, DEPTH_CAP).sum() + one_only) / max(either.sum(), 1),
         "mask_iou": float(common.sum() / either.sum()) if either.any() else 1.0,
     }
 
@@ -170,14 +180,27 @@ class Evaluation:
 def evaluate(field: Field, inputs: RunInputs) -> Evaluation:
     """Compares a field with a scene's truth: surface samples of both, and the images in the scene's view.
 
-    The field is cut off at the unit sphere, since no prior was trained outside it.
+    Images are those of the extracted mesh, so that no renderer judges itself, and those of the run's renderer beside
+    them. The field is cut off at the unit sphere, since no prior was trained outside it.
     """
     truth = inputs.scene.view
     mesh, metrics = _compare(field, inputs)
-    seen = render_view(field, truth.camera, inputs)
-    metrics |= image_metrics(seen.depth.numpy(), seen.mask.numpy(), truth.depth.numpy(), truth.mask.numpy())
+    seen = unseen(truth.camera) if mesh is None else see(Truth(mesh, closed=False), truth.camera)
+    metrics |= view_metrics(seen, truth) | view_metrics(render_view(field, truth.camera, inputs), truth, OWN)
     failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if mesh is None else None
     return Evaluation(metrics, mesh, failure)
+
+
+def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
+    """The image metrics of a view against the true one, with a prefix to their names."""
+    found = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())
+    return {prefix + name: value for name, value in found.items()}
+
+
+def unseen(camera: Camera) -> View:
+    """The view of a camera that sees no surface."""
+    shape = camera.height, camera.width
+    return View(camera, torch.zeros(shape), torch.zeros(*shape, 3), torch.zeros(shape, dtype=torch.bool))
 
 
 def chamfer_only(field: Field, inputs: RunInputs) -> dict[str, float]:

@@ -57,6 +57,7 @@ class Look:
 _DIST, _DVR, _IDR, _NAIVE = Look("#0072b2", "s"), Look("#d1495b", "^"), Look("#6a3d9a", "D"), Look("#111111", "o")
 _LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<", "-.")
 _PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
+_OFFICIAL_DIST = Look("#2f9e9e", "<", "-.")
 # By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
 KNOWN = {
     "naive": _NAIVE,
@@ -74,7 +75,8 @@ KNOWN = {
     "dist_step_back": Look("#8b2252", "v", "-."),
     "dist_step_floor": Look("#b8860b", "<", "--"),
     "dist_slope_bound": Look("#66a61e", ">", "-."),
-    "dist_official_clamp": Look("#2f9e9e", "<", "-."),
+    "dist_official_clamp": _OFFICIAL_DIST,
+    "dist_official": _OFFICIAL_DIST,
     "dvr": _DVR,
     "dvr_64": _DVR,
     "dvr_official_slope": Look("#e7a1ab", "^", "--"),
@@ -84,6 +86,7 @@ KNOWN = {
     "dist_depth": _LIGHT_DIST,
     "dist_mask_paper": _PAPER_DIST,
     "dist_depth_paper": _PAPER_DIST_DEPTH,
+    "dist_mask_official": _OFFICIAL_DIST,
     "dvr_mask": _DVR,
     "idr_mask": _IDR,
     "naive_mask": _NAIVE_OF_METHODS,

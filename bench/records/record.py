@@ -91,8 +91,13 @@ class Record:
 
 
 def row_name(config: dict[str, Any], renderer: str) -> str:
-    """The name of a run's row: the label of its configuration, or of its renderer's node, or the renderer's name."""
-    return config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer
+    """The name of a run's row: the label of its configuration, or of its renderer's node, or the renderer's name.
+
+    A silhouette loss that is not the renderer's own follows it.
+    """
+    name = config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer
+    loss = (config.get("silhouette") or {}).get("_label_")
+    return f"{name}, {loss}" if loss else name
 
 
 def read_record(folder: Path) -> dict[str, Any]:

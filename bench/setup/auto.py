@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from datasets.views import ViewSampler
 from renderers.adaptive_samples import samples
-from renderers.checks import check_positive
+from renderers.checks import check_positive, check_share
 
 AUTO = "auto"
 RADIUS = 1.0  # of the unit sphere, which holds every shape
@@ -25,19 +25,31 @@ class AutoSettings:
 
     Args:
         grazing: least angle between a ray and a surface, in degrees, at which a ray must still converge.
+        spurious: largest share of the hits that may be added around outlines.
+        area_over_perimeter: of the narrowest silhouette for which that holds, in scene units.
     """
 
     grazing: float
+    spurious: float
+    area_over_perimeter: float
 
     def __post_init__(self) -> None:
         check_positive("auto.grazing", self.grazing, "DIST, A.1, takes 10")
+        check_share("auto.spurious", self.spurious, "0.01 is one hit in a hundred")
+        check_positive(
+            "auto.area_over_perimeter", self.area_over_perimeter, "a disc of radius 0.5 has 0.25, a plane 0.08"
+        )
         if self.grazing > 90:
             raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
 
 
 def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> float:
-    """The footprint; see there."""
-    return footprint(view.focal_length, view.distance)
+    """Half a pixel (`footprint`), but no more than adds a given share of spurious hits.
+
+    Rays that pass by within epsilon are hits, so that an outline grows by epsilon: by epsilon * perimeter / area of the
+    hits, whatever the resolution. No hit is missed for a larger epsilon.
+    """
+    return min(footprint(view.focal_length, view.distance), settings.spurious * settings.area_over_perimeter)
 
 
 def footprint(focal_length: float, distance: float) -> float:
@@ -100,6 +112,10 @@ FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
     "n_ray_samples": first_samples,
 }
 PIXEL_PRECISION = ("epsilon", "steps")  # that follow from the camera alone
+LIMITED = {  # what a value holds for
+    "epsilon": ", with at most {0.spurious:.0%} spurious hits around outlines (auto.spurious)",
+    "steps": ", for surfaces met at {0.grazing:g} degrees or more (auto.grazing)",
+}
 CHANGING = {"n_ray_samples": ("begins with", "and follows the thinnest part that is seen")}  # during an optimisation
 
 
@@ -119,7 +135,7 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     for name in [name for name in FORMULAS if name in requested]:
         node[name] = FORMULAS[name](view, node, settings)
         seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
-        seen += f", for surfaces met at {settings.grazing:g} degrees or more (auto.grazing)" if name == "steps" else ""
+        seen += LIMITED[name].format(settings) if name in LIMITED else ""
         verb, reason = CHANGING.get(name, ("is", seen))
         notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
     return node, notes

@@ -9,21 +9,31 @@ from torch import Tensor
 
 from bench.solve.latent_code import Terms
 from datasets.scene import View
-from renderers.boundary import rendered, silhouette_loss
+from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Field
 from renderers.rendering import Renderer, at_iteration
+from renderers.silhouette import SilhouetteLoss
+
+DEPTH, POINTS = "depth", "points"  # what a depth loss takes the mean of; see `bench.tasks.completion.Completion`
+DEPTH_LOSSES = (DEPTH, POINTS)
 
 
 @runtime_checkable
 class Weights(Protocol):
-    """The weights of the terms of a view's loss."""
+    """The terms of a view's loss and their weights."""
+
+    @property
+    def depth_loss(self) -> str: ...
 
     @property
     def depth_weight(self) -> float: ...
 
     @property
     def silhouette_weight(self) -> float: ...
+
+    @property
+    def silhouette(self) -> SilhouetteLoss: ...
 
 
 @dataclass(frozen=True)
@@ -65,13 +75,15 @@ class GivenView:
         return replace(self, **parts, mask=None if self.mask is None else self.mask[rays])
 
     def compare(self, field: Field, iteration: int) -> Terms:
-        """The weighted terms of DIST, Eq. 5, with the weights of B.4."""
+        """The weighted terms of DIST, Eq. 5."""
         renderer = at_iteration(self.renderer, iteration)
         rendering = rendered(renderer, field, self.rays)
         compared = self.observed & rendering.hit
         error = (rendering.distance * self.depth_of_distance - self.depth).abs()
+        if self.settings.depth_loss == POINTS:
+            error = error / self.depth_of_distance
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
         if self.mask is not None:
-            silhouette = silhouette_loss(renderer, field, self.rays, rendering, self.mask)
+            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, self.mask)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms

@@ -7,8 +7,10 @@ import numpy as np
 import torch
 
 from bench.machine.limits import Limits
+from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.problem import OptimiserSettings
-from renderers.checks import check_at_least, check_positive, check_share
+from renderers.checks import check_at_least, check_choice, check_positive, check_share
+from renderers.silhouette import SilhouetteLoss
 
 
 @dataclass(frozen=True)
@@ -43,19 +45,22 @@ class FitSettings:
     Args:
         resolution: height and width of its image, in pixels.
         iterations, learning_rate: of Adam; the rate falls to zero along half a cosine.
-        depth_weight, silhouette_weight: as in completion.
+        depth_loss, depth_weight, silhouette, silhouette_weight: as in completion.
         offset: of the sphere's centre at the start, in scene units.
     """
 
     resolution: int
     iterations: int
     learning_rate: float
+    depth_loss: str
     depth_weight: float
+    silhouette: SilhouetteLoss
     silhouette_weight: float
     offset: float
 
     def __post_init__(self) -> None:
         check_at_least("task.fit.resolution", self.resolution, 4, "32 suits a sphere")
+        check_choice("task.fit.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_positive("task.fit.offset", self.offset, "0.1 is an easy start")
         OptimiserSettings(self.iterations, self.learning_rate, "cosine")
 

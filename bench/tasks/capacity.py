@@ -17,11 +17,13 @@ from bench.pictures.run_figures import draw_candidates
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
+from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.problem import check_field_gradient
 from bench.solve.solve import COSTS
 from datasets.truth import Truth
 from renderers.adaptive_samples import final_note
-from renderers.checks import check_positive, check_share
+from renderers.checks import check_choice, check_positive, check_share
+from renderers.silhouette import SilhouetteLoss
 
 TINY = 1e-9  # seconds: for a clock that did not move
 NEEDS = {
@@ -59,18 +61,21 @@ class Capacity:
     """Fits all candidates to views of a shape, and recommends the smallest that is sufficient.
 
     Args:
-        depth_weight, silhouette_weight: see `bench.tasks.completion.Completion`.
+        depth_loss, depth_weight, silhouette, silhouette_weight: see `bench.tasks.completion.Completion`.
         frugal_rays: share of the rays that the recommended candidate's fit at pixel precision begins with.
         checks: of the choice on further views.
     """
 
+    depth_loss: str
     depth_weight: float
+    silhouette: SilhouetteLoss
     silhouette_weight: float
     frugal_rays: float
     checks: CheckSettings
 
     def __post_init__(self) -> None:
         check_share("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
+        check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
             check_positive(f"task.{name}", getattr(self, name), "10 works for both")
 

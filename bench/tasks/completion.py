@@ -14,13 +14,14 @@ from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
-from bench.solve.observed_view import GivenView
+from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.problem import OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
 from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene, View
-from renderers.checks import check_at_least
+from renderers.checks import check_at_least, check_choice
 from renderers.rendering import Renderer
+from renderers.silhouette import SilhouetteLoss
 
 HELD_OUT, TILES = 0.2, 4  # share of the observations that is held out; tiles of the view along each side
 
@@ -32,15 +33,20 @@ class Completion:
     Args:
         points: amount of depth that is given; see `datasets.observe.observed_pixels`. Dense depth implies the mask.
         mask: whether the silhouette is given.
-        depth_weight: of the mean absolute depth error over pixels that are observed and hit (DIST, B.3).
-        silhouette_weight: of the renderer's own silhouette loss.
+        depth_loss: over pixels that are observed and hit, the mean of "depth", the error of the camera's depth (DIST,
+            B.3), or of "points", the distance in space between the points (DVR's official code).
+        depth_weight: of that mean.
+        silhouette: loss of the mask.
+        silhouette_weight: of that loss.
         code: penalty on the code.
         optimiser: iterations and learning rates.
     """
 
     points: str
     mask: bool
+    depth_loss: str
     depth_weight: float
+    silhouette: SilhouetteLoss
     silhouette_weight: float
     code: CodePenalty
     optimiser: OptimiserSettings
@@ -49,6 +55,7 @@ class Completion:
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
+        check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
 

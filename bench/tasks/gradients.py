@@ -31,6 +31,8 @@ DEFINITIONS = {
     "code: along task.directions orthogonal directions, camera: six rigid motions (scene units, radians)",
     "code_pooled_cosine, camera_pooled_cosine": "cosine between the concatenated gradients of all pixels of the band "
     "and the true ones: a scale that differs between pixels lowers it",
+    "code_pooled_scale, camera_pooled_scale": "component of the concatenated gradients along the true ones over the "
+    "length of the true ones",
     "code_scale, camera_scale": "component of the gradient along the true one over the length of the true one, median "
     "over pixels",
     "code_median_error, code_p99_error, camera_median_error, camera_p99_error": "length of the difference over the "
@@ -183,6 +185,7 @@ def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str)
     return {
         f"{name}_cosine": torch.cosine_similarity(found, true, dim=1).median().item(),
         f"{name}_pooled_cosine": torch.cosine_similarity(found.flatten(), true.flatten(), dim=0).item(),
+        f"{name}_pooled_scale": ((found * true).sum() / true.square().sum()).item(),
         f"{name}_scale": ((found * true).sum(1) / length.square()).median().item(),
         f"{name}_median_error": middle,
         f"{name}_p99_error": high,

@@ -10,22 +10,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import DEFINITIONS as IMAGE_DEFINITIONS
-from bench.evaluate.evaluate import Evaluation, image_metrics, render_view
+from bench.evaluate.evaluate import IMAGE, OWN, Evaluation, render_view, view_metrics
 from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.observed_view import DEPTH_LOSSES, POINTS
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.solve.solve import solve
-from datasets.scene import View
+from datasets.scene import Scene, View, see
 from datasets.truth import Truth
-from renderers.boundary import rendered, silhouette_loss
+from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
 from renderers.rendering import Renderer, at_iteration
+from renderers.silhouette import SilhouetteLoss
 
 REACH = 1.05  # half the side of the cube of a known shape's samples: the unit sphere with a margin
 DEFINITIONS = {
@@ -35,7 +36,9 @@ DEFINITIONS = {
     "success": "1 where both errors are at most task.success_degrees and task.success_distance, else 0",
 }
 TRACKED = tuple(DEFINITIONS)
-EVALUATED = DEFINITIONS | {name: IMAGE_DEFINITIONS[name] for name in ("depth_mae", "mask_iou")}
+SEEN = "By exact first hits of the known mesh, the same for every method."
+SEEN_DEFINITIONS = DEFINITIONS | {name: f"{text} {SEEN}" for name, text in IMAGE.items()}
+OWN_DEFINITIONS = {OWN + name: f"{text} Of the image that the renderer renders." for name, text in IMAGE.items()}
 
 
 @dataclass(frozen=True)
@@ -86,15 +89,17 @@ class PoseTask(ABC):
         success = rotation <= self.success_degrees and translation <= self.success_distance
         return {"rotation_error_deg": rotation, "translation_error": translation, "success": float(success)}
 
-    def evaluate(self, seen: View, true: View) -> Evaluation:
-        """The metrics of `EVALUATED`; a note where the pose was not found, which changes no status.
+    def evaluate(self, found: Camera, scene: Scene, own: View | None = None) -> Evaluation:
+        """The metrics of the pose and of its view; a note where it was not found, which changes no status.
 
         Args:
-            seen: view of the found camera.
-            true: given view.
+            found: the found camera.
+            scene: the known mesh and the given view.
+            own: what the renderer under test sees from the found camera, where there is one.
         """
-        images = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())
-        metrics = self.metrics(seen.camera, true.camera)
+        seen, true = see(Truth(scene.mesh), found), scene.view
+        images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN))
+        metrics = self.metrics(found, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
         note = f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"
         return Evaluation(metrics | images, notes=() if metrics["success"] else (note,))
@@ -110,8 +115,9 @@ class Pose(PoseTask):
         shape: field of the known shape: "grid", distances of the mesh on a grid; "prior", the network at the scene's
             code, which must be a training shape; "formula", that of a procedural family.
         grid: samples per axis of the grid.
-        depth_weight: of the mean absolute depth error over pixels that both hit.
-        silhouette_weight: of the renderer's own silhouette loss.
+        depth_loss, depth_weight: over pixels that both hit; see `bench.tasks.completion.Completion`.
+        silhouette: loss of the mask.
+        silhouette_weight: of that loss.
         normal_weight: of the mean of one minus the cosine between normals there, in camera axes; its gradient rotates
             the normals and does not move the points.
         optimiser: iterations and learning rates.
@@ -120,7 +126,9 @@ class Pose(PoseTask):
     trial: int
     shape: str
     grid: int
+    depth_loss: str
     depth_weight: float
+    silhouette: SilhouetteLoss
     silhouette_weight: float
     normal_weight: float
     optimiser: OptimiserSettings
@@ -128,6 +136,7 @@ class Pose(PoseTask):
     takes_field: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_choice("task.shape", self.shape, ("grid", "prior", "formula"))
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
         for name in ("depth_weight", "silhouette_weight", "normal_weight"):
@@ -151,7 +160,7 @@ class Pose(PoseTask):
         def problem() -> PoseProblem:
             return PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device)
 
-        solve(problem, self.optimiser, run, EVALUATED)
+        solve(problem, self.optimiser, run, SEEN_DEFINITIONS | OWN_DEFINITIONS)
 
 
 def known_shape(settings: Pose, inputs: RunInputs) -> Field:
@@ -215,7 +224,8 @@ class PoseProblem:
 
     def evaluate(self, inputs: RunInputs) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
-        return self.settings.evaluate(render_view(self.known, self.camera(), inputs), self.view)
+        own = render_view(self.known, self.camera(), inputs)
+        return self.settings.evaluate(own.camera, inputs.scene, own)
 
     def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
         """The errors of the current camera."""
@@ -241,7 +251,9 @@ class PoseProblem:
         compared = self.mask & rendering.hit
         count = compared.sum().clamp_min(1)
         error = (camera.depth(rendering.distance) - self.depth).abs()
-        silhouette = silhouette_loss(renderer, metered, rays, rendering, self.mask)
+        if self.settings.depth_loss == POINTS:
+            error = error / camera.depth(torch.ones_like(self.depth))
+        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, self.mask)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,

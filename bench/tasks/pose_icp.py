@@ -11,9 +11,9 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.tasks.pose import EVALUATED, PoseTask
-from datasets.scene import View, see
-from datasets.truth import Truth, sample_surface
+from bench.tasks.pose import SEEN_DEFINITIONS, PoseTask
+from datasets.scene import View
+from datasets.truth import sample_surface
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 
@@ -57,9 +57,9 @@ class PoseICP(PoseTask):
     def execute(self, run: RunContext) -> None:
         """Registers the points of the depth image to the mesh, and evaluates the camera before and after."""
         inputs, record, view = run.inputs, run.record, run.inputs.scene.view
-        record.definitions = EVALUATED | COSTS
+        record.definitions = SEEN_DEFINITIONS | COSTS
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
-        record.metrics_start = self.evaluate(see(Truth(inputs.scene.mesh), cameras[0]), view).metrics
+        record.metrics_start = self.evaluate(cameras[0], inputs.scene).metrics
         points, normals = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
         clock = time.perf_counter()
         tried = []
@@ -71,7 +71,7 @@ class PoseICP(PoseTask):
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         clock = time.perf_counter()
-        after = self.evaluate(see(Truth(inputs.scene.mesh), found), view)
+        after = self.evaluate(found, inputs.scene)
         record.seconds["evaluation"] = time.perf_counter() - clock
         record.metrics, record.notes = after.metrics, [*record.notes, *after.notes]
         record.status, record.reason = RunStatus.OK, ""

@@ -9,11 +9,12 @@ import trimesh
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, load, register, renamed
+from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, check_top_level, load, register, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
 from renderers.rendering import Renderer
+from renderers.silhouette import SilhouetteLoss
 
 IDR_ARGUMENTS = {
     "steps": 7,
@@ -31,9 +32,9 @@ SINGLE = {"completion_paper", "fitted"}  # of one run, and without a table or fi
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
 COMPARING = {"table1": 12, "fig4": 6, "fig5": 7, "stability": 12, "gradients": 4, "speed_accuracy": 20}  # renderers
-KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset}
+KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
-PARTS = ("task", "renderer", "dataset", "prior")
+PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 # What a choice needs on the command line.
 NEEDS = {
     "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
@@ -94,7 +95,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
         for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"), *CONF.glob("hydra/launcher/*.yaml"))
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    chosen = {"task", "renderer", "dataset", "prior", "scale", "stress", "tracker"}
+    chosen = {"task", "renderer", "dataset", "prior", "scale", "silhouette", "stress", "tracker"}
     assert {group for group, _ in YAMLS} == {*chosen, "experiment", "method"}
 
 
@@ -208,6 +209,13 @@ def test_variants_of_our_own_are_what_they_are_called(compose_config):
     assert variant("dist_official_clamp") == ("DIST, official clamp", replace(PAPER, step_clamp=0.1))
     assert variant("dist_capped") == ("+ aggressive, capped", replace(aggressive, extra_step_cap=0.01))
     assert variant("dist_paper") == ("DIST, paper's", replace(PAPER, steps=100, n_gradient_samples=3))
+    official = {
+        "step_clamp": 0.1,
+        "n_gradient_samples": 5,
+        "silhouette_signed": True,
+        "silhouette_average": "violating",
+    }
+    assert variant("dist_official") == ("DIST, official code's", replace(PAPER, steps=100, **official))
     assert variant("dvr_64") == ("DVR, n = 64", replace(dvr, n_ray_samples=64, doublings=(10, 30)))
     assert variant("dvr_official_slope") == ("DVR, official slope", replace(dvr, keep_slope_sign=False))
     assert variant("dvr_early_stop") == ("DVR, early stop", early)
@@ -431,3 +439,10 @@ def test_a_target_outside_our_packages_needs_leave(compose_config):
     for target in ("renderers.DISTT", "renderers.nowhere.DIST"):
         with pytest.raises(ValueError, match=rf"renderer\._target_ names '{target}', which cannot be imported"):
             build_part(compose_config(f"renderer._target_={target}"), "renderer")
+
+
+def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
+    with pytest.raises(ValueError, match="silhouette is read by task=completion, pose, capacity and stability alone"):
+        check_top_level(compose_config("task=gradients", "silhouette=hinge"))
+    for task in ("completion", "pose", "capacity", "stability", "gradients"):
+        check_top_level(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))

@@ -85,6 +85,8 @@ def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_rend
     assert row_name(cells["mine"].config, "mine") == "mine"
     assert row_name(cells["mine_on_dist"].config, "mine_on_dist") == "mine_on_dist"  # not the label of dist
     assert row_name(cells["dist"].config, "dist") == "DIST, our default"
+    under_another = cells["dist"].config | {"silhouette": {"_label_": "IDR's mask loss"}}
+    assert row_name(under_another, "dist") == "DIST, our default, IDR's mask loss"
     made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
     assert (type(made).__name__, made.size) == ("Mine", 3)
     if experiment != "table1":

@@ -65,6 +65,15 @@ def test_a_larger_sphere_is_off_by_the_difference(inputs):
     assert metrics["mask_iou"] < 0.7
 
 
+def test_no_renderer_judges_itself(inputs):
+    """One that sees a fattened outline, as a large epsilon does, changes its own metrics and no other."""
+    fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
+    thin, found = evaluate(sphere(RADIUS), inputs).metrics, evaluate(sphere(RADIUS), fat).metrics
+    differing = {name for name in thin if found[name] != thin[name]}
+    assert differing == {"own_mask_iou", "own_depth_mae", "own_depth_error_capped"}
+    assert found["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
+
+
 def test_a_field_is_not_evaluated_outside_the_unit_sphere(inputs):
     corner = sphere(0.3, (1.0, 1.0, 1.0))
     spoilt = evaluate(sphere(RADIUS) | corner, inputs)

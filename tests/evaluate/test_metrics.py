@@ -17,7 +17,8 @@ SURFACE = [
     "fscore",
     "normal_consistency",
 ]
-IMAGE = ["depth_mae", "mask_iou"]
+IMAGE = ["depth_error_capped", "depth_mae", "mask_iou"]
+OWN = [f"own_{name}" for name in IMAGE]
 
 
 def surface(points, normals) -> Surface:
@@ -124,19 +125,32 @@ def test_image_worked_example():
     truth_depth = np.array([[1.0, 2.25], [np.nan, 0.0]], dtype=np.float32)
     predicted_mask, truth_mask = np.array([[True, True], [True, False]]), np.array([[True, True], [False, False]])
     measured = image_metrics(predicted_depth, predicted_mask, truth_depth, truth_mask)
-    assert measured == pytest.approx({"depth_mae": 0.375, "mask_iou": 2 / 3})
+    assert measured == pytest.approx({"depth_mae": 0.375, "depth_error_capped": 0.1, "mask_iou": 2 / 3})
 
 
 def test_image_edges():
     depth, none, every = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
-    assert image_metrics(depth, every, depth, every) == {"depth_mae": 0, "mask_iou": 1}
-    assert image_metrics(depth, none, depth, every) == {"depth_mae": np.inf, "mask_iou": 0}
-    assert image_metrics(depth, none, depth, none) == {"depth_mae": np.inf, "mask_iou": 1}
-    assert image_metrics(depth * np.nan, every, depth, every) == {"depth_mae": np.inf, "mask_iou": 1}
+
+    def measured(*images: np.ndarray) -> tuple[float, ...]:
+        found = image_metrics(*images)
+        return tuple(found[name] for name in ("depth_mae", "depth_error_capped", "mask_iou"))
+
+    assert measured(depth, every, depth, every) == (0, 0, 1)
+    assert measured(depth, none, depth, every) == (np.inf, pytest.approx(0.1), 0)
+    assert measured(depth, none, depth, none) == (np.inf, 0, 1)
+    assert measured(depth * np.nan, every, depth, every) == (np.inf, pytest.approx(0.1), 1)
+
+
+def test_a_capped_depth_error_counts_pixels_of_one_mask_alone():
+    depth, every = np.ones((1, 4)), np.ones((1, 4), dtype=bool)
+    mask = np.array([[True, True, True, False]])
+    errors = np.array([[0.02, 0.3, 0.0, 0.0]])  # of the three in common; the second is capped, the fourth is missed
+    found = image_metrics(depth + errors, mask, depth, every)["depth_error_capped"]
+    assert found == pytest.approx((0.02 + 0.1 + 0.0 + 0.1) / 4)
 
 
 def test_every_metric_has_one_sentence():
-    assert sorted(DEFINITIONS) == sorted(SURFACE + IMAGE)
+    assert sorted(DEFINITIONS) == sorted(SURFACE + IMAGE + OWN)
     for sentence in DEFINITIONS.values():
         assert re.fullmatch(r"[A-Z][^\n]*\.", sentence)
         assert re.search(r"scene units|from 0 to 1", sentence)

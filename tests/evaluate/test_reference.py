@@ -9,6 +9,8 @@ import torch
 from bench.evaluate import reference as reference_store
 from bench.evaluate.reference import in_float64, make_reference, reference_for
 from bench.shape_prior.autodecoder import Prior
+from renderers.field import Kind
+from renderers.fields.analytic import Shape
 from tests.tiny import ball_prior, camera_of
 
 PRIOR = ball_prior()
@@ -36,6 +38,14 @@ def test_the_reference_agrees_with_dense_sampling():
     assert (reference.normals[reference.hit] * outwards).sum(-1).min() > 0.98
     assert (reference.distance[~reference.hit] == 0).all()
     assert (reference.normals[~reference.hit] == 0).all()
+
+
+def test_a_thin_plate_is_not_stepped_over():
+    """A plate 1e-3 thick across the whole view."""
+    plate = Shape(lambda points: points[..., 2].abs() - 5e-4, Kind.DISTANCE)
+    reference = make_reference(plate, camera_of(8, field_of_view=20.0))
+    assert reference.hit.all()
+    assert reference.distance.min().item() == pytest.approx(2.5 - 5e-4, abs=0.01)
 
 
 def test_it_is_kept_and_found_again(tmp_path, monkeypatch):

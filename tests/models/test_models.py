@@ -29,12 +29,13 @@ from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
 from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
+from renderers.silhouette import Own
 from tests.tiny import CPU
 
 DIST = load("renderer", "dist", n_gradient_samples=1)
 FIT = FitSettings(iterations=30, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
 SAMPLER = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 24)
-WEIGHTS = SimpleNamespace(depth_weight=10.0, silhouette_weight=10.0)
+WEIGHTS = SimpleNamespace(depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0)
 VIEWS = ViewSettings(fitted=6, held_out=4, share=0.1, elevation=60.0, rays=256)
 SIZES = {
     "sphere": 4,
@@ -350,7 +351,8 @@ def test_the_error_that_is_left_is_that_of_the_depth_whatever_a_silhouette_costs
 
 
 def test_half_a_pixel_is_that_of_epsilon_auto():
-    assert views_of("ball").footprint == pytest.approx(epsilon(SAMPLER, OmegaConf.create({}), AutoSettings(10.0)))
+    loose = AutoSettings(10.0, spurious=1.0, area_over_perimeter=1.0)
+    assert views_of("ball").footprint == pytest.approx(epsilon(SAMPLER, OmegaConf.create({}), loose))
     with pytest.raises(ValueError, match="outside of the unit sphere"):
         _ = replace(views_of("ball"), sampler=replace(SAMPLER, distance=0.5)).footprint
 

@@ -1,9 +1,13 @@
-"""The silhouette loss, DIST Eq. 11, against values worked out by hand."""
+"""Silhouette losses: DIST's, Eq. 11, against values worked out by hand, and all of them with every renderer."""
 
 import pytest
 import torch
 
-from renderers.silhouette import hinge_silhouette_loss
+from bench.config import CONF, load
+from renderers.camera import Rays
+from renderers.fields.analytic import sphere
+from renderers.rendering import Renderer
+from renderers.silhouette import Hinge, SilhouetteLoss
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
 CLOSEST = torch.tensor([0.5, 0.03, -0.3, -0.04], dtype=torch.float64)
@@ -11,7 +15,7 @@ ALL, NONE = torch.ones(4, dtype=torch.bool), torch.zeros(4, dtype=torch.bool)
 
 
 def loss(mask, *, signed=False, average="all", closest=CLOSEST):
-    return hinge_silhouette_loss(closest, mask, epsilon=0.1, signed=signed, average=average)
+    return Hinge(0.1, signed, average).of(closest, mask)
 
 
 @pytest.mark.parametrize(
@@ -70,3 +74,60 @@ def test_any_leading_shape_gives_one_number():
 @pytest.mark.parametrize("average", ["all", "violating"])
 def test_no_rays_cost_nothing(average):
     assert loss(ALL[:0], average=average, closest=CLOSEST[:0]).item() == 0
+
+
+LOSSES = sorted(path.stem for path in (CONF / "silhouette").glob("*.yaml"))
+# Along z past a sphere of radius .5: through the middle, just inside of the edge, just outside, far outside, no sphere.
+HEIGHTS = torch.tensor([0.0, 0.495, 0.505, 0.9, 1.2], dtype=torch.float64)
+
+
+def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tuple[float, float]:
+    """The loss of a sphere of radius .5, and its slope towards the radius."""
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    origins = torch.stack([HEIGHTS, torch.zeros_like(HEIGHTS), torch.full_like(HEIGHTS, -2.0)], dim=-1)
+    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 3))
+    torch.manual_seed(0)  # some losses draw points
+    value = loss(renderer, sphere(radius), rays, renderer.render(sphere(radius), rays), torch.tensor(mask))
+    slope = torch.autograd.grad(value, radius, allow_unused=True)[0] if value.requires_grad else None
+    return value.item(), 0.0 if slope is None else slope.item()
+
+
+@pytest.mark.parametrize(
+    ("renderer", "loss"), [("dist", "hinge"), ("naive", "hinge"), ("idr", "cross_entropy"), ("dvr", "occupancy")]
+)
+def test_the_loss_of_a_paper_is_that_of_its_renderer_to_the_last_digit(renderer, loss):
+    mine, own, named = load("renderer", renderer), load("silhouette", "own"), load("silhouette", loss)
+    for mask in ([True] * 4 + [False], [False] * 5, [True, False, True, False, False]):
+        assert of_sphere(mine, named, mask) == of_sphere(mine, own, mask)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive"])
+def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too_large(renderer, loss):
+    mine, given = load("renderer", renderer), load("silhouette", loss)
+    small, large = of_sphere(mine, given, [True] * 4 + [False]), of_sphere(mine, given, [False] * 5)
+    assert small[0] > 0
+    assert large[0] > 0
+    assert small[1] < 0 < large[1]
+
+
+@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive"])
+def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
+    hinge, mask = load("silhouette", "hinge"), [True] * 4 + [False]
+    expected = of_sphere(load("renderer", "idr", steps=500), hinge, mask)
+    assert of_sphere(load("renderer", renderer), hinge, mask) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("loss", "values", "message"),
+    [
+        ("hinge", {"average": "some"}, "average must be one of all, violating, not 'some'"),
+        ("hinge", {"epsilon": 0.0}, "epsilon must be positive, not 0.0"),
+        ("cross_entropy", {"sharpness": -1.0}, "sharpness must be positive, not -1.0"),
+        ("occupancy", {"width": 0.0}, "width must be positive, not 0.0"),
+        ("occupancy", {"weight": -1.0}, "weight must be at least 0, not -1.0"),
+    ],
+)
+def test_what_cannot_be_is_told(loss, values, message):
+    with pytest.raises(ValueError, match=message):
+        load("silhouette", loss, **values)

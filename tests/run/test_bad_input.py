@@ -96,6 +96,8 @@ def assert_one_line(err: str, *words: str) -> None:
         ("renderer.alhpa=1", ("unknown key 'renderer.alhpa'", "did you mean renderer.alpha")),
         ("sed=1", ("unknown key 'sed'", "did you mean seed")),
         ("points=5", ("unknown key 'points'", "task.points")),
+        ("silhouette.weight=2", ("unknown key 'silhouette.weight'",)),
+        ("silhouette=hing", ("unknown silhouette 'hing'", "did you mean hinge")),
         ("seed=x", ("seed", "'x'", "Integer")),
         ("verbose=maybe", ("verbose", "'maybe'", "bool")),
         ("device=gpu", ("device", "'gpu'", "auto, cpu, cuda")),

@@ -41,7 +41,8 @@ COMMANDS = {
     "naive": ("task=completion", "renderer=naive", *TINY, "task.optimiser.iterations=12"),
 }
 SURFACE = {"chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "fscore", "normal_consistency"}
-METRICS = SURFACE | {"depth_mae", "mask_iou"}
+IMAGE = {"depth_mae", "depth_error_capped", "mask_iou"}
+METRICS = SURFACE | IMAGE | {f"own_{name}" for name in IMAGE}
 PICTURES = {"summary", "input", "depth", "normals", "silhouette", "curve"}
 SETTINGS = {"dist": (20, 32), "naive": (12, 16)}  # iterations, image width in pixels
 

@@ -57,6 +57,15 @@ def silent(phase, done, total, loss=None):
     """No progress is shown."""
 
 
+def test_the_penalty_keeps_codes_short():
+    samples = distance_samples(Boxes(), Split.TRAIN, SETTINGS, 3, silent)
+    short, free = (
+        train(samples, replace(SETTINGS, steps=40, code_penalty=penalty), CPU, silent).codes.norm(dim=-1).mean()
+        for penalty in (1.0, 0.0)
+    )
+    assert short < 0.5 * free
+
+
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """A folder with a prior that was trained once, and what the call gave."""

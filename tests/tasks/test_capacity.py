@@ -22,6 +22,7 @@ from bench.setup.fields import FieldChoice, ModelSettings
 from bench.solve.problem import Unsupported
 from bench.tasks.capacity import Capacity, saved
 from bench.tasks.photographs import photographic_error, split_pairs
+from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
 from tests.tiny import Blind, ball_prior, camera_of, run_of, silent
 
@@ -119,7 +120,7 @@ def test_the_final_number_of_samples_is_noted_for_the_recommended_candidate(comp
 def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
     ladder = ModelSettings(("sphere",), FIT, GROWTH, VIEWS)
     run = run_of(tmp_path, Blind(), ball_prior(), camera_of(8), field=FieldChoice("prior", ladder))
-    task = Capacity(10.0, 10.0, 0.5, CheckSettings(4, 2, 2))
+    task = Capacity("depth", 10.0, Own(), 10.0, 0.5, CheckSettings(4, 2, 2))
     with pytest.raises(Unsupported, match="no gradient towards the field"):
         task.execute(run)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from bench.config import CONF, build
+from bench.config import CONF, build, load
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, optimise
@@ -20,13 +20,16 @@ from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Capabilities, Rendering, Status
+from renderers.silhouette import Own
 from tests.tiny import altered
 
 CPU = torch.device("cpu")
 SETTINGS = Completion(
     points="dense",
     mask=True,
+    depth_loss="depth",
     depth_weight=10.0,
+    silhouette=Own(),
     silhouette_weight=4.0,
     code=CodePenalty(0.1, "sum"),
     optimiser=OptimiserSettings(20, 0.01, "constant"),
@@ -156,6 +159,19 @@ def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
     assert torch.allclose(problem.code.grad, 10.0 / 2 * COSINE * expected, rtol=1e-4, atol=1e-6)
 
 
+def test_the_depth_loss_is_of_depths_or_of_points(problem_of):
+    """Depths differ by .1 and .3 where they are compared; along the rays that is 1 / COSINE as much."""
+    assert problem_of().loss(0)["depth"].item() == pytest.approx(10.0 * 0.2)
+    assert problem_of(depth_loss="points").loss(0)["depth"].item() == pytest.approx(10.0 * 0.2 / COSINE)
+
+
+def test_the_mask_loss_is_the_one_that_is_chosen(problem_of):
+    renderer = Fake()
+    terms = problem_of(renderer, silhouette=load("silhouette", "hinge")).loss(0)
+    assert renderer.asked is None
+    assert terms["silhouette"].item() != pytest.approx(4.0 * SILHOUETTE)
+
+
 def test_evaluations_are_counted_and_judging_is_not(problem_of):
     problem = problem_of()
     assert problem.rays_per_iteration == 4
@@ -224,6 +240,7 @@ def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(problem_of, 
         ({"optimiser.iterations": 0}, "task.optimiser.iterations must be at least 1, not 0"),
         ({"optimiser.learning_rate": 0.0}, "task.optimiser.learning_rate must be positive, not 0"),
         ({"optimiser.learning_rate": float("nan")}, "task.optimiser.learning_rate must be positive, not nan"),
+        ({"depth_loss": "normals"}, "task.depth_loss must be one of depth, points, not 'normals'"),
         ({"depth_weight": -1.0}, "task.depth_weight must be at least 0, not -1"),
         ({"silhouette_weight": float("inf")}, "task.silhouette_weight must be at least 0, not inf"),
         ({"code.weight": -0.1}, "task.code.weight must be at least 0, not -0.1"),
@@ -235,7 +252,10 @@ def test_settings_that_cannot_be_are_refused(changed, message):
 
 
 def test_the_shipped_settings_build():
-    node = OmegaConf.merge({"scale": {"iterations": 3}}, {"task": OmegaConf.load(CONF / "task" / "completion.yaml")})
+    files = {"task": "task/completion.yaml", "silhouette": "silhouette/own.yaml"}
+    parts = {name: OmegaConf.load(CONF / file) for name, file in files.items()}
+    node = OmegaConf.merge({"scale": {"iterations": 3}}, parts)
     task = build(node.task, "task")
     assert task.optimiser.iterations == 3
     assert task.points == "100"
+    assert task.silhouette == Own()

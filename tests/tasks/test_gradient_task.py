@@ -52,6 +52,7 @@ def test_an_exact_rule_is_found_exact(exact):
             assert metrics[f"{band}.{of}_cosine"] == pytest.approx(1, abs=1e-9)
             assert metrics[f"{band}.{of}_pooled_cosine"] == pytest.approx(1, abs=1e-9)
             assert metrics[f"{band}.{of}_scale"] == pytest.approx(1, abs=1e-6)
+            assert metrics[f"{band}.{of}_pooled_scale"] == pytest.approx(1, abs=1e-6)
             assert metrics[f"{band}.{of}_median_error"] < 1e-6
             assert metrics[f"{band}.{of}_p99_error"] < 1e-5
 

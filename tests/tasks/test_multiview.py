@@ -54,6 +54,11 @@ def test_the_truth_costs_least(scene):
     assert losses[2] < 0.5 * min(losses[0], losses[4])
 
 
+def test_the_photometric_term_is_weighted(scene):
+    one, three = (given(scene, photometric_weight=w).compare(sphere(0.45), 0)["photometric"].item() for w in (1.0, 3.0))
+    assert three == pytest.approx(3 * one) and one > 0
+
+
 def test_views_move_on_and_are_spread_evenly(scene):
     photographs = given(scene)
     assert photographs.pairs(0) == [(0, 1), (2, 3), (4, 5), (6, 7)]

@@ -20,13 +20,15 @@ from datasets.scene import Scene, see
 from datasets.truth import Truth
 from renderers.boundary import BrokenContract
 from renderers.fields.analytic import box
+from renderers.silhouette import Own
 from tests.tiny import CPU, Blind, ball_prior, camera_of, phases_of, run_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
 SETTINGS = Pose(
     degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05, trial=5,
-    shape="formula", grid=32, depth_weight=10.0, silhouette_weight=10.0, normal_weight=0.0,
+    shape="formula", grid=32, depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0,
+    normal_weight=0.0,
     optimiser=OptimiserSettings(60, 0.02, "cosine"),
 )  # fmt: skip
 START = replace(SETTINGS, degrees=20.0, shift=0.1, starts=3, spread=40.0)

@@ -1,0 +1,41 @@
+"""Numbers of the papers that stand in YAML, typed a second time."""
+
+import pytest
+
+# Override of the default configuration, key, value, and where the paper states it.
+STATED = [
+    ("renderer=idr", "renderer.mask_weight", 100.0, "IDR: rho"),
+    ("renderer=idr", "renderer.mask_sharpness", 50.0, "IDR: its sharpness at the start"),
+    ("renderer=idr", "renderer.epsilon", 5e-5, "IDR"),
+    ("silhouette=cross_entropy", "silhouette.weight", 100.0, "IDR: rho"),
+    ("silhouette=cross_entropy", "silhouette.sharpness", 50.0, "IDR: at the start"),
+    ("renderer=dist", "renderer.alpha", 1.5, "DIST, A.1"),
+    ("renderer=dist", "renderer.epsilon", 5e-5, "DIST, A.1"),
+    ("renderer=dist_paper", "renderer.steps", 100, "DIST, B.4"),
+    ("renderer=dist_paper", "renderer.n_gradient_samples", 3, "DIST, B.4"),
+    ("renderer=dist_paper", "renderer.silhouette_average", "all", "DIST, Eq. 11"),
+    ("renderer=dist_paper", "renderer.extra_step_cap", None, "DIST has none"),
+    ("renderer=dist_official", "renderer.step_clamp", 0.1, "DIST, official code"),
+    ("renderer=dist_official", "renderer.n_gradient_samples", 5, "DIST, official code"),
+    ("renderer=dvr", "renderer.refinement_steps", 8, "DVR, official code"),
+    ("renderer=dvr_64", "renderer.n_ray_samples", 64, "DVR, Sec. 3.5: between 16 and 128"),
+    ("+method=dist_mask_paper", "task.depth_weight", 10.0, "DIST, B.4"),
+    ("+method=dist_mask_paper", "task.silhouette_weight", 1.0, "DIST, B.4"),
+    ("+method=dist_mask_paper", "task.code.weight", 1.0, "DIST, B.4"),
+    ("+method=dist_mask_paper", "task.code.average", "mean", "DIST, official code"),
+    ("+method=multiview_paper", "task.views_per_step", 8, "DIST, B.4"),
+    ("task=multiview", "task.photometric_weight", 5.0, "DIST, B.4"),
+    ("scale=paper", "scale.multiview.views", 72, "DIST, B.4"),
+    ("scale=paper", "scale.multiview.iterations", 180, "DIST, B.4: 9 iterations, 20 times"),
+    ("scale=paper", "scale.iterations", 100, "DIST, B.4"),
+    ("scale=paper", "scale.rendering", 512, "DIST, Table 1"),
+    ("prior=autodecoder", "prior.code_penalty", 1e-4, "DeepSDF, official code"),
+]
+
+
+@pytest.mark.parametrize(("override", "key", "value", "where"), STATED, ids=[f"{o} {k}" for o, k, _, _ in STATED])
+def test_a_number_of_a_paper_is_as_stated(compose_config, override, key, value, where):
+    node = compose_config(override)
+    for part in key.split("."):
+        node = node[part]
+    assert node == value, where

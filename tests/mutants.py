@@ -1,0 +1,162 @@
+"""Plants mistakes one at a time in a copy of the project, and prints those that no test finds: `make mutants`.
+
+`make mutants ONLY=silhouette` plants those alone whose file or text contains a word.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import copy2
+
+ROOT = Path(__file__).resolve().parents[1]
+WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A mistake: `old`, which stands once in `file`, becomes `new`; the tests in `tests` should find it."""
+
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+M = Mutant
+MUTANTS = (
+    # Renderers: the march, the brackets, the gradients.
+    M("renderers/march.py", "value.abs() < stepping.epsilon", "value.abs() < 2 * stepping.epsilon", "tests/renderers"),
+    M("renderers/march.py", "(self.alpha - 1) * value", "self.alpha * value", "tests/renderers"),
+    M("renderers/march.py", "value.clamp(-self.step_clamp, self.step_clamp)", "value", "tests/renderers"),
+    M("renderers/march.py", "PYRAMID_STEPS = 3", "PYRAMID_STEPS = 2", "tests/renderers"),
+    M("renderers/march.py", "values.abs().argsort(dim=1, stable=True)", "values.argsort(dim=1, stable=True)",
+      "tests/renderers"),
+    M("renderers/march.py", "status[left] = Status.MISS", "status[left] = Status.HIT", "tests/renderers"),
+    M("renderers/march.py", "least <= CAREFUL * apart", "least >= CAREFUL * apart", "tests/renderers"),
+    M("renderers/bracket.py", "(value[:, 1:] <= 0)", "(value[:, 1:] < -0.1)", "tests/renderers"),
+    M("renderers/bracket.py", "bracket.near_value / (bracket.near_value - bracket.far_value)", "0.5",
+      "tests/renderers"),
+    M("renderers/gradients.py", "distance + alpha * (total - total.detach())", "distance + (total - total.detach())",
+      "tests/renderers"),
+    M("renderers/gradients.py", "distance.detach() - change / slope", "distance.detach() + change / slope",
+      "tests/renderers"),
+    M("renderers/gradients.py", "slope.clamp_max(-least_slope)", "slope.clamp_max(0.0)", "tests/renderers"),
+    M("renderers/gradients.py", "total = table.sum(dim=1)", "total = table.mean(dim=1)", "tests/renderers"),
+    M("renderers/camera.py", "torch.arange(self.height, **like) + 0.5", "torch.arange(self.height, **like)",
+      "tests/renderers"),
+    M("renderers/camera.py", "return distance / torch.linalg.vector_norm(self._bearings(), dim=-1)", "return distance",
+      "tests/renderers"),
+    M("renderers/camera.py", "self.world_to_camera @ rigid(twist)", "rigid(twist) @ self.world_to_camera",
+      "tests/renderers"),
+    M("renderers/dvr.py", "self.n_ray_samples // 2**to_come", "self.n_ray_samples", "tests/renderers"),
+    M("renderers/dvr.py", "found < 0 if sample == 0 else found <= 0", "found < -0.1", "tests/renderers"),
+    M("renderers/field.py", "self.counts.value += values.numel()", "self.counts.value += len(values)",
+      "tests/renderers"),
+    # Losses.
+    M("renderers/silhouette.py", "torch.where(mask, soft, -soft).clamp_min(0)", "torch.where(mask, soft, -soft).abs()",
+      "tests/renderers/test_silhouette.py"),
+    M("renderers/silhouette.py", "closest if self.signed else closest.abs()", "closest",
+      "tests/renderers/test_silhouette.py"),
+    M("renderers/silhouette.py", "entropy * ~(mask & rendering.hit)", "entropy", "tests/renderers"),
+    M("renderers/silhouette.py", "self.weight * total / (self.sharpness * max(mask.numel(), 1))",
+      "self.weight * total / max(mask.numel(), 1)", "tests/renderers"),
+    M("renderers/silhouette.py", "meets & ~(wanted & hit)", "meets", "tests/renderers"),
+    M("bench/solve/observed_view.py", "self.settings.silhouette_weight * silhouette", "silhouette",
+      "tests/tasks/test_completion.py"),
+    M("bench/solve/observed_view.py", "error = error / self.depth_of_distance", "pass",
+      "tests/tasks/test_completion.py"),
+    M("bench/solve/latent_code.py", 'squares.sum() if self.average == "sum" else squares.mean()', "squares.sum()",
+      "tests/tasks/test_completion.py tests/solve"),
+    M("bench/tasks/photographs.py", "self.settings.photometric_weight * together.mean()", "together.mean()",
+      "tests/tasks/test_multiview.py"),
+    M("bench/shape_prior/autodecoder.py", "settings.code_penalty * codes[chosen]", "0.0 * codes[chosen]",
+      "tests/shape_prior"),
+    M("bench/solve/optimise.py", "DIVERGED = 100.0", "DIVERGED = 1e9", "tests/solve"),
+    # Metrics and references.
+    M("bench/evaluate/evaluate.py", "np.mean(to_truth**2) + np.mean(to_predicted**2)",
+      "np.mean(to_truth**2) + np.mean(to_truth**2)", "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", 'float(np.mean(to_predicted**2)),', 'float(np.mean(to_truth**2)),',
+      "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", "np.mean(to_truth < threshold)", "np.mean(to_truth < 2 * threshold)",
+      "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", "common.sum() / either.sum()", "common.sum() / truth_mask.sum()", "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", "DEPTH_CAP = 0.1", "DEPTH_CAP = 0.2", "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", "see(Truth(mesh, closed=False), truth.camera)",
+      "render_view(field, truth.camera, inputs)", "tests/evaluate"),
+    M("bench/evaluate/reference.py", "LEAST_STEP = 2e-4", "LEAST_STEP = 2e-2", "tests/evaluate"),
+    M("bench/stress/theory.py", "FLATTEST = 0.29", "FLATTEST = 0.5", "tests/stress"),
+    M("bench/setup/auto.py", "settings.spurious * settings.area_over_perimeter)", "1.0)", "tests/setup"),
+    M("bench/setup/auto.py", "depth / (2 * focal_length)", "depth / focal_length", "tests/setup"),
+    # Statistics.
+    M("bench/report/data/statistics.py", "2 * float(chance", "1 * float(chance",
+      "tests/report/test_statistics.py"),
+    M("bench/report/data/statistics.py", "math.sqrt(n / (n - 1)) * stats.t.ppf((1 - level) / 2, n - 1)",
+      "stats.norm.ppf((1 - level) / 2)", "tests/report/test_statistics.py"),
+    M("bench/report/data/statistics.py", "np.arange(len(p), 0, -1)", "len(p)", "tests/report/test_statistics.py"),
+    M("bench/report/data/statistics.py", "fillna(len(table)).mean()", "mean()", "tests/report/test_statistics.py"),
+    M("bench/report/data/statistics.py", "(other[0] < mine[0]) | (other[1] < mine[1])",
+      "(other[0] <= mine[0]) | (other[1] <= mine[1])", "tests/report/test_statistics.py"),
+    # Published numbers, and numbers of papers in YAML.
+    M("bench/report/pages/table1.py", '"887K"', '"787K"', "tests/report/test_published.py"),
+    M("bench/report/pages/table2.py", "4.12, 3.98, 4.31", "4.12, 2.98, 4.31", "tests/report/test_published.py"),
+    M("bench/report/pages/table3.py", '"DIST, random start": 0.919', '"DIST, random start": 0.991',
+      "tests/report/test_published.py"),
+    M("conf/renderer/idr.yaml", "mask_weight: 100.0", "mask_weight: 1.0", "tests/conf/test_numbers.py"),
+    M("conf/renderer/dist_official.yaml", "step_clamp: 0.1", "step_clamp: 1.0", "tests/conf/test_numbers.py"),
+    M("conf/method/dist_mask_paper.yaml", "silhouette_weight: 1.0", "silhouette_weight: 10.0",
+      "tests/conf/test_numbers.py"),
+    M("conf/task/multiview.yaml", "photometric_weight: 5.0", "photometric_weight: 1.0", "tests/conf/test_numbers.py"),
+    M("conf/silhouette/occupancy.yaml", "weight: 3.0", "weight: 1.0", "tests/renderers/test_silhouette.py"),
+)  # fmt: skip
+
+
+def main() -> int:
+    """Plants all mistakes, prints the outcome of each, and gives 1 where one survives."""
+    word = os.environ.get("ONLY", "")
+    chosen = [mutant for mutant in MUTANTS if word in f"{mutant.file} {mutant.old}"]
+    survivors = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for mutant, found in zip(chosen, pool.map(is_found, chosen), strict=True):
+            print("found   " if found else "SURVIVES", f"{mutant.file}: {mutant.old} -> {mutant.new}", flush=True)
+            survivors += [] if found else [mutant]
+    print(f"{len(chosen)} planted, {len(survivors)} survive")
+    return bool(survivors)
+
+
+def is_found(mutant: Mutant) -> bool:
+    """Whether the tests fail on a copy of the project with the mistake."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        for name in subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True).split("\0")[:-1]:
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            copy2(ROOT / name, copy / name)
+        planted = planted_in(copy / mutant.file, mutant)
+        (copy / mutant.file).write_text(planted)
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *mutant.tests.split()]
+        environment = os.environ | {"PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
+        if done.returncode not in (0, 1):  # 1: a test failed; others: pytest could not run them
+            raise RuntimeError(f"{mutant}: pytest ended with {done.returncode}\n{done.stdout}{done.stderr}")
+        return done.returncode == 1
+
+
+def planted_in(file: Path, mutant: Mutant) -> str:
+    """The file's text with the mistake.
+
+    Raises:
+        ValueError: unless `old` stands once in it.
+    """
+    text = file.read_text()
+    if text.count(mutant.old) != 1:
+        raise ValueError(
+            f"{mutant.file} must have {mutant.old!r} once, not {text.count(mutant.old)} times: mend the list"
+        )
+    return text.replace(mutant.old, mutant.new)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
