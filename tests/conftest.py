@@ -3,20 +3,62 @@
 import bench  # noqa: F401, before all else: it sets the OpenMP variables, which torch reads once
 
 # isort: split
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
+from beartype import BeartypeConf, beartype
 from hypothesis import settings
 from jaxtyping import install_import_hook
+from omegaconf import OmegaConf
 
-# The hook must stand before the first import of what it checks. PEP 484 takes an int where a float is asked for.
-CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
-install_import_hook(["renderers", "datasets", "bench"], CHECKER)
+CHECKED = beartype(conf=BeartypeConf(is_pep484_tower=True))  # PEP 484 takes an int where a float is asked for
+
+
+def checked(function: Callable) -> Callable:
+    """Checks the types of a call, each once.
+
+    jaxtyping calls one function before a call, with its arguments, and one after it, with its arguments again and its
+    result. The second one has the names of the shapes from the first one, so that here it looks at the result alone.
+    """
+    result = function.__annotations__.get("return", Any)  # the first function gives Any
+    if result is not Any:
+        function.__annotations__ = {"return": result}
+    return CHECKED(function)
+
+
+# The hook must stand before the first import of what it checks.
+install_import_hook(["renderers", "datasets", "bench"], "tests.conftest.checked")
 
 settings.register_profile("implicit-bench", deadline=None, derandomize=True)
 settings.load_profile("implicit-bench")
+
+
+def loads_each_text_once(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`OmegaConf.load`, which parses a text once and gives a copy from then on: Hydra loads 20 files for each command.
+
+    What is kept is kept by the text, not by the name of its file, so that a file that changes is read anew.
+    """
+    loaded = {}
+
+    def once(file: Any) -> Any:
+        stream = hasattr(file, "read")
+        text = file.read() if stream else Path(file).read_text(encoding="utf-8")
+        if text not in loaded:
+            if stream:
+                file.seek(0)
+            loaded[text] = load(file)  # the file itself, since an error names it
+        return deepcopy(loaded[text])
+
+    return once
+
+
+OmegaConf.load = loads_each_text_once(OmegaConf.load)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -43,12 +85,39 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("filterwarnings", "ignore::beartype.roar.BeartypeDecorHintPep585DeprecationWarning")
 
 
+def pytest_collection_finish() -> None:
+    """Leaves what imports made, which stays to the end, out of all further searches for garbage."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     """The tensors of tests are small: a second thread costs more than it brings."""
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def asked_once() -> Iterator[None]:
+    """What all runs in this process would find out anew is found out once; runs in processes of their own do ask.
+
+    This is what git says, the machine's matrix product rate, and `hydra.mode`, for which Hydra composes the
+    configuration of a command once more; a test in conf sees that no configuration sets it.
+    """
+    import torch
+    from hydra._internal.hydra import Hydra
+
+    from bench.machine import environment
+
+    measure = environment.gemm_peak
+    rate = cache(lambda device, threads: measure(device))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(environment, "_git", cache(environment._git))
+        patch.setattr(environment, "gemm_peak", lambda device: rate(device, torch.get_num_threads()))
+        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
+        yield
 
 
 @pytest.fixture(scope="session")

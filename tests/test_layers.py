@@ -1,10 +1,16 @@
-"""Who may import whom: renderers <- datasets <- bench, in bench room by room, and a report that needs no torch."""
+"""Who may import whom: renderers <- datasets <- bench, in bench room by room; and that tests check types."""
 
 import ast
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from jaxtyping import Float, TypeCheckError, jaxtyped
+from torch import Tensor
+
+from tests.conftest import checked
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("renderers", "datasets", "bench", "conf", "tests")
@@ -182,3 +188,18 @@ def test_the_checker_finds_what_is_wrong(module, source):
 )
 def test_the_checker_lets_pass_what_is_right(module, source):
     assert wrongs(source, module, is_package=module == "bench") == []
+
+
+@jaxtyped(typechecker=checked)
+def _first(points: Float[Tensor, "*n 3"], wrong: int = 0) -> Float[Tensor, "*n"]:
+    return points[..., 0] if wrong == 0 else points
+
+
+def test_types_and_shapes_are_checked_of_arguments_and_of_results():
+    assert _first(torch.zeros(4, 3)).shape == (4,)
+    wrong: tuple[tuple[Any, ...], ...] = ((torch.zeros(4, 2),), (torch.zeros(4, 3), "no"), ([0.0],))
+    for arguments in wrong:
+        with pytest.raises(TypeCheckError, match="parameters"):
+            _first(*arguments)
+    with pytest.raises(TypeCheckError, match="return value"):  # of shape (4, 3), where n is (4,)
+        _first(torch.zeros(4, 3), 1)

@@ -42,19 +42,12 @@ NEEDS = {
 }
 
 
+@cache
 def composed_with_hydra(*overrides: str) -> DictConfig:
-    """The configuration with Hydra's own node, which says what an experiment sweeps over."""
+    """The configuration with Hydra's own node, which says what an experiment sweeps over: only to be read."""
     register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
-
-
-@cache
-def composed_alone(override: str) -> DictConfig:
-    """The default configuration with one choice, without Hydra's own node: only to be read."""
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=[override])
 
 
 def swept(name: str) -> dict[str, str]:
@@ -97,6 +90,12 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
     chosen = {"task", "renderer", "dataset", "prior", "scale", "silhouette", "stress", "tracker"}
     assert {group for group, _ in YAMLS} == {*chosen, "experiment", "method"}
+
+
+def test_no_yaml_sets_the_mode_of_hydra():
+    assert composed_with_hydra().hydra.mode is None  # the fixture `asked_once` of the tests says so to Hydra
+    for path in CONF.rglob("*.yaml"):
+        assert OmegaConf.select(OmegaConf.load(path), "hydra.mode") is None, path
 
 
 def test_the_default_configuration_builds(compose_config):
@@ -145,8 +144,7 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
     elif key == "stress":
         assert build_part(config, "task").stress.scene == OmegaConf.load(CONF / f"stress/{value}.yaml").scene
     elif key in ("renderer", "method"):
-        alone = composed_alone(swept)
-        config = compose_config(*method, swept, f"+experiment={name}")  # a sweep has them so
+        alone = compose_config(swept)
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")
         if key == "method":

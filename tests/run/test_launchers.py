@@ -36,7 +36,7 @@ NO_FOLDER = "terminate"
 HOWS = ("not", "kill", "loop", NO_FOLDER)
 MORE = ("raise", "not_a_number", "leave", "segfault", "native_loop")  # under the basic launcher, which costs least
 # A limit of its own for each: a short one for work that never ends, a generous one for work that ends at once.
-LIMITS = {how: 3 if CASES[how][1] == "timeout" else PATIENCE for how in CASES} | {"not": PATIENCE}
+LIMITS = {how: 1 if CASES[how][1] == "timeout" else PATIENCE for how in CASES} | {"not": PATIENCE}
 LIMITED = (
     f"+renderer.limits={{{','.join(f'{how}:{seconds}' for how, seconds in LIMITS.items())}}}",
     "time_limit='${renderer.limits.${oc.select:renderer.how,not}}'",  # a sweep is planned from what has no `how` yet
@@ -127,7 +127,7 @@ def test_a_limit_holds_for_a_cell_and_no_other(swept):
     for record in read_records(swept.results)[0]:
         limited = record["status"] == "timeout"
         assert limited is (LIMITS[record["config"]["renderer"]["how"]] < PATIENCE)
-        assert not limited or "more than time_limit=3 s" in record["reason"]
+        assert not limited or "more than time_limit=1 s" in record["reason"]
 
 
 def test_a_sweep_prints_a_line_for_each_cell_and_its_folder_last(swept):
