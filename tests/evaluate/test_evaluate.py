@@ -9,6 +9,7 @@ import trimesh
 
 from bench.config import EvaluationSettings, load
 from bench.evaluate.evaluate import DEFINITIONS, evaluate, render_view
+from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
 from datasets.mesh import Mesh
@@ -39,6 +40,7 @@ def inputs(tmp_path_factory) -> RunInputs:
         seed=0,
         device=torch.device("cpu"),
         cache=tmp_path_factory.mktemp("cache"),
+        field=FieldChoice("prior", None),
     )
 
 
