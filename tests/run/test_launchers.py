@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -29,6 +30,7 @@ LAUNCHERS = {
     "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ("hydra.launcher.timeout_min=5",)),
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", ()),
 }
+LAUNCHED = ("basic", "workers", "submitit_local", "ray_cluster")  # joblib is in `workers`
 PINNED = ("workers", "ray_cluster")  # our presets pin the threads of their runs
 LOGGED = ("submitit_local", "ray_cluster")  # their runs print to logs of their own
 # The cells of a sweep under every launcher; `terminate` stands for a cell whose run folder cannot be made.
@@ -67,11 +69,14 @@ def need(launcher: str) -> None:
         pytest.skip(f"the plugin of {launcher} is not installed: pip install -e '.[joblib,submitit,ray]'")
 
 
-def sweep(results: Path, *arguments: str) -> Outcome:
-    """A sweep by a driver that is a program of its own."""
-    program = [sys.executable, "-m", "bench", "-m", *FAILING, *arguments, f"results_dir={results}"]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=4 * PATIENCE, check=False)
-    return Outcome(done.returncode, done.stdout, done.stderr)
+def started_program(arguments: tuple[str, ...]) -> subprocess.Popen:
+    """A command line in a program of its own."""
+    program = [sys.executable, "-m", "bench", *arguments]
+    return subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def hows_of(launcher: str) -> tuple[str, ...]:
+    return (*HOWS, *(MORE if launcher == "basic" else ()))
 
 
 def plan_of(results: Path) -> dict:
@@ -91,24 +96,52 @@ def folder_of(results: Path, *arguments: str) -> Path:
     return results / "runs" / identify(config, runtime).name
 
 
-@pytest.fixture(scope="module", params=[name for name in LAUNCHERS if name != "joblib"])  # it is in `workers`
-def swept(request, tmp_path_factory) -> Swept:
+@dataclass(frozen=True)
+class Started:
+    """A sweep by a program of its own, or, without one, what it is to sweep over."""
+
+    results: Path
+    arguments: tuple[str, ...]
+    program: subprocess.Popen | None
+
+    def ended(self) -> Outcome:
+        """What the sweep left; without a program it takes place now, in this process."""
+        if self.program is None:
+            return command(*self.arguments)
+        out, err = self.program.communicate(timeout=4 * PATIENCE)
+        return Outcome(self.program.returncode, out, err)
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory) -> Iterator[dict[str, Started]]:
+    """One sweep under each launcher, all at once, since they mostly wait."""
+    sweeps = {}
+    for launcher in LAUNCHED:
+        if not available(launcher):
+            continue
+        results = tmp_path_factory.mktemp(launcher)
+        arguments = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1], *LIMITED, "threads=null")
+        blocked = folder_of(results, *FAILING, *arguments, f"+renderer.how={NO_FOLDER}")
+        blocked.parent.mkdir()
+        blocked.symlink_to(results / "nowhere")
+        arguments = (*arguments, f"+renderer.how={','.join(hows_of(launcher))}")
+        arguments = ("-m", *FAILING, *arguments, f"results_dir={results}")
+        sweeps[launcher] = Started(results, arguments, None if launcher == "basic" else started_program(arguments))
+    yield sweeps
+    for sweep in sweeps.values():
+        if sweep.program is not None:
+            sweep.program.kill()
+            sweep.program.wait()
+
+
+@pytest.fixture(scope="module", params=LAUNCHED)
+def swept(request, started) -> Swept:
     """One sweep under each launcher: a run that ends by itself, one killed, one that hangs, one without a folder."""
     launcher = request.param
     need(launcher)
-    results = tmp_path_factory.mktemp(launcher)
-    hows = (*HOWS, *(MORE if launcher == "basic" else ()))
-    arguments = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1], *LIMITED, "threads=null")
-    blocked = folder_of(results, *FAILING, *arguments, f"+renderer.how={NO_FOLDER}")
-    blocked.parent.mkdir()
-    blocked.symlink_to(results / "nowhere")
-    arguments = (*arguments, f"+renderer.how={','.join(hows)}")
-    if launcher == "basic":
-        outcome = command("-m", *FAILING, *arguments, f"results_dir={results}")
-    else:
-        outcome = sweep(results, *arguments)
+    outcome = started[launcher].ended()
     assert outcome.code == 1, outcome.err
-    return Swept(launcher, hows, results, outcome)
+    return Swept(launcher, hows_of(launcher), started[launcher].results, outcome)
 
 
 def test_every_planned_cell_is_a_row_whatever_becomes_of_it(swept):
@@ -163,7 +196,8 @@ def test_where_a_run_folder_cannot_be_made_it_says_what_to_do(swept):
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
     need(launcher)
-    sweep(tmp_path, f"hydra/launcher={launcher}", f"+renderer.how={','.join(CASES)}", *LIMITED, "memory_limit=1.5")
+    cells = (f"hydra/launcher={launcher}", f"+renderer.how={','.join(CASES)}", *LIMITED, "memory_limit=1.5")
+    started_program(("-m", *FAILING, *cells, f"results_dir={tmp_path}")).communicate(timeout=4 * PATIENCE)
     records, problems = read_records(tmp_path)
     assert problems == []
     found = {record["config"]["renderer"]["how"]: record["status"] for record in records}
