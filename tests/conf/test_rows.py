@@ -73,7 +73,7 @@ def rows(plan: sweep.Plan) -> list[str]:
 def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_renderers(
     swept, tmp_path, package, experiment, ours
 ):
-    few = ["stress=thin_plate"] if experiment == "stability" else []
+    few = {"stability": ["stress=thin_plate"], "table1": []}.get(experiment, ["dataset=sofa", "index=0"])
     plan, _ = swept(f"+experiment={experiment}", *few, f"packages=[{package}]", folder=tmp_path / "conf")
     first = ["mine_first"] if experiment == "table1" else []
     found = rows(plan)

@@ -35,8 +35,15 @@ PINNED = ("workers", "ray_cluster")  # our presets pin the threads of their runs
 LOGGED = ("submitit_local", "ray_cluster")  # their runs print to logs of their own
 # The cells of a sweep under every launcher; `terminate` stands for a cell whose run folder cannot be made.
 NO_FOLDER = "terminate"
-HOWS = ("not", "kill", "loop", NO_FOLDER)
-MORE = ("raise", "not_a_number", "leave", "segfault", "native_loop")  # under the basic launcher, which costs least
+HOWS = ("not", "loop", NO_FOLDER)
+MORE = (
+    "kill",
+    "raise",
+    "not_a_number",
+    "leave",
+    "segfault",
+    "native_loop",
+)  # under the basic launcher, which costs least
 # A limit of its own for each: a short one for work that never ends, a generous one for work that ends at once.
 LIMITS = {how: 1 if CASES[how][1] == "timeout" else PATIENCE for how in CASES} | {"not": PATIENCE}
 LIMITED = (

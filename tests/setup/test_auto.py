@@ -104,13 +104,13 @@ def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name
 @pytest.mark.parametrize("family", FAMILIES)
 def test_epsilon_auto_holds_on_the_families(family):
     shape = load("dataset", family).formula(Split.VALIDATION, 0)
-    exact, _ = hits("idr", shape, 96, steps=300)
-    found, _ = hits("dist", shape, 96, epsilon=epsilon(replace(VIEW, resolution=96), OmegaConf.create({}), TEN))
-    own, _ = hits("dist", shape, 96)
+    exact, _ = hits("idr", shape, 64, steps=300)
+    found, _ = hits("dist", shape, 64, epsilon=epsilon(replace(VIEW, resolution=64), OmegaConf.create({}), TEN))
+    own, _ = hits("dist", shape, 64)
     assert int((own & ~found).sum()) == 0
     assert int((found & ~exact).sum()) <= 0.01 * int(exact.sum())
     half_a_pixel, _ = hits(
-        "dist", shape, 96, epsilon=footprint(replace(VIEW, resolution=96).focal_length, VIEW.distance)
+        "dist", shape, 64, epsilon=footprint(replace(VIEW, resolution=64).focal_length, VIEW.distance)
     )
     assert int((half_a_pixel & ~exact).sum()) > 0.01 * int(exact.sum())  # why it is no more than that
 
