@@ -307,8 +307,14 @@ def _with_defaults(path: Path) -> DictConfig:
 def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | list[str]) -> Any:
     """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
     types = get_type_hints(cls)
+    protocols = [key for key in arguments if getattr(types[key], "_is_protocol", False)]
+    for key in protocols:
+        if not OmegaConf.is_dict(arguments[key]):
+            raise ValueError(
+                f"{name}.{key} must have a _target_, not be {arguments[key]!r}: choose a file of its group"
+            )
     nested = {key: _node_class(types[key]) for key, value in arguments.items() if OmegaConf.is_dict(value)}
-    nested = {key: found for key, found in nested.items() if found or "_target_" in arguments[key]}
+    nested = {key: found for key, found in nested.items() if found or key in protocols}
     given = {key: value for key, value in arguments.items() if key not in nested}
     schema = OmegaConf.structured(make_dataclass(cls.__name__, [(key, types[key]) for key in given]))
     try:

@@ -56,9 +56,18 @@ def silhouette_loss(
     if loss.shape != () or not loss.is_floating_point():
         found = f"{_short(loss.dtype)} of shape {list(loss.shape)}"
         raise BrokenContract(f"{name} must return one floating-point number of shape [], not {found}: take its mean")
-    if (lacked := _lacked(renderer, field, rays, loss)) and bool(loss != 0):
-        raise _no_gradient(renderer, lacked, "its silhouette loss carries")
+    check_loss_gradient(renderer, field, rays, loss, "its silhouette loss carries")
     return loss
+
+
+def check_loss_gradient(renderer: Renderer, field: Field, rays: Rays, loss: Float[Tensor, ""], what: str) -> None:
+    """Raises BrokenContract where a loss that is not 0 lacks a gradient that the renderer claims and that is wanted.
+
+    Args:
+        what: the output that the loss is made of, for the message: "its closest values carry".
+    """
+    if (lacked := _lacked(renderer, field, rays, loss)) and bool(loss != 0):
+        raise _no_gradient(renderer, lacked, what)
 
 
 def check_gradients(renderer: Renderer, towards_field: Tensor | None, towards_rays: Tensor | None) -> None:

@@ -1,7 +1,8 @@
 """Silhouette losses: of each paper one, for the rendering of any renderer, so that renderers can be compared under one.
 
-`Own` is the renderer's own. The other three weigh a rendering by what every renderer gives: `hit`, `distance` and
-`closest`.
+`Own` is the renderer's own. The other three are made of what every renderer gives: `hit`, `distance` and `closest`.
+Their gradient is that of the renderer's `closest`: on a hit, that of `naive` follows the surface, so that its spurious
+hits are hardly pushed away.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, occupancy_logits
 from renderers.rendering import Renderer, Rendering
+
+CLOSEST = "its closest field values carry"  # what a loss is made of, in the message where they carry no gradient
 
 
 @runtime_checkable
@@ -73,8 +76,11 @@ class Hinge:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`."""
-        return self.of(rendering.closest, mask)
+        """See `SilhouetteLoss`; a hit on the foreground is right, whatever the renderer's own threshold."""
+        right = mask & rendering.hit
+        loss = self.of(torch.where(right, 0.0, rendering.closest), mask)
+        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
+        return loss
 
     def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
         """The loss of the field's values of least magnitude on each ray, with their sign."""
@@ -104,7 +110,9 @@ class CrossEntropy:
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        return self.of(rendering, mask)
+        loss = self.of(rendering, mask)
+        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
+        return loss
 
     def of(self, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
         """The loss of a rendering."""

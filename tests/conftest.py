@@ -86,7 +86,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leaves what imports made, which stays to the end, out of all further searches for garbage."""
+    """Freezes what imports made, so that the garbage collector skips it."""
     gc.collect()
     gc.freeze()
 
@@ -101,10 +101,10 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def asked_once() -> Iterator[None]:
-    """What all runs in this process would find out anew is found out once; runs in processes of their own do ask.
+    """Caches, for runs in this process, what each run would find out anew; runs in processes of their own do ask.
 
-    This is what git says, the machine's matrix product rate, and `hydra.mode`, for which Hydra composes the
-    configuration of a command once more; a test in conf sees that no configuration sets it.
+    These are what git says, the machine's matrix product rate, and `hydra.mode`, for which Hydra composes the
+    configuration of a command once more; a test in conf checks that no configuration sets it.
     """
     import torch
     from hydra._internal.hydra import Hydra

@@ -20,7 +20,7 @@ class Failing:
     Args:
         how: it fails, one of FAILURES.
         pause: seconds before each rendering.
-        limits: not its own: seconds for each way to fail, for the `time_limit` of a sweep over `how` to refer to.
+        limits: unused here: seconds for each way to fail, to which the `time_limit` of a sweep over `how` refers.
     """
 
     capabilities = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)

@@ -119,6 +119,9 @@ def main() -> int:
     word = os.environ.get("ONLY", "")
     chosen = [mutant for mutant in MUTANTS if word in f"{mutant.file} {mutant.old}"]
     survivors = []
+    for tests in dict.fromkeys(mutant.tests for mutant in chosen):
+        if is_found(None, tests):
+            raise RuntimeError(f"{tests} fail without any mistake: mend them first")
     with ThreadPoolExecutor(WORKERS) as pool:
         for mutant, found in zip(chosen, pool.map(is_found, chosen), strict=True):
             print("found   " if found else "SURVIVES", f"{mutant.file}: {mutant.old} -> {mutant.new}", flush=True)
@@ -127,16 +130,17 @@ def main() -> int:
     return bool(survivors)
 
 
-def is_found(mutant: Mutant) -> bool:
-    """Whether the tests fail on a copy of the project with the mistake."""
+def is_found(mutant: Mutant | None, tests: str = "") -> bool:
+    """Whether the tests of a mistake fail on a copy of the project with it; without one, whether `tests` do."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         for name in subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True).split("\0")[:-1]:
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             copy2(ROOT / name, copy / name)
-        planted = planted_in(copy / mutant.file, mutant)
-        (copy / mutant.file).write_text(planted)
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *mutant.tests.split()]
+        if mutant is not None:
+            tests = mutant.tests
+            (copy / mutant.file).write_text(planted_in(copy / mutant.file, mutant))
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests.split()]
         environment = os.environ | {"PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
         if done.returncode not in (0, 1):  # 1: a test failed; others: pytest could not run them

@@ -24,6 +24,7 @@ from renderers.fields.analytic import Shape, sphere
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
 REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
+OF_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
 DEPTH_CAP = 0.1  # scene units
 IMAGE = {
     "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
@@ -50,7 +51,7 @@ DEFINITIONS: dict[str, str] = {
     "normal_consistency": "Mean absolute cosine between the normal at each sampled point and the normal at"
     " the nearest point sampled on the other surface, averaged over both directions (Occupancy Networks),"
     " from 0 to 1.",
-    **{name: f"{text} By exact first hits of the extracted mesh, for every renderer." for name, text in IMAGE.items()},
+    **{name: f"{text} {OF_MESH}" for name, text in IMAGE.items()},
     **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE.items()},
 }
 

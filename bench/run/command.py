@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, check_names, nearest, register, renamed
-from bench.run.process import catch_signals, stopped_by
+from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
@@ -40,6 +40,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         try:
             check_names(config)
             job(config)
+            raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
             raised.append(error)
 
@@ -68,6 +69,8 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         if begun:
             raise
         return _tell(f"cannot compose {' '.join(sys.argv[1:])!r}: {what}", USAGE)  # Hydra, at a value of an odd type
+    finally:
+        forget_signals()
     return 0
 
 
@@ -81,6 +84,7 @@ def _call(program: Callable[[], None]) -> None:
     """Calls it; where a sweep was refused, raises why, and KeyboardInterrupt also where that became another error."""
     try:
         program()
+        raise_if_stopped()  # also where a library swallowed it
     except (Refused, Exception) as error:
         if stopped := stopped_by(error):
             raise KeyboardInterrupt(stopped) from error

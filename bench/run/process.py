@@ -243,14 +243,21 @@ def stopped_by(error: BaseException) -> str:
 
 @contextmanager
 def signals_delayed() -> Iterator[None]:
-    """Signals that arrive in the block raise KeyboardInterrupt at its end."""
+    """The first signal that arrives in the block raises KeyboardInterrupt at its end."""
     global _delayed
-    _delayed = True
+    before, _delayed = _stopped, True
     try:
         yield
     finally:
         _delayed = False
-    raise_if_stopped()
+    if not before:
+        raise_if_stopped()
+
+
+def forget_signals() -> None:
+    """Forgets the signals of a command that has ended, for the next one in this process."""
+    global _stopped
+    _stopped = ""
 
 
 def raise_if_stopped() -> None:

@@ -16,7 +16,7 @@ from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, identify, release
 from bench.records.record import Record, RunStatus, now, read_record
 from bench.run.command import unwritten
-from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, stopped_by
+from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
 
@@ -110,12 +110,13 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
         if stopped:
             record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:
-        record.seconds["total"] = time.perf_counter() - started
-        record.ended = now()
-        if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
-            record.log = _last_lines(folder / "log.txt")
-        release(folder)
-        record.write(folder)
+        with signals_delayed():  # one that comes now must not lose the record
+            record.seconds["total"] = time.perf_counter() - started
+            record.ended = now()
+            if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
+                record.log = _last_lines(folder / "log.txt")
+            release(folder)
+            record.write(folder)
     if tracker is not None and not isinstance(tracker, Nothing):
         _export(tracker, folder, record)
     if stopped:

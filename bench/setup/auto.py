@@ -79,7 +79,7 @@ def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> in
     if "epsilon" not in renderer:
         raise ValueError("renderer.steps=auto needs renderer.epsilon, which this renderer does not have: give a number")
     alpha, epsilon = float(renderer.get("alpha", 1.0)), float(renderer.epsilon)
-    check_positive("renderer.epsilon", epsilon, "renderer.epsilon=auto is half a pixel")
+    check_positive("renderer.epsilon", epsilon, "renderer.epsilon=auto is a pixel's precision")
     left = max(abs(1 - alpha * sin(radians(settings.grazing))), alpha - 1)
     if left >= 1:
         raise ValueError(f"renderer.alpha must lie between 0 and 2, not {alpha:g}: steps of others do not converge")
@@ -113,7 +113,8 @@ FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
 }
 PIXEL_PRECISION = ("epsilon", "steps")  # that follow from the camera alone
 LIMITED = {  # what a value holds for
-    "epsilon": ", with at most {0.spurious:.0%} spurious hits around outlines (auto.spurious)",
+    "epsilon": ", with at most {0.spurious:.0%} spurious hits around outlines (auto.spurious) of true distances whose "
+    "area over perimeter is {0.area_over_perimeter:g} or more (auto.area_over_perimeter)",
     "steps": ", for surfaces met at {0.grazing:g} degrees or more (auto.grazing)",
 }
 CHANGING = {"n_ray_samples": ("begins with", "and follows the thinnest part that is seen")}  # during an optimisation

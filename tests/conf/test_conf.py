@@ -449,3 +449,8 @@ def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
         check_top_level(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "pose", "capacity", "stability", "gradients"):
         check_top_level(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
+
+
+def test_a_mask_loss_is_a_file_and_no_name(compose_config):
+    with pytest.raises(ValueError, match=r"task\.silhouette must have a _target_, not be 'hinge'"):
+        build(compose_config("task.silhouette=hinge").task, "task")

@@ -1,12 +1,16 @@
 """Silhouette losses: DIST's, Eq. 11, against values worked out by hand, and all of them with every renderer."""
 
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
 import pytest
 import torch
 
 from bench.config import CONF, load
+from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
-from renderers.rendering import Renderer
+from renderers.rendering import Capabilities, Renderer
 from renderers.silhouette import Hinge, SilhouetteLoss
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
@@ -131,3 +135,29 @@ def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
 def test_what_cannot_be_is_told(loss, values, message):
     with pytest.raises(ValueError, match=message):
         load("silhouette", loss, **values)
+
+
+def test_a_right_hit_costs_nothing_whatever_the_renderers_own_threshold():
+    """A hit within a threshold of .05 has a value far above the loss's; a missed ray must weigh no less for it."""
+    rough = load("renderer", "idr", epsilon=0.05)
+    assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3)[0] == 0
+
+
+@dataclass(frozen=True)
+class Detached:
+    """IDR, whose closest values carry no gradient, although it claims one."""
+
+    capabilities: ClassVar[Capabilities] = load("renderer", "idr").capabilities
+
+    def render(self, field, rays):
+        rendering = load("renderer", "idr").render(field, rays)
+        return replace(rendering, closest=rendering.closest.detach())
+
+    def silhouette_loss(self, field, rays, rendering, mask):
+        raise AssertionError("another loss was chosen")
+
+
+@pytest.mark.parametrize("loss", ["hinge", "cross_entropy"])
+def test_a_renderer_whose_closest_values_lack_the_gradient_that_it_claims_is_told(loss):
+    with pytest.raises(BrokenContract, match="its closest field values carry no gradient towards the field's param"):
+        of_sphere(Detached(), load("silhouette", loss), [True] * 4 + [False])

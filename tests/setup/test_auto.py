@@ -58,7 +58,8 @@ def test_epsilon_and_steps_are_resolved_in_order_with_notes():
     seen = "for 128 pixels from 2.5 away (view)"
     numbers = {"epsilon": f"{node.epsilon:.4g}", "steps": str(node.steps)}
     angle = {
-        "epsilon": ", with at most 1% spurious hits around outlines (auto.spurious)",
+        "epsilon": ", with at most 1% spurious hits around outlines (auto.spurious) of true distances whose area over "
+        "perimeter is 0.07 or more (auto.area_over_perimeter)",
         "steps": ", for surfaces met at 10 degrees or more (auto.grazing)",
     }
     assert notes == [f"renderer.{name}=auto is {number}, {seen}{angle[name]}" for name, number in numbers.items()]

@@ -46,8 +46,8 @@ PUBLISHED = {
     },
 }
 NOTES = (
-    "Dense depth implies the mask. “Paper's” is the setting of DIST, B.4 (the mean of the squared code from the "
-    "official code); README, “Paper-literal”, says what the other rows are.",
+    "Dense depth implies the mask. “Paper's as printed” is the setting of DIST, B.4 (the mean of the squared code from "
+    "the official code); conf/README.md, “The paper's setting, and the default”, says what the other rows are.",
     NOTE,
     "“Published” is DIST, Table 2: 200 shapes of ShapeNet, with another prior and camera, and another number of points "
     "per share, so it cannot be compared directly with the measured rows.",
