@@ -252,6 +252,15 @@ def test_a_sweep_that_is_stopped_says_what_it_came_to(tmp_path):
     assert (tmp_path / "index.html").is_file()
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C takes effect also where these tests are a shell's background job, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("error", [AttributeError("a list was half made"), None], ids=["replaced", "swallowed"])
 def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrupt(tmp_path, monkeypatch, error):
     def interrupted(text: str) -> None:
