@@ -115,7 +115,7 @@ class Started:
         """What the sweep left; without a program it takes place now, in this process."""
         if self.program is None:
             return command(*self.arguments)
-        out, err = self.program.communicate(timeout=4 * PATIENCE)
+        out, err = self.program.communicate(timeout=8 * PATIENCE)
         return Outcome(self.program.returncode, out, err)
 
 
@@ -204,7 +204,7 @@ def test_where_a_run_folder_cannot_be_made_it_says_what_to_do(swept):
 def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
     need(launcher)
     cells = (f"hydra/launcher={launcher}", f"+renderer.how={','.join(CASES)}", *LIMITED, "memory_limit=1.5")
-    started_program(("-m", *FAILING, *cells, f"results_dir={tmp_path}")).communicate(timeout=4 * PATIENCE)
+    started_program(("-m", *FAILING, *cells, f"results_dir={tmp_path}")).communicate(timeout=8 * PATIENCE)
     records, problems = read_records(tmp_path)
     assert problems == []
     found = {record["config"]["renderer"]["how"]: record["status"] for record in records}
