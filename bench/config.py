@@ -186,12 +186,15 @@ def register() -> None:
 
 
 def check_names(config: DictConfig) -> None:
-    """Raises ValueError for a key of the top level that there is not, which a plus on the command line would add."""
+    """Raises ValueError for a key of the top level that there is not, and for a choice that nothing reads."""
     names = [item.name for item in fields(Config)]
     for key in map(str, config):
         if key not in names:
             what = f"{key}/{config[key]}" if isinstance(config[key], str) else key
             raise ValueError(f"unknown key {key!r}{renamed(what) or nearest(key, names)}")
+    loss, task = config.get("silhouette") or {}, config.get("task") or {}
+    if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {*task, *task.get("fit", {})}:
+        raise ValueError("silhouette is read by task=completion, pose, capacity and stability alone: leave it out")
 
 
 def check_top_level(config: DictConfig) -> None:
@@ -208,16 +211,10 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
     if config.evaluation.film is not None and config.evaluation.picture is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
-    if not config.silhouette._target_.endswith(".Own") and not _reads_silhouette(config.task):
-        raise ValueError("silhouette is read by task=completion, pose, capacity and stability alone: leave it out")
     for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
         if isinstance(value, int) and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
-
-
-def _reads_silhouette(task: DictConfig) -> bool:
-    return "silhouette" in task or "silhouette" in task.get("fit", {})
 
 
 def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (), target: str = "") -> Any:
@@ -311,7 +308,7 @@ def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | li
     for key in protocols:
         if not OmegaConf.is_dict(arguments[key]):
             raise ValueError(
-                f"{name}.{key} must have a _target_, not be {arguments[key]!r}: choose a file of its group"
+                f"{name}.{key} must have a _target_, not be {arguments[key]!r}: write {key}=NAME, without {name}"
             )
     nested = {key: _node_class(types[key]) for key, value in arguments.items() if OmegaConf.is_dict(value)}
     nested = {key: found for key, found in nested.items() if found or key in protocols}

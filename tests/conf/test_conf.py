@@ -10,7 +10,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, check_top_level, load, register, renamed
+from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, check_names, load, register, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
@@ -446,9 +446,9 @@ def test_a_target_outside_our_packages_needs_leave(compose_config):
 
 def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
     with pytest.raises(ValueError, match="silhouette is read by task=completion, pose, capacity and stability alone"):
-        check_top_level(compose_config("task=gradients", "silhouette=hinge"))
+        check_names(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "pose", "capacity", "stability", "gradients"):
-        check_top_level(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
+        check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
 
 
 def test_a_mask_loss_is_a_file_and_no_name(compose_config):

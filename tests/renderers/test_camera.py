@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from renderers.camera import Camera, Rays, distance_to_origin, sphere_span
+from renderers.camera import Camera, Rays, distance_to_origin, rigid, sphere_span
 from tests.renderers.analytic_cases import vector
 
 INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.float64)
@@ -344,3 +344,13 @@ def moving() -> Camera:
     motion[:3, :3] = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
     motion[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
     return Camera(intrinsics, motion, height=5, width=4)
+
+
+def test_a_moved_object_is_seen_as_by_the_camera_that_stays():
+    """Seen by `with_object_moved`, an unmoved point lies where the old camera sees the moved one, also off the axis."""
+    twist = torch.tensor([0.1, -0.2, 0.05, 0.3, 0.2, -0.4], dtype=torch.float64)
+    old = camera(motion(0.4, (0.1, 0.2, 3.0))).double()
+    point = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+    moved = rigid(twist) @ torch.cat([point, torch.ones(1, dtype=torch.float64)])
+    for seen, expected in zip(old.with_object_moved(twist).project(point), old.project(moved[:3]), strict=True):
+        torch.testing.assert_close(seen, expected)

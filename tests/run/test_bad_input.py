@@ -112,6 +112,14 @@ def test_a_command_line_that_cannot_be_is_told_with_the_nearest_name(bench, tmp_
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize("multirun", [[], ["-m"]])
+def test_a_mask_loss_that_no_task_reads_is_told_before_any_run(bench, tmp_path, multirun):
+    code, _, err = bench(*multirun, "task=gradients", "silhouette=hinge,own" if multirun else "silhouette=hinge")
+    assert code == 2
+    assert_one_line(err, "error: silhouette is read by task=completion")
+    assert not (tmp_path / "r" / "runs").exists()
+
+
 @pytest.mark.parametrize(
     ("argument", "words"),
     [

@@ -136,6 +136,10 @@ def test_a_parameter_that_is_no_number_ends_the_loop():
     assert len(history.curve) == 1
 
 
+def test_a_hundredfold_loss_has_diverged():
+    assert DIVERGED == 100  # as bench/README.md says
+
+
 @pytest.mark.parametrize(("factor", "diverges"), [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
 def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
     history = go(Toy(spoil={3: factor}), 5, rate=1e-4)
