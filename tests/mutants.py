@@ -67,7 +67,7 @@ MUTANTS = (
     M("renderers/silhouette.py", "meets & ~(wanted & hit)", "meets", "tests/renderers"),
     M("bench/solve/observed_view.py", "self.settings.silhouette_weight * silhouette", "silhouette",
       "tests/tasks/test_completion.py"),
-    M("bench/solve/observed_view.py", "error = error / self.depth_of_distance", "pass",
+    M("bench/solve/observed_view.py", "error / at_one if loss == POINTS", "error if loss == POINTS",
       "tests/tasks/test_completion.py"),
     M("bench/solve/latent_code.py", 'squares.sum() if self.average == "sum" else squares.mean()', "squares.sum()",
       "tests/tasks/test_completion.py tests/solve"),

@@ -34,6 +34,9 @@ IMAGE = {
     "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
     " in at least one, from 0 to 1; two empty masks give 1.",
 }
+OWN_DEFINITIONS = {
+    OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE.items()
+}
 DEFINITIONS: dict[str, str] = {
     "chamfer_l2": "Sum of the mean squared distance from each point sampled on the prediction to the nearest"
     " point sampled on the truth and the same from truth to prediction (DIST), in squared scene units.",
@@ -52,7 +55,7 @@ DEFINITIONS: dict[str, str] = {
     " the nearest point sampled on the other surface, averaged over both directions (Occupancy Networks),"
     " from 0 to 1.",
     **{name: f"{text} {OF_MESH}" for name, text in IMAGE.items()},
-    **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE.items()},
+    **OWN_DEFINITIONS,
 }
 
 # The score of a run without a surface: the worst.

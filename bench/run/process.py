@@ -220,8 +220,6 @@ def machine_memory() -> int:
 
 def catch_signals() -> None:
     """From now on Ctrl-C and SIGTERM raise KeyboardInterrupt, which says which of them it was."""
-    global _stopped
-    _stopped = ""
     signal.signal(signal.SIGTERM, _stop)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background jobs ignore it
         signal.signal(signal.SIGINT, _stop)

@@ -19,6 +19,14 @@ DEPTH, POINTS = "depth", "points"  # what a depth loss takes the mean of; see `b
 DEPTH_LOSSES = (DEPTH, POINTS)
 
 
+def depth_error(
+    loss: str, found: Float[Tensor, "*rays"], given: Float[Tensor, "*rays"], at_one: Float[Tensor, "*rays"]
+) -> Float[Tensor, "*rays"]:
+    """The error of each ray's depth or of its point, as `loss` says; `at_one` is the depth at distance 1."""
+    error = (found - given).abs()
+    return error / at_one if loss == POINTS else error
+
+
 @runtime_checkable
 class Weights(Protocol):
     """The terms of a view's loss and their weights."""
@@ -79,9 +87,8 @@ class GivenView:
         renderer = at_iteration(self.renderer, iteration)
         rendering = rendered(renderer, field, self.rays)
         compared = self.observed & rendering.hit
-        error = (rendering.distance * self.depth_of_distance - self.depth).abs()
-        if self.settings.depth_loss == POINTS:
-            error = error / self.depth_of_distance
+        found = rendering.distance * self.depth_of_distance
+        error = depth_error(self.settings.depth_loss, found, self.depth, self.depth_of_distance)
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
         if self.mask is not None:
             silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, self.mask)

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import IMAGE, OWN, Evaluation, render_view, view_metrics
+from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
 from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import DEPTH_LOSSES, POINTS
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.solve.solve import solve
@@ -38,7 +38,6 @@ DEFINITIONS = {
 TRACKED = tuple(DEFINITIONS)
 SEEN = "By exact first hits of the known mesh, the same for every method."
 SEEN_DEFINITIONS = DEFINITIONS | {name: f"{text} {SEEN}" for name, text in IMAGE.items()}
-OWN_DEFINITIONS = {OWN + name: f"{text} Of the image that the renderer renders." for name, text in IMAGE.items()}
 
 
 @dataclass(frozen=True)
@@ -250,9 +249,8 @@ class PoseProblem:
         rendering = rendered(renderer, metered, rays)
         compared = self.mask & rendering.hit
         count = compared.sum().clamp_min(1)
-        error = (camera.depth(rendering.distance) - self.depth).abs()
-        if self.settings.depth_loss == POINTS:
-            error = error / camera.depth(torch.ones_like(self.depth))
+        found, at_one = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
+        error = depth_error(self.settings.depth_loss, found, self.depth, at_one)
         silhouette = self.settings.silhouette(renderer, metered, rays, rendering, self.mask)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
