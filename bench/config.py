@@ -4,6 +4,9 @@ A file of the group `renderer` may have two keys that are no arguments: `_rows_`
 renderer's row in its table, and `_label_` names the row. A file without `_rows_` has a row in every such experiment,
 after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`. The files are those of conf/renderer and of
 the user's `--config-dir`.
+
+A file of `conf/method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
+that dimension, of the Sobol point whose number is `draw`.
 """
 
 import dataclasses
@@ -13,10 +16,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from difflib import get_close_matches
 from enum import StrEnum
+from functools import cache
 from math import inf
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
+import numpy as np
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -28,6 +33,7 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 LEAST = {
     "seed": 0,
     "index": 0,
+    "draw": 0,
     "threads": 1,
     "evaluation.grid": 8,
     "evaluation.points": 1,
@@ -39,6 +45,7 @@ SELF = "_self_"  # of a list of defaults: the file itself
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
 RESERVED = ("_target_", "_package_", LABEL, ROWS)  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
+DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from; more than spaces need
 MANY = 20  # names, beyond which a message leaves variants out
 KEY = re.compile(r"\w+(\.\w+)+")  # a dotted key and nothing else
 STRATEGIES = {  # of the group `strategy`, whose files are files of `renderer` now
@@ -164,6 +171,7 @@ class Config:
     seed: int = MISSING
     label: str | None = MISSING
     experiment: str | None = MISSING
+    draw: int | None = MISSING
     sizes: Any = MISSING
     device: Device = MISSING
     threads: int | None = MISSING
@@ -181,6 +189,7 @@ def register() -> None:
     """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
     ConfigStore.instance().store(name="schema", node=Config)
     OmegaConf.register_new_resolver("rows", _rows, replace=True)
+    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
     OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
 
@@ -356,6 +365,31 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
     if runtime.choices.get("method") is not None:  # a method sets its renderer
         return runtime.choices["renderer"]
     return ",".join(renderers_of(experiment, runtime))
+
+
+def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
+    """The value of draw `_root_.draw` in a range, even in its logarithm, to three digits; a whole number for whole ends.
+
+    Raises:
+        ValueError: without a draw, beyond the last one, or for a range or dimension that there is not.
+    """
+    draw = _root_.draw
+    if draw is None or not 0 <= draw < DRAWS:
+        raise ValueError(f"a method of method/space needs draw=0 to draw={DRAWS - 1}, found {draw}")
+    if not (0 < least < most and 0 <= dimension < DIMENSIONS):
+        raise ValueError(
+            f"${{drawn:{dimension},{least},{most}}} must have a dimension from 0 to {DIMENSIONS - 1} and ends above 0"
+        )
+    value = least * (most / least) ** float(sobol_points()[draw, dimension])
+    return round(value) if isinstance(least, int) and isinstance(most, int) else float(f"{value:.3g}")
+
+
+@cache
+def sobol_points() -> np.ndarray:
+    """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
+    from scipy.stats import qmc  # only here: it takes a second
+
+    return qmc.Sobol(DIMENSIONS, scramble=True, rng=0).random(DRAWS)
 
 
 def _renderers(runtime: DictConfig) -> dict[str, Path]:

@@ -54,7 +54,8 @@ class Identity:
     @property
     def name(self) -> str:
         """Name of the run's folder."""
-        return "-".join([*filter(None, self.choices.values()), self.config_hash])
+        named = [choice.replace("/", "_") for choice in self.choices.values() if choice]  # of files in a nested folder
+        return "-".join([*named, self.config_hash])
 
     @cached_property
     def code(self) -> str:
