@@ -368,7 +368,7 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
 
 
 def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
-    """The value of draw `_root_.draw` in a range, even in its logarithm, to three digits; a whole number for whole ends.
+    """The value of draw `_root_.draw` in a range, even in its logarithm; a whole number for whole ends, else 3 digits.
 
     Raises:
         ValueError: without a draw, beyond the last one, or for a range or dimension that there is not.

@@ -79,6 +79,7 @@ KNOWN = {
     "dist_official": _OFFICIAL_DIST,
     "dvr": _DVR,
     "dvr_64": _DVR,
+    "dvr_64_early_stop": _DVR,
     "dvr_official_slope": Look("#e7a1ab", "^", "--"),
     "idr": _IDR,
     "deepsdf": Look("#009e73", "P", "-."),

@@ -133,7 +133,7 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ex
     same = _like_newest(found, lambda record: _shared(record, selection))
     if selection.varies:
         by_task = [[r for r in same if r["task"] == task] for task in selection.tasks]
-        same = [r for runs in by_task for r in _like_newest(runs, _seen)]
+        same = [r for runs in by_task for r in _like_newest(runs, lambda record: _seen(record, selection))]
         newest = {(row_of(r), r["task"]): r for r in sorted(same, key=requested)}
         same = [r for r in same if _variant(r, selection) == _variant(newest[row_of(r), r["task"]], selection)]
         same.sort(key=started)
@@ -161,14 +161,16 @@ def _like_newest(records: list[Record], part: Callable[[Record], Any]) -> list[R
 def _key(record: Record, selection: Selection) -> Hashable:
     """The key that identifies a run within its experiment."""
     key = (row_of(record), seed(record), index(record), str(sorted(_renderer(record).items())), record["task"])
+    key += (record["config"].get("split"),)
     cell = (str(setting(record["config"], "task", name)) for name in selection.cell)
     return (*key, family(record), *cell) if selection.varies else key
 
 
-def _seen(record: Record) -> tuple[Any, Any]:
-    """The split and the camera, without its resolution, which is a setting of a row."""
+def _seen(record: Record, selection: Selection) -> tuple[Any, Any]:
+    """The split, unless it varies, and the camera, without its resolution, which is a setting of a row."""
     view = record["config"].get("view") or {}
-    return record["config"].get("split"), {key: value for key, value in view.items() if key != "resolution"}
+    split = None if "split" in selection.varies else record["config"].get("split")
+    return split, {key: value for key, value in view.items() if key != "resolution"}
 
 
 def _variant(record: Record, selection: Selection) -> Any:

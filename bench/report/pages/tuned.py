@@ -1,0 +1,71 @@
+"""Each method as it stands, tuned, and at its paper's setting, side by side."""
+
+from typing import Any
+
+from bench.report.data import statistics
+from bench.report.data.completions import ERROR, Completions, heading, shapes_per_cell
+from bench.report.data.crossing import geometric_mean
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import Row
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+
+PLACE = 37
+READS = (Selection("tuned", ("completion",), ("dataset", "task"), ("points",)),)
+SEED = 0  # of the bootstrap
+FOLDER = "tuned/"  # of the presets that `python -m bench.tune` writes
+PAPERS = ("_paper", "_official")  # ends of the names of presets with a paper's setting
+NOTES = (
+    "The ratio is that of geometric means over shapes, of each shape's geometric mean over all numbers of points, to "
+    "those of the same method as it stands; behind it on how many shapes the row is better, ties half.",
+    "Tuned rows: conf/method/tuned, chosen on validation shapes by `python -m bench.tune`; their first lines say from "
+    "which runs.",
+)
+RUNS = (
+    *(FAMILY, configured("points", "task", "points"), *IDENTITY),
+    *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"),
+    *LOOP,
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family and row: medians, and the ratio to the method as it stands."""
+    runs = Completions(experiment)
+    columns = [
+        *(text("family", "Family"), text("row", "Method")),
+        *(Column(points, heading(points)) for points in runs.points),
+        *(text("ratio", "Ratio to the default"), text("failed", "Failed")),
+    ]
+    return Result(
+        experiment,
+        "Methods as they stand, tuned, and at their papers' settings.",
+        "Median error of shapes over the number of given depth points.",
+        interval="95 % bootstrap intervals of the ratios over shapes and seeds",
+        remarks=(ERROR, shapes_per_cell(runs), *NOTES),
+        data=to_data(RUNS, experiment.records),
+        table=to_table(columns, [_line(runs, name, row) for name in runs.families for row in runs.rows_of(name)]),
+    )
+
+
+def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:
+    medians = {points: runs.median(name, row, points) for points in runs.points}
+    failed = "{} of {}".format(*runs.failures(name, row))
+    return {"family": name, "row": row.name, "ratio": _ratio(runs, name, row), "failed": failed, **medians}
+
+
+def _ratio(runs: Completions, name: str, row: Row) -> str:
+    """The row's errors over those of its method as it stands, and on how many shapes it is better; empty for itself."""
+    default = next((other for other in runs.rows if other.preset == default_of(row.preset)), row)
+    mine, other = runs.pair(name, row, default)
+    if default == row or not mine:
+        return ""
+    medians = [(statistics.median(a), statistics.median(b)) for a, b in zip(mine, other, strict=True)]
+    better = sum((a < b) + 0.5 * (a == b) for a, b in medians)
+    ratio = statistics.paired_bootstrap(mine, other, geometric_mean, seed=SEED)
+    return f"{ratio}; {better:g} of {len(mine)}"
+
+
+def default_of(preset: str) -> str:
+    """The preset of which another is the tuned or the paper's setting."""
+    name = preset.removeprefix(FOLDER)
+    return next((name.removesuffix(end) for end in PAPERS if name.endswith(end)), name)

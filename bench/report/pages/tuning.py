@@ -1,0 +1,118 @@
+"""What tuning is worth: the expected test error of the best of some draws, and what each setting changes."""
+
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.completions import ERROR
+from bench.report.data.crossing import geometric_mean
+from bench.report.data.experiments import Experiment
+from bench.report.data.tuning import TUNING, Tuned, tuned
+from bench.report.write import chart
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table, whole
+
+PLACE = 35
+PLACE_SETTINGS = 36
+READS = (TUNING,)
+SEED = 0  # of the bootstrap
+PLOTTED = "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken."
+NOTES = (
+    "Every method has the same number of Sobol draws from its own search space (conf/method/space), even in the "
+    "logarithm of each setting, and is judged on the same shapes; the draw with the smallest geometric mean of errors "
+    "on the validation shapes is taken. The expectation is over all choices of so many of the draws.",
+    "A run that did not end ok has the largest finite error of any draw of any method on its shape. Validation runs: "
+    "{validation} per draw; test runs: {test} per draw.",
+    "The interval is over test shapes; another set of draws would add to it.",
+)
+EFFECT_NOTES = (
+    "ρ is Spearman's rank correlation between the setting and the geometric mean of errors on the validation shapes, "
+    "over the draws: below 0 larger values are better. For 16 draws a |ρ| above 0.50 has p < 0.05 for one setting "
+    "alone.",
+)
+RUNS = (
+    *(FAMILY, configured("split", "split"), configured("draw", "draw"), *IDENTITY),
+    *metrics("chamfer_l2", "chamfer_l1", "mask_iou"),
+    *LOOP,
+)
+EFFECTS = (
+    *(text("method", "Method"), text("setting", "Setting")),
+    *(Column("least", "Least drawn"), Column("most", "Most drawn"), Column("chosen", "Chosen")),
+    *(Column("rho", "ρ"), Column("n", "Draws", show=whole)),
+)
+Curve = dict[int, statistics.Interval]  # by the number of draws
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per method: the expected test error at each budget."""
+    methods = tuned(experiment)
+    curves = {method.label: _curve(method) for method in methods}
+    budgets = sorted({k for curve in curves.values() for k in curve})
+    columns = [
+        text("method", "Method"),
+        *(Column(str(k), f"Best of {k}", words=lambda line, k=k: _words(line["curve"], k)) for k in budgets),
+        text("failed", "Failed"),
+    ]
+    lines = [{"method": method.label, "curve": curves[method.label], "failed": _failed(method)} for method in methods]
+    sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].runs)} if methods else {}
+    return Result(
+        experiment,
+        "What tuning is worth.",
+        PLOTTED,
+        interval="95 % bootstrap intervals over test shapes",
+        remarks=(ERROR, *(note.format(**sizes) for note in NOTES)) if methods else ("No draw has all of its runs.",),
+        data=to_data(RUNS, experiment.records),
+        table=to_table(columns, lines),
+        figure=draw(methods, curves),
+    )
+
+
+def _curve(method: Tuned) -> Curve:
+    return {k: statistics.bootstrap(method.expected(k), geometric_mean, seed=SEED) for k in method.budgets}
+
+
+def _words(curve: Curve, k: int) -> str:
+    return str(curve[k]) if k in curve else format.MISSING
+
+
+def _failed(method: Tuned) -> str:
+    return f"{sum(method.failures)} of {len(method.draws) * (method.validation.shape[1] + len(method.runs))}"
+
+
+@style.styled
+def draw(methods: list[Tuned], curves: dict[str, Curve]) -> Figure:
+    """Draws a line per method: the expected test error over the number of draws."""
+    figure, axes = chart.sheet(3.2, width=4.6)
+    axis = axes[0, 0]
+    for method in methods:
+        curve = curves[method.label]
+        low, middle, high = (style.finite(getattr(x, end) for x in curve.values()) for end in ("low", "value", "high"))
+        chart.line(axis, method.method, list(curve), middle, band=(low, high), label=method.label)
+    axis.set(
+        xlabel="drawn settings, of which the best on validation shapes is taken", ylabel="Chamfer × 1000 (scene units²)"
+    )
+    everything = [end for curve in curves.values() for x in curve.values() for end in (x.low, x.value, x.high)]
+    style.log_axis(axis, "y", everything)
+    ticks = sorted({k for curve in curves.values() for k in curve})
+    axis.set_xscale("log", base=2)
+    axis.set_xticks(ticks, [str(k) for k in ticks])
+    style.legend_below(figure, axis)
+    return figure
+
+
+def make_settings(experiment: Experiment) -> Result:
+    """Makes the page of the settings, with a line per method and setting: its range, choice and effect."""
+    lines: list[dict[str, Any]] = [
+        {"method": method.label} | effect for method in tuned(experiment) for effect in method.effects()
+    ]
+    return Result(
+        experiment,
+        "What each setting changes, and which was chosen.",
+        "Rank correlation of each drawn setting with the validation error, and its value in the chosen draw.",
+        remarks=EFFECT_NOTES,
+        data=to_data(EFFECTS, lines),
+        table=to_table(EFFECTS, lines),
+    )

@@ -1,0 +1,1 @@
+"""Writes the tuned settings of methods."""

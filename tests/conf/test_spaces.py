@@ -1,0 +1,96 @@
+"""Search spaces: every method of the tuning has one, and a draw is the same Sobol point for all of them."""
+
+from math import log
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import InterpolationResolutionError
+
+from bench.config import CONF, DIMENSIONS, DRAWS, build, register, sobol_points
+
+SPACES = sorted(path.stem for path in (CONF / "method" / "space").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def composed():
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield lambda *overrides: compose("config", [*overrides])
+
+
+def ranges(space: str) -> dict[str, tuple[int, float, float]]:
+    """The drawn keys of a space's file: dimension and ends."""
+    found = {}
+
+    def walk(node, prefix=""):
+        for key, value in node.items():
+            if isinstance(value, dict):
+                walk(value, f"{prefix}{key}.")
+            elif str(value).startswith("${drawn:"):
+                dimension, least, most = str(value)[len("${drawn:") : -1].split(",")
+                found[f"{prefix}{key}"] = (int(dimension), float(least), float(most))
+
+    walk(OmegaConf.to_container(OmegaConf.load(CONF / "method" / "space" / f"{space}.yaml"), resolve=False))
+    return found
+
+
+def test_the_points_fill_the_cube_evenly():
+    points = sobol_points()
+    assert points.shape == (DRAWS, DIMENSIONS)
+    for dimension in range(DIMENSIONS):  # a point in each sixteenth, also of the first sixteen alone
+        assert sorted((16 * points[:16, dimension]).astype(int)) == list(range(16))
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_a_space_has_its_own_dimension_for_each_setting_and_contains_the_default(space, composed):
+    known = ranges(space)
+    assert sorted(dimension for dimension, *_ in known.values()) == list(range(len(known)))
+    assert "task.optimiser.learning_rate" in known and "task.silhouette_weight" in known
+    default = composed(f"+method={space}")
+    for key, (_, least, most) in known.items():
+        assert least <= OmegaConf.select(default, key) <= most, key
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("draw", [0, 5, DRAWS - 1])
+def test_a_draw_is_its_sobol_point_even_in_the_logarithm(space, draw, composed):
+    config = composed(f"+method=space/{space}", f"draw={draw}")
+    for key, (dimension, least, most) in ranges(space).items():
+        value = OmegaConf.select(config, key)
+        share = log(value / least) / log(most / least)
+        rounded = 0.5 / value if isinstance(value, int) else 0.005  # the most by which rounding changes a logarithm
+        assert share == pytest.approx(sobol_points()[draw, dimension], abs=1.02 * rounded / log(most / least))
+    build(config.renderer, "renderer")
+    assert f"draw {draw}" in config.label
+
+
+def test_the_same_draw_is_the_same_share_of_each_range(composed):
+    shares = []
+    for space in SPACES:
+        config = composed(f"+method=space/{space}", "draw=3")
+        shares.append(config.task.optimiser.learning_rate)
+    assert len(set(shares)) == 1
+
+
+@pytest.mark.parametrize("draw", ["null", "64", "-1"])
+def test_a_space_needs_a_draw_that_there_is(draw, composed):
+    with pytest.raises((InterpolationResolutionError, HydraException), match="needs draw=0 to draw=63"):
+        OmegaConf.to_container(composed("+method=space/dist_mask", f"draw={draw}"), resolve=True)
+
+
+@pytest.mark.parametrize("bad", ["0,0.0,1.0", "0,2.0,1.0", "8,1.0,2.0"])
+def test_a_range_that_is_none_is_refused(bad):
+    register()
+    node = OmegaConf.create({"draw": 0, "x": f"${{drawn:{bad}}}"})
+    with pytest.raises(InterpolationResolutionError, match="must have a dimension from 0 to 7 and ends above 0"):
+        OmegaConf.to_container(node, resolve=True)
+
+
+def test_a_whole_range_gives_whole_numbers():
+    register()
+    values = [OmegaConf.create({"draw": draw, "x": "${drawn:3,15,60}"}).x for draw in range(16)]
+    assert all(isinstance(value, int) and 15 <= value <= 60 for value in values) and len({*values}) > 8
+    assert np.ptp(values) > 30

@@ -1,0 +1,125 @@
+"""The pages of the crossing, made from run folders whose errors are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data.crossing import CROSSING, Crossed
+from bench.report.data.experiments import choose
+from bench.report.pages import crossing
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+RENDERERS = {"dist": ("renderers.DIST", "DIST"), "idr": ("renderers.IDR", "IDR")}
+LOSSES = {"Hinge": "DIST's mask loss", "CrossEntropy": "IDR's mask loss"}
+# Errors factor in renderer, loss and both together, so that every number of the pages is known.
+RENDERER, LOSS, BOTH = {"dist": 1.0, "idr": 1.5}, {"Hinge": 1.0, "CrossEntropy": 3.0}, 1.0
+
+
+def crossed(results, *, both=BOTH, families=("sofa", "plane"), shapes=8, failed=()):
+    """Runs of all settings; the error of a shape is that of its setting times the shape's own."""
+    for name in families:
+        for index in range(shapes):
+            for points, (renderer, (target, label)), (loss, loss_label) in (
+                (p, r, x) for p in ("100", "20") for r in RENDERERS.items() for x in LOSSES.items()
+            ):
+                factor = both if (renderer, loss) == ("idr", "CrossEntropy") else 1.0
+                value = RENDERER[renderer] * LOSS[loss] * factor * (1 + index) * (2 if points == "20" else 1)
+                ok = (name, index, renderer, loss) not in failed
+                write_run(
+                    results,
+                    "crossing",
+                    None,
+                    **{"task": "completion", "dataset": name, "renderer": renderer, "method": ""},
+                    **{"status": "ok" if ok else "empty", "metrics": {"chamfer_l2": value / 1000} if ok else {}},
+                    evaluations={"value": 1000},
+                    settings={
+                        "task": {"points": points, "_target_": "completion"},
+                        "renderer": {"_target_": target, "_label_": label},
+                        "silhouette": {"_target_": f"renderers.silhouette.{loss}", "_label_": loss_label},
+                        "dataset": {"name": name},
+                        "index": index,
+                    },
+                )
+    return choose(read_records(results)[0], CROSSING, results)
+
+
+def line(result, **wanted):
+    """The only line of a page's data with these values."""
+    found = result.data
+    for key, value in wanted.items():
+        found = found[found[key] == value]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+def test_all_runs_are_one_experiment_with_a_cell_per_setting(tmp_path):
+    runs = Crossed(crossed(tmp_path, shapes=2))
+    assert (runs.families, runs.points) == (["sofa", "plane"], ["100", "20"])
+    assert (runs.renderers, runs.losses) == (["dist", "idr"], ["Hinge", "CrossEntropy"])
+    assert runs.own == {"dist": "Hinge", "idr": "CrossEntropy"}
+    assert runs.median("sofa", "100", "idr", "CrossEntropy") == pytest.approx(1.5 * 3 * 1.5)
+    assert runs.median("table", "100", "idr", "Hinge") is None
+    values = runs.over_points("idr", "Hinge")
+    assert len(values) == 4 and values[("sofa", 0), 0] == pytest.approx(1.5 * math.sqrt(2))
+
+
+def test_the_part_of_a_gap_that_is_the_loss(tmp_path):
+    result = crossing.make_gaps(crossed(tmp_path))
+    gap = line(result, family=crossing.EVERY)
+    assert gap["compared"] == "IDR over DIST" and gap["shapes"] == 16
+    assert gap["own"] == pytest.approx(4.5)  # the methods' gap: the renderer's 1.5 times the loss's 3
+    assert gap["Hinge"] == pytest.approx(1.5) and gap["CrossEntropy"] == pytest.approx(1.5)
+    assert gap["share"] == pytest.approx(1 - math.log(1.5) / math.log(4.5))
+    assert gap["own_better"] == 0
+    assert gap["own_low"] == pytest.approx(4.5) and gap["own_high"] == pytest.approx(4.5)  # the same on every shape
+    assert "explains 88 %, the renderer 12 %, and what only both together explain is 0 %" in told(result)
+
+
+def test_an_interaction_is_neither_the_renderers_nor_the_losses(tmp_path):
+    shares, count = Crossed(crossed(tmp_path, both=1 / 9)).shares()
+    # Means of logarithms: dist 0, log 3; idr log 1.5, log 1.5 - log 3: the two losses cancel.
+    assert count == 16 and shares["loss"] == pytest.approx(0, abs=1e-12)
+    renderer, both = (math.log(1.5) - math.log(3)) / 2, math.log(3) / 2
+    assert shares["renderer"] == pytest.approx(renderer**2 / (renderer**2 + both**2))
+    assert sum(shares.values()) == pytest.approx(1)
+
+
+def test_a_failure_is_infinite_and_leaves_its_shape_out_of_the_analysis(tmp_path):
+    runs = Crossed(experiment := crossed(tmp_path, families=("sofa",), failed={("sofa", 3, "idr", "Hinge")}))
+    assert runs.shares()[1] == 7
+    gap = line(crossing.make_gaps(experiment), family="sofa")
+    assert gap["Hinge"] == np.inf and gap["share"] is None
+    table = crossing.make(experiment).table
+    assert table[(table["Renderer"] == "IDR") & (table["Loss of the mask"] == LOSSES["Hinge"])]["Failed"].item() == (
+        "2 of 16"
+    )
+
+
+def test_losses_are_compared_with_each_renderer(tmp_path):
+    found = line(crossing.make_losses(crossed(tmp_path, both=2.0)), family="plane")
+    assert found["compared"] == "IDR's mask loss over DIST's mask loss"
+    assert (found["dist"], found["idr"]) == (pytest.approx(3), pytest.approx(6))
+    assert (found["dist_better"], found["shapes"]) == (0, 8)
+
+
+def test_a_renderer_without_a_known_loss_has_no_own_gap(tmp_path):
+    experiment = crossed(tmp_path, shapes=1, families=("sofa",))
+    for record in experiment.records:
+        if record["renderer"] == "idr":
+            record["config"]["renderer"]["_target_"] = "mine.Renderer"
+    gap = line(crossing.make_gaps(experiment), family="sofa")
+    assert gap["Hinge"] == pytest.approx(1.5)
+    assert gap["share"] is None and "own" not in gap.dropna()
+
+
+def test_the_figure_has_a_panel_per_family_and_number_of_points(tmp_path):
+    figure = crossing.make(crossed(tmp_path, shapes=2)).figure
+    assert [axis.get_title() for axis in figure.axes] == [
+        f"{name}, {points} pts" for points in (100, 20) for name in ("sofa", "plane")
+    ]
+    shown = figure.axes[0].lines
+    assert len(shown) == 2 * (2 + 1)  # of each renderer: its shapes under each loss, and its medians
+    medians = [y for drawn in shown for y in drawn.get_ydata() if drawn.get_label() == "IDR"]
+    assert medians == pytest.approx([1.5 * 1.5, 1.5 * 3 * 1.5])

@@ -1,0 +1,147 @@
+"""The tuning, from run folders whose errors are known: what the best of some draws is worth, and its file."""
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from bench.records.read import read_records
+from bench.report.data.experiments import choose
+from bench.report.data.tuning import TUNING, tuned
+from bench.report.pages import tuned as tuned_page
+from bench.report.pages import tuning
+from bench.tune.__main__ import main, write
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
+RATES = (0.04, 0.01, 0.03, 0.02)
+
+
+def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=()):
+    """Four draws of a method; the error of a shape is that of its draw."""
+    for split, errors in (("validation", VALIDATION), ("test", TEST)):
+        for draw, value in enumerate(errors):
+            for index in range(shapes):
+                ok = (split, draw, index) not in failed
+                if (split, draw, index) in left_out:
+                    continue
+                write_run(
+                    results,
+                    "tuning",
+                    f"DIST with mask, draw {draw}",
+                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": f"space/{method}"},
+                    **{"status": "ok" if ok else "empty", "metrics": {"chamfer_l2": value / 1000} if ok else {}},
+                    settings={
+                        **{"split": split, "draw": draw, "index": index, "dataset": {"name": "sofa"}},
+                        "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
+                        "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
+                    },
+                )
+
+
+def read(results):
+    return choose(read_records(results)[0], TUNING, results)
+
+
+def test_the_best_is_chosen_on_validation_shapes(tmp_path):
+    drawn(tmp_path)
+    (method,) = tuned(read(tmp_path))
+    assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
+    assert method.best == 1  # the last draw is better on the test shapes
+    assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_the_expected_error_is_the_mean_over_all_choices_of_draws(tmp_path, k):
+    drawn(tmp_path)
+    (method,) = tuned(read(tmp_path))
+    chosen = [min(some, key=lambda draw: VALIDATION[draw]) for some in combinations(range(4), k)]
+    expected = math.exp(np.mean([math.log(TEST[draw]) for draw in chosen]))
+    assert len(method.expected(k)) == 6
+    assert np.concatenate(method.expected(k)) == pytest.approx(expected)
+
+
+def test_the_page_has_a_column_per_budget_and_an_effect_per_setting(tmp_path):
+    drawn(tmp_path)
+    result = tuning.make(read(tmp_path))
+    assert list(result.table.columns) == ["Method", "Best of 1", "Best of 2", "Best of 4", "Failed"]
+    assert result.table["Best of 4"].item().startswith("2.00 [2.00, 2.00]")
+    assert "Validation runs: 6 per draw; test runs: 6 per draw" in told(result)
+    effects = tuning.make_settings(read(tmp_path)).data.set_index("setting")
+    assert effects.loc["task.optimiser.learning_rate", "rho"] == pytest.approx(1)  # a smaller rate was better
+    assert effects.loc["renderer.steps", "rho"] == pytest.approx(-0.4)
+    assert effects.loc["renderer.steps", "chosen"] == 11
+
+
+def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
+    drawn(tmp_path, failed={("test", 1, 0), ("validation", 3, 2)})
+    (method,) = tuned(read(tmp_path))
+    assert method.test[1].tolist() == pytest.approx([math.log(9), *[math.log(2)] * 5])
+    assert method.validation[3, 2] == pytest.approx(math.log(4))
+    assert method.failures == [0, 1, 0, 1]
+    assert tuning.make(read(tmp_path)).table["Failed"].item() == "2 of 48"
+
+
+def test_a_draw_without_all_of_its_runs_is_left_out(tmp_path):
+    drawn(tmp_path, left_out={("validation", 1, 5)})
+    (method,) = tuned(read(tmp_path))
+    assert method.draws == [0, 2, 3] and method.draws[method.best] == 3
+
+
+def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
+    drawn(tmp_path)
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 0
+    path = tmp_path / "tuned" / "dist_mask.yaml"
+    assert f"{path}: " in capsys.readouterr().out
+    text = path.read_text()
+    assert text.startswith("# @package _global_\n# Draw 1 of 4 of method/space/dist_mask: geometric mean")
+    assert "6 validation runs\n# 1.00, of the median draw 2.45" in text
+    node = OmegaConf.load(path)
+    assert node.defaults == ["/method/dist_mask", "_self_"]
+    assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
+    assert set(node) == {"defaults", "label", "task", "renderer"}
+
+
+def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    assert main(["--results", str(tmp_path)]) == 1
+    assert "type python -m bench -m +experiment=tuning" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="has no complete runs"):
+        write(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("preset", "default"),
+    [
+        ("tuned/idr_mask", "idr_mask"),
+        ("dist_mask_paper", "dist_mask"),
+        ("dist_mask_official", "dist_mask"),
+        ("dist_mask", "dist_mask"),
+    ],
+)
+def test_rows_are_compared_with_their_method_as_it_stands(preset, default):
+    assert tuned_page.default_of(preset) == default
+
+
+def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
+    for preset, label, factor in (("dist_mask", "DIST", 2.0), ("tuned/dist_mask", "DIST, tuned", 1.0)):
+        for index in range(6):
+            for points in ("100", "20"):
+                write_run(
+                    tmp_path,
+                    "tuned",
+                    label,
+                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": preset},
+                    metrics={"chamfer_l2": factor * (1 + index) / 1000},
+                    settings={
+                        "task": {"points": points, "_target_": "completion"},
+                        "dataset": {"name": "sofa"},
+                        "index": index,
+                    },
+                )
+    table = tuned_page.make(choose(read_records(tmp_path)[0], tuned_page.READS[0], tmp_path)).table.set_index("Method")
+    assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
+    assert table.loc["DIST", "Ratio to the default"] == ""
+    assert table.loc["DIST", "100 pts"] == "7.00"
