@@ -13,6 +13,7 @@ from bench.report.data import statistics
 from bench.report.data.completions import ERROR, heading
 from bench.report.data.crossing import CROSSING, Crossed, geometric_mean
 from bench.report.data.experiments import Experiment
+from bench.report.data.records import by_shape
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -32,6 +33,7 @@ from bench.report.write.table import (
 PLACE = 32
 PLACE_GAPS = 33
 PLACE_LOSSES = 34
+PLACE_FRONT = 35
 READS = (CROSSING,)
 SEED = 0  # of the bootstrap
 REFERENCE = "dist"  # the renderer with which the others are compared
@@ -54,6 +56,7 @@ RUNS = (
     *LOOP,
 )
 EVERY = "all families"
+NOTHING = statistics.Interval(math.inf, math.nan, math.nan)
 Pair = tuple[tuple[str, str], tuple[str, str]]  # two settings: renderer and loss
 
 
@@ -125,6 +128,66 @@ def _panel(axis: Axes, runs: Crossed, name: str, points: str) -> None:
     axis.grid(False, axis="x")
 
 
+def make_front(experiment: Experiment) -> Result:
+    """Makes the page of the front, with a line per loss and renderer: its error over all families, and its cost."""
+    runs = Crossed(experiment)
+    lines = []
+    for loss in runs.losses:
+        points = [_placed(runs, renderer, loss) for renderer in runs.renderers]
+        beaten = statistics.dominated([p["evaluations"] for p in points], [p["error"] for p in points])
+        lines += [point | {"front": "" if inside else "yes"} for point, inside in zip(points, beaten, strict=True)]
+    columns = [
+        *(text("loss", "Loss of the mask"), text("renderer", "Renderer")),
+        Column("evaluations", "Evaluations", show=format.count),
+        Column("error", "Error × 1000", words=lambda line: str(line["interval"])),
+        *(
+            Column("low", value=lambda line: line["interval"].low),
+            Column("high", value=lambda line: line["interval"].high),
+        ),
+        text("front", "On the front"),
+    ]
+    return Result(
+        experiment,
+        "Error over cost, under one loss at a time.",
+        "Geometric mean of the errors of all shapes and numbers of points over the median number of a run's values.",
+        interval="95 % bootstrap intervals over shapes and seeds",
+        remarks=(
+            ERROR,
+            "On the front: under the same loss no other renderer has a smaller error for fewer values.",
+        ),
+        data=to_data(columns, lines),
+        table=to_table(columns, lines),
+        figure=draw_front(runs, lines),
+    )
+
+
+def _placed(runs: Crossed, renderer: str, loss: str) -> dict[str, Any]:
+    errors = by_shape(runs.over_points(renderer, loss))
+    found = statistics.bootstrap(errors, geometric_mean, seed=SEED) if errors else NOTHING
+    cost = runs.cost(renderer, loss)
+    names = {"preset": renderer, "renderer": runs.labels[renderer], "loss": runs.labels[loss]}
+    return names | {"interval": found, "error": found.value, "evaluations": math.inf if cost is None else cost}
+
+
+@style.styled
+def draw_front(runs: Crossed, lines: list[dict[str, Any]]) -> Figure:
+    """Draws a panel per loss, with a point per renderer; filled points are on the front."""
+    figure, (axes,) = chart.sheet(2.9, 1, len(runs.losses), sharey=True, sharex=True)
+    for axis, loss in zip(axes, runs.losses, strict=True):
+        for line in (line for line in lines if line["loss"] == runs.labels[loss]):
+            x, y = style.finite([line["evaluations"]]), style.finite([line["error"]])
+            ends = style.finite([line["interval"].low, line["interval"].high])
+            hollow = {} if line["front"] else {"mfc": "none"}
+            axis.vlines(x, *ends, color=style.look(line["preset"]).colour, lw=0.8)
+            chart.points(axis, line["preset"], x, y, ms=5, label=line["renderer"], **hollow)
+        axis.set(title=runs.labels[loss], xlabel="field values per run")
+    axes[0].set_ylabel("Chamfer × 1000 (scene units²)")
+    style.log_axis(axes[0], "x", [line["evaluations"] for line in lines])
+    style.log_axis(axes[0], "y", [line["error"] for line in lines])
+    style.legend_below(figure, axes[0])
+    return figure
+
+
 def make_gaps(experiment: Experiment) -> Result:
     """Makes the page of the gaps between renderers: a line per pair and family, under own losses and under each one."""
     runs = Crossed(experiment)
@@ -144,7 +207,7 @@ def make_gaps(experiment: Experiment) -> Result:
         "Which part of a gap between renderers is their loss of the mask.",
         "Ratio of two renderers' errors, each under its own paper's loss and both under one.",
         interval="95 % bootstrap intervals over shapes and seeds",
-        remarks=(_explained(runs), *GAP_NOTES, ERROR),
+        remarks=(_explained(runs), *_verdicts(lines, runs.losses), *GAP_NOTES, ERROR),
         data=to_data(columns, lines),
         table=to_table(columns, lines),
     )
@@ -216,6 +279,20 @@ def _share(own: float | None, under: list[float | None]) -> float | None:
     if len(ratios) < 1 + len(under) or ratios[0] == 1:
         return None
     return 1 - float(np.mean(np.log(ratios[1:]))) / math.log(ratios[0])
+
+
+def _verdicts(lines: list[dict[str, Any]], losses: list[str]) -> list[str]:
+    """What the gaps over all families say, a sentence for each pair whose own losses differ."""
+    verdicts = []
+    for line in (line for line in lines if line["family"] == EVERY and line.get("share") is not None):
+        under = [line[loss] for loss in losses]
+        verdicts.append(
+            f"{line['compared']}: {format.number(line['own'])} times the error under own losses, "
+            f"{format.number(geometric_mean(np.array(under)))} times under one loss (geometric mean of the {len(under)}; "
+            f"{format.number(min(under))} to {format.number(max(under))}); the loss is {percent(line['share'])} of the "
+            f"gap, over {line['shapes']} shapes."
+        )
+    return verdicts
 
 
 def _explained(runs: Crossed) -> str:

@@ -13,10 +13,22 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.tuning import TUNING, Tuned, tuned
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table, whole
+from bench.report.write.table import (
+    FAMILY,
+    IDENTITY,
+    LOOP,
+    Column,
+    configured,
+    metrics,
+    text,
+    to_data,
+    to_table,
+    whole,
+    word,
+)
 
-PLACE = 35
-PLACE_SETTINGS = 36
+PLACE = 36
+PLACE_SETTINGS = 37
 READS = (TUNING,)
 SEED = 0  # of the bootstrap
 PLOTTED = "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken."
@@ -38,9 +50,17 @@ RUNS = (
     *metrics("chamfer_l2", "chamfer_l1", "mask_iou"),
     *LOOP,
 )
+DRAWN = {"least": "Least drawn", "most": "Most drawn", "chosen": "Chosen"}
+
+
+def as_drawn(value: float | int) -> str:
+    """A drawn value as text; whole numbers have no decimals."""
+    return word(value) if isinstance(value, int) else format.number(value)
+
+
 EFFECTS = (
     *(text("method", "Method"), text("setting", "Setting")),
-    *(Column("least", "Least drawn"), Column("most", "Most drawn"), Column("chosen", "Chosen")),
+    *(Column(key, heading, show=as_drawn) for key, heading in DRAWN.items()),
     *(Column("rho", "ρ"), Column("n", "Draws", show=whole)),
 )
 Curve = dict[int, statistics.Interval]  # by the number of draws
@@ -99,7 +119,7 @@ def draw(methods: list[Tuned], curves: dict[str, Curve]) -> Figure:
     ticks = sorted({k for curve in curves.values() for k in curve})
     axis.set_xscale("log", base=2)
     axis.set_xticks(ticks, [str(k) for k in ticks])
-    style.legend_below(figure, axis)
+    style.legend_below(figure, axis, columns=2)
     return figure
 
 
