@@ -286,11 +286,11 @@ def _verdicts(lines: list[dict[str, Any]], losses: list[str]) -> list[str]:
     verdicts = []
     for line in (line for line in lines if line["family"] == EVERY and line.get("share") is not None):
         under = [line[loss] for loss in losses]
+        mean, ends = geometric_mean(np.array(under)), f"{format.number(min(under))} to {format.number(max(under))}"
         verdicts.append(
             f"{line['compared']}: {format.number(line['own'])} times the error under own losses, "
-            f"{format.number(geometric_mean(np.array(under)))} times under one loss (geometric mean of the {len(under)}; "
-            f"{format.number(min(under))} to {format.number(max(under))}); the loss is {percent(line['share'])} of the "
-            f"gap, over {line['shapes']} shapes."
+            f"{format.number(mean)} times under one loss (geometric mean of the {len(under)}; {ends}); the loss is "
+            f"{percent(line['share'])} of the gap, over {line['shapes']} shapes."
         )
     return verdicts
 
