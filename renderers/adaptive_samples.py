@@ -12,7 +12,7 @@ from renderers.boundary import rendered, silhouette_loss
 from renderers.bracket import first_crossing, refine
 from renderers.camera import Rays
 from renderers.field import Field, autograd_normals
-from renderers.rendering import Capabilities, Renderer, Rendering, Spaced, at_iteration
+from renderers.rendering import Capabilities, Observed, Renderer, Rendering, Spaced, at_iteration
 
 FEWEST, MOST = 16, 128  # samples per ray: the range of DVR, Sec. 3.5
 HITS = 128  # most hits of a rendering at which the thickness is measured
@@ -79,7 +79,11 @@ class Following:
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """That of the inner renderer."""
-        return silhouette_loss(self.current(), field, rays, rendering, mask)
+        return self.observed_loss(field, rays, rendering, Observed(mask))
+
+    def observed_loss(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
+        """That of the inner renderer."""
+        return silhouette_loss(self.current(), field, rays, rendering, observed)
 
     def at_max_samples(self) -> Spaced:
         """The inner renderer with the largest number of samples."""

@@ -5,12 +5,12 @@ shapes and types, and no evaluation of the field.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.rendering import Renderer, Rendering
+from renderers.rendering import Guided, Observed, Renderer, Rendering
 
 PARTS = ("distance", "status", "points", "residual", "closest")
 TOWARDS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
@@ -40,16 +40,19 @@ def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
 
 
 def silhouette_loss(
-    renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
 ) -> Float[Tensor, ""]:
-    """The renderer's own loss between its rendering and a mask.
+    """The renderer's own loss between its rendering and what is observed: of a Guided one all, of others the mask.
 
     Raises:
         BrokenContract: where it is no scalar of floating point, or carries no gradient although it is not 0, the
             renderer claims one, and it is wanted.
     """
-    loss = renderer.silhouette_loss(field, rays, rendering, mask)
-    name = f"{type(renderer).__name__}.silhouette_loss"
+    if isinstance(renderer, Guided):
+        loss, method = renderer.observed_loss(field, rays, rendering, observed), "observed_loss"
+    else:
+        loss, method = renderer.silhouette_loss(field, rays, rendering, observed.mask), "silhouette_loss"
+    name = f"{type(renderer).__name__}.{method}"
     if not isinstance(loss, Tensor):
         found = "None" if loss is None else f"a {type(loss).__name__}"
         raise BrokenContract(f"{name} must return a tensor with one number, not {found}: return the mean over the rays")

@@ -12,8 +12,8 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind
 from renderers.gradients import fixed_samples, implicit
-from renderers.rendering import Capabilities, Rendering, Status, assemble
-from renderers.silhouette import Occupancy
+from renderers.rendering import Capabilities, Observed, Rendering, Status, assemble
+from renderers.silhouette import PLACES, Occupancy
 
 BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
@@ -29,7 +29,10 @@ class DVR:
     Deviates from the paper: the first sample lies where the ray enters the volume (Eq. 9 from j = 0, as in the official
         code), which is the unit sphere; a ray that begins occupied has STARTED_INSIDE. Rays have a gradient, which the
         official code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as in the official
-        clamp. `early_stop` is ours.
+        clamp. `early_stop` is ours. L_occupancy (Eq. 15) is at a random point also where depth is given, unless
+        `occupied_at` is "depth", and never at the depth of the visual hull, which the paper takes where it trains
+        single-view reconstruction by masks of several views: here, views with masks have dense depth as well, the
+        photographs of task=multiview have no mask, and the hull of one mask begins where the ray enters the sphere.
 
     Args:
         n_ray_samples: n, equally spaced between where a ray enters and leaves the sphere, its ends among them.
@@ -39,7 +42,7 @@ class DVR:
         early_stop: evaluate the samples of a ray from front to back up to the first that is occupied; else all of them,
             as in the paper.
         least_slope, keep_slope_sign: see `gradients.implicit`.
-        occupancy_width, mask_weight: of both mask losses; see `silhouette.Occupancy`.
+        occupancy_width, mask_weight, occupied_at: of both mask losses; see `silhouette.Occupancy`.
         sphere_radius: of the volume of interest, a sphere about the origin.
     """
 
@@ -52,6 +55,7 @@ class DVR:
     keep_slope_sign: bool
     occupancy_width: float
     mask_weight: float
+    occupied_at: str
     sphere_radius: float
 
     capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
@@ -63,6 +67,7 @@ class DVR:
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("occupancy_width", self.occupancy_width, "0.02 suits distances in the unit sphere")
         check_at_least("mask_weight", self.mask_weight, 0, "1 keeps the paper's equations")
+        check_choice("occupied_at", self.occupied_at, PLACES)
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         if list(self.doublings) != sorted(set(self.doublings)) or min(self.doublings, default=0) < 0:
             raise ValueError(f"doublings must be rising iterations from 0, not {list(self.doublings)}: [10, 30, 50]")
@@ -100,9 +105,13 @@ class DVR:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
+        """DVR, Eqs. 14 and 15, of a mask without any distance; see `silhouette.Occupancy`."""
+        return self.observed_loss(field, rays, rendering, Observed(mask))
+
+    def observed_loss(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
         """DVR, Eqs. 14 and 15; see `silhouette.Occupancy`."""
-        occupancy = Occupancy(self.occupancy_width, self.mask_weight, self.sphere_radius)
-        return occupancy.of(field, rays, rendering, mask)
+        occupancy = Occupancy(self.occupancy_width, self.mask_weight, self.sphere_radius, self.occupied_at)
+        return occupancy.of(field, rays, rendering, observed)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""

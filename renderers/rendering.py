@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
@@ -60,6 +61,27 @@ class Capabilities:
     ray_gradient: bool
 
 
+@dataclass(frozen=True)
+class Observed:
+    """What is observed of rays: a mask, and distances where they are given.
+
+    Args:
+        mask: true on the foreground.
+        distance: along each ray to the observed surface, in scene units; NaN where it is not given. None where no ray
+            has one.
+    """
+
+    mask: Bool[Tensor, "*rays"]
+    distance: Float[Tensor, "*rays"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.mask.dtype != torch.bool:
+            raise ValueError(f"mask must be boolean, not {self.mask.dtype}: compare a picture with a threshold")
+        if self.distance is not None and self.distance.shape != self.mask.shape:
+            shapes = f"{list(self.mask.shape)}, not {list(self.distance.shape)}"
+            raise ValueError(f"distance must have the mask's shape {shapes}: give NaN where no distance is known")
+
+
 @runtime_checkable
 class Renderer(Protocol):
     """Finds surfaces along rays. It never times, logs, draws or synchronises, and knows no task."""
@@ -83,6 +105,15 @@ class Scheduled(Protocol):
 
     def at_iteration(self, iteration: int) -> Renderer:
         """The renderer as it is at an iteration, counted from 0."""
+        ...
+
+
+@runtime_checkable
+class Guided(Protocol):
+    """A renderer whose own silhouette loss takes given distances as well; the mask alone is `silhouette_loss`."""
+
+    def observed_loss(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
+        """The method's own loss between its rendering, and a mask and the distances that are given."""
         ...
 
 

@@ -17,24 +17,26 @@ from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, occupancy_logits
-from renderers.rendering import Renderer, Rendering
+from renderers.rendering import Observed, Renderer, Rendering
 
+RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
+PLACES = (RANDOM, DEPTH)
 CLOSEST = "its closest field values carry"  # what a loss is made of, in the message where they carry no gradient
 
 
 @runtime_checkable
 class SilhouetteLoss(Protocol):
-    """A loss between a rendering and a binary mask."""
+    """A loss between a rendering and a binary mask, or what else is observed of its rays."""
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """The loss.
 
         Args:
             renderer, field, rays: of which `rendering` is the outcome.
             rendering: of the field.
-            mask: true on the foreground.
+            observed: the mask, and the distances that are given.
         """
         ...
 
@@ -44,10 +46,10 @@ class Own:
     """The renderer's own silhouette loss, checked by `boundary.silhouette_loss`."""
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        return boundary.silhouette_loss(renderer, field, rays, rendering, mask)
+        return boundary.silhouette_loss(renderer, field, rays, rendering, observed)
 
 
 @dataclass(frozen=True)
@@ -74,11 +76,11 @@ class Hinge:
         check_at_least("weight", self.weight, 0, "0 switches the loss off")
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`; a hit on the foreground is right, whatever the renderer's own threshold."""
-        right = mask & rendering.hit
-        loss = self.of(torch.where(right, 0.0, rendering.closest), mask)
+        right = observed.mask & rendering.hit
+        loss = self.of(torch.where(right, 0.0, rendering.closest), observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
 
@@ -107,10 +109,10 @@ class CrossEntropy:
         check_at_least("weight", self.weight, 0, "the paper uses 100")
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        loss = self.of(rendering, mask)
+        loss = self.of(rendering, observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
 
@@ -126,37 +128,45 @@ class CrossEntropy:
 class Occupancy:
     """DVR, Eqs. 14 and 15, summed and divided by the number of rays.
 
-    On the background, the hit or else a point drawn on the ray should be free; on the foreground without a hit, a point
-    drawn on the ray should be occupied. Points are drawn evenly, from PyTorch's own generator.
+    On the background, the hit or else a point drawn on the ray should be free (L_freespace); on the foreground without
+    a hit, a point of the ray should be occupied (L_occupancy). Points are drawn evenly, from PyTorch's own generator.
 
     Args:
         width: length in scene units over which a distance turns from occupied to free; see `field.occupancy_logits`.
             Occupancy networks do not use it.
         weight: of both terms; 1 leaves them as the paper's equations have them.
         sphere_radius: of the sphere about the origin on whose chords points are drawn.
+        occupied_at: the point of L_occupancy. "random": drawn, as in Eq. 15. "depth": at the observed distance, where
+            the ray has one within the sphere, as the paper does with depth supervision; drawn on other rays. The
+            paper's third, the depth of the visual hull, is not built: see `renderers.dvr.DVR`.
     """
 
     width: float
     weight: float
     sphere_radius: float
+    occupied_at: str
 
     def __post_init__(self) -> None:
         check_positive("width", self.width, "0.02 suits distances in the unit sphere")
         check_at_least("weight", self.weight, 0, "1 keeps the paper's equations")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+        check_choice("occupied_at", self.occupied_at, PLACES)
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        return self.of(field, rays, rendering, mask)
+        return self.of(field, rays, rendering, observed)
 
-    def of(self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+    def of(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
         """The loss of a rendering of the field along the rays."""
-        flat, hit, wanted = rays.flat(), rendering.hit.flatten(), mask.flatten()
+        flat, hit, wanted = rays.flat(), rendering.hit.flatten(), observed.mask.flatten()
         entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
-        drawn = entry + torch.rand_like(entry) * (leave - entry)
-        distance = torch.where(hit, rendering.distance.detach().flatten(), drawn)
+        place = entry + torch.rand_like(entry) * (leave - entry)
+        if self.occupied_at == DEPTH and observed.distance is not None:
+            given = observed.distance.detach().flatten()
+            place = torch.where(wanted & (given >= entry) & (given <= leave), given, place)
+        distance = torch.where(hit, rendering.distance.detach().flatten(), place)
         judged = meets & ~(wanted & hit)
         values = field(flat[judged].at(distance[judged]))
         logits = occupancy_logits(field, values, width=self.width)

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bench.models.model import Candidate, Model, Seen
-from bench.setup.fields import parsed
+from bench.models.model import FLOAT, Candidate, Model, Seen
+from bench.setup.fields import FREE, parsed
 from bench.shape_prior.autodecoder import initialise_to_sphere
 from renderers.camera import rigid
 from renderers.field import Flops, Kind
@@ -82,19 +82,23 @@ def quadric(parameters: Float[Tensor, "11"]) -> Shape:
 
 @dataclass(frozen=True)
 class Part:
-    """A shape with a formula: its field, its initial parameters after pose and sizes, and its operations per value."""
+    """A shape with a formula.
+
+    Its field, its initial parameters after pose and sizes, how many parameters it has, and its operations per value.
+    """
 
     shape: Callable[[Tensor], Shape]
     extra: tuple[float, ...]
+    size: int
     flops: int
 
 
 PARTS = {
-    "sphere": Part(sphere_part, (), 10),
-    "ellipsoid": Part(ellipsoid, (), 50),
-    "box": Part(box, (), 50),
-    "rounded_box": Part(rounded, (ROUND_LOGIT,), 55),
-    "superquadric": Part(quadric, (0.0, 0.0), 110),
+    "sphere": Part(sphere_part, (), 4, 10),
+    "ellipsoid": Part(ellipsoid, (), 9, 50),
+    "box": Part(box, (), 9, 50),
+    "rounded_box": Part(rounded, (ROUND_LOGIT,), 10, 55),
+    "superquadric": Part(quadric, (0.0, 0.0), 11, 110),
 }
 
 
@@ -105,6 +109,10 @@ class OnePart:
     name: str
     follows: ClassVar[bool] = False
     tries: ClassVar[int] = 1
+
+    @property
+    def stored(self) -> int:
+        return PARTS[self.name].size
 
     @property
     def flops(self) -> int:
@@ -139,6 +147,10 @@ class UnionOf:
     @property
     def name(self) -> str:
         return f"union_{self.count}"
+
+    @property
+    def stored(self) -> int:
+        return self.count * PARTS["rounded_box"].size
 
     @property
     def flops(self) -> int:
@@ -177,8 +189,7 @@ class Network:
         return f"network_{self.layers}x{self.width}"
 
     @cached_property
-    def size(self) -> int:
-        """The number of parameters."""
+    def stored(self) -> int:
         return sum(parameter.numel() for parameter in self._decoder(0).parameters())
 
     @cached_property
@@ -219,6 +230,11 @@ class NarrowBand:
         return f"grid_{self.resolution}"
 
     @property
+    def stored(self) -> int:
+        """All samples: those that are not fitted are evaluated as well."""
+        return self.resolution**3
+
+    @property
     def flops(self) -> int:
         return FLOPS.value
 
@@ -238,7 +254,17 @@ class NarrowBand:
             return Grid(kept.view(self.resolution, self.resolution, self.resolution), REACH)
 
         free = values[band].clone().requires_grad_()
-        return [Model(self.name, [free], grid, GRID_RATE, metric=False, held=len(values) - len(free))]
+        sparse = self._sparse_bytes(len(free), seen)
+        held = len(values) - len(free)
+        return [Model(self.name, [free], grid, GRID_RATE, metric=False, held=held, sparse_bytes=sparse)]
+
+    def _sparse_bytes(self, fitted: int, seen: Seen) -> int:
+        """Of a file with the fitted samples, a bit per sample that tells which they are, and the previous field.
+
+        The other samples are values of that field, so that the same grid can be computed from it.
+        """
+        assert seen.previous is not None
+        return FLOAT * fitted + -(-self.stored // 8) + seen.previous.size.bytes
 
     def _near_points(self, points: Float[Tensor, "n 3"], cell: float) -> Int[Tensor, " m"]:
         """Indices of the samples within `BAND` cells of a point, along each axis."""
@@ -263,6 +289,17 @@ def candidate(name: str) -> Candidate:
     """
     kind, sizes = parsed(name)
     return SIZED[kind](*sizes) if sizes else OnePart(name)
+
+
+def by_size(names: tuple[str, ...], measure: str) -> list[Candidate]:
+    """The candidates of these names, the smallest first.
+
+    Args:
+        names: in the order of their free numbers, and of any others that are as large as each other.
+        measure: of `models.size`. By free numbers the order is kept: those of a grid are known at its start only.
+    """
+    listed = [candidate(name) for name in names]
+    return listed if measure == FREE else sorted(listed, key=lambda one: one.stored)
 
 
 def _model(name: str, parameters: Tensor, shape: Callable[[list[Tensor]], Shape], flops: int, seen: Seen) -> Model:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from math import inf
 
 from bench.models.held_out import HeldOutError
+from bench.models.model import Size
 from bench.records.record import RunStatus
 
 
@@ -13,8 +14,7 @@ class Evidence:
 
     Args:
         candidate: its name.
-        parameters: the number of its parameters.
-        bytes: to store the field.
+        size: its free and its stored numbers.
         flops_per_query: floating-point operations per value.
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.
@@ -25,8 +25,7 @@ class Evidence:
     """
 
     candidate: str
-    parameters: int
-    bytes: int
+    size: Size
     flops_per_query: int
     error: HeldOutError | None = None
     status: RunStatus = RunStatus.OK
@@ -51,16 +50,18 @@ class Choice:
 
     chosen: Evidence
     best: Evidence
+    measure: str  # of size, by which it is the smallest
     within: bool  # its error is within one standard error of the best one's
     enough: bool  # its error is under the footprint
 
 
-def choose(evidence: list[Evidence], footprint: float) -> Choice:
+def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
     """The smallest candidate within one standard error of the best (Breiman et al. 1984), or under the footprint.
 
     Args:
         evidence: of all candidates.
         footprint: half a pixel (DIST, Eq. 10), in scene units.
+        measure: of size, see `models.size`.
 
     Raises:
         ValueError: where all fits failed.
@@ -72,8 +73,8 @@ def choose(evidence: list[Evidence], footprint: float) -> Choice:
         )
     best = min(known, key=lambda candidate: candidate.mean)
     fit = [candidate for candidate in known if is_as_good(candidate.error, best.error) or candidate.mean <= footprint]
-    chosen = min(fit, key=lambda candidate: (candidate.parameters, candidate.mean))
-    return Choice(chosen, best, is_as_good(chosen.error, best.error), chosen.mean <= footprint)
+    chosen = min(fit, key=lambda candidate: (candidate.size.by(measure), candidate.mean))
+    return Choice(chosen, best, measure, is_as_good(chosen.error, best.error), chosen.mean <= footprint)
 
 
 def is_as_good(error: HeldOutError, best: HeldOutError) -> bool:

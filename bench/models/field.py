@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
-from bench.models.candidates import candidate
+from bench.models.candidates import by_size
 from bench.models.fit import FitProblem, Fitter
 from bench.models.growth import Growth, grow
 from bench.models.observations import Observations
@@ -25,10 +25,14 @@ from datasets.truth import Truth
 from renderers.field import Field
 from renderers.rendering import Renderer
 
+SIZES = (
+    "the numbers of its field that the optimiser may change; those that a file must hold so that it can be evaluated, "
+    "of a grid all its samples; the size of that file in float32"
+)
 NOT_RENDERED = ("part", "phase", "candidate", "eikonal", "rays_share")  # keys that curves of other runs lack
 ENDED = {
     "field": "the candidate that field=auto ended on, or the one that was requested",
-    "field_parameters": "the number of its parameters",
+    "field_free, field_stored, field_bytes": SIZES,
     "field_error, field_standard_error": "of the held-out observations: as NAME.error of task=capacity, in "
     "scene units; of photographs the mean difference of colours from 0 to 1; through the renderer as configured, "
     "so that what renderer.epsilon=auto adds to a surface is not in it",
@@ -71,7 +75,7 @@ def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
 
         settings = replace(choice.models.fit, iterations=task.optimiser.iterations)
         fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
-        growth = grow(fitter, [candidate(name) for name in choice.candidates], choice.models.growth)
+        growth = grow(fitter, by_size(choice.candidates, choice.models.size), choice.models.growth)
     clock = time.perf_counter()
     _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
     first, last = growth.first, growth.fitted.model.frozen()
@@ -107,7 +111,7 @@ def fitted_shape(run: RunContext, weights: Weights) -> Field:
         run.progress(f"fitting {name}", line["iteration"] + 1, settings.fit.iterations, line["total"])
 
     fitter = Fitter(views.observations(inputs.seed), settings.fit, inputs.seed, inputs.device, on_line)
-    growth = grow(fitter, [candidate(name) for name in choice.candidates], settings.growth)
+    growth = grow(fitter, by_size(choice.candidates, settings.size), settings.growth)
     if growth.fitted.failed:
         reason = growth.fitted.evidence.reason
         raise ValueError(f"no field was found for the known shape: {reason}; field=prior takes the shape itself")
@@ -133,7 +137,9 @@ def ended(growth: Growth) -> dict[str, Any]:
     error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
     return {
         "field": evidence.candidate,
-        "field_parameters": evidence.parameters,
+        "field_free": evidence.size.free,
+        "field_stored": evidence.size.stored,
+        "field_bytes": evidence.size.bytes,
         "field_error": evidence.mean,
         **error,
         "field_footprint": growth.footprint,

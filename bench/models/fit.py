@@ -119,7 +119,7 @@ class Fitter:
 
     def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:
         """A candidate's model as a Fitted; it has failed where the renderer does not support its kind of field."""
-        evidence = Evidence(candidate.name, model.size, model.bytes, candidate.flops)
+        evidence = Evidence(candidate.name, model.size, candidate.flops)
         fitted = Fitted(candidate, previous, model, fresh(self.observations.renderer), evidence)
         try:
             check_kind(self.observations.renderer, model.frozen())

@@ -47,7 +47,7 @@ class Growth:
         """The result, in words."""
         error = self.fitted.evidence.mean
         path, size = " -> ".join(self.fields), self.fitted.model.size
-        found = f"field={requested}: {path}, {size} parameters, held-out error {error:.3g}"
+        found = f"field={requested}: {path}, {size}, held-out error {error:.3g}"
         if not self.footprint or error <= self.footprint:
             return [found, *final_note(self.fitted.renderer)]
         above = f"above half a pixel ({self.footprint:.3g}): {self.end}; more iterations may help"

@@ -8,9 +8,41 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.setup.fields import SIZE_WORDS
 from renderers.field import Counts, Field, Meter
 
 FLOAT = 4  # bytes of a float32
+
+
+@dataclass(frozen=True)
+class Size:
+    """The size of a field, in float32; its attributes are the measures of `models.size`.
+
+    Args:
+        free: numbers that the optimiser may change.
+        stored: numbers that a file must hold so that the field can be evaluated, the free ones among them: of a grid,
+            all its samples.
+        sparse_bytes: of a file with the free numbers only, from which the same field can be computed; None where it
+            would be the same file.
+    """
+
+    free: int
+    stored: int
+    sparse_bytes: int | None = None
+
+    @property
+    def bytes(self) -> int:
+        """The size of a file with all stored numbers."""
+        return FLOAT * self.stored
+
+    def by(self, measure: str) -> int:
+        """The size by a measure of `models.size`."""
+        assert measure in SIZE_WORDS
+        return getattr(self, measure)
+
+    def __str__(self) -> str:
+        """The numbers in words."""
+        return f"{self.stored:,} numbers" + (f", {self.free:,} of them free" if self.free < self.stored else "")
 
 
 @dataclass
@@ -24,6 +56,7 @@ class Model:
         learning_rate: of Adam, for these parameters.
         metric: whether the values are distances or bounds by construction; else an eikonal term keeps them so.
         held: number of stored values in addition to the parameters.
+        sparse_bytes: see `Size`.
     """
 
     candidate: str
@@ -32,16 +65,13 @@ class Model:
     learning_rate: float
     metric: bool
     held: int = 0
+    sparse_bytes: int | None = None
 
     @property
-    def size(self) -> int:
-        """The number of parameters."""
-        return sum(parameter.numel() for parameter in self.parameters)
-
-    @property
-    def bytes(self) -> int:
-        """The size of the stored field, in float32."""
-        return FLOAT * (self.size + self.held)
+    def size(self) -> Size:
+        """Its free and its stored numbers."""
+        free = sum(parameter.numel() for parameter in self.parameters)
+        return Size(free, free + self.held, self.sparse_bytes)
 
     def field(self) -> Field:
         """The field of the current parameters, with gradients towards them."""
@@ -82,6 +112,11 @@ class Candidate(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def stored(self) -> int:
+        """Its stored numbers, see `Size`, which are known before its start; the free ones of a grid are not."""
+        ...
 
     @property
     def flops(self) -> int:

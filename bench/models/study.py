@@ -47,11 +47,13 @@ class Study:
         fitter: fits with the configured renderer.
         pixel_precise: the same renderer at pixel precision.
         fewest_rays: share of the rays that the fit at pixel precision begins with.
+        measure: of size, by which the smallest candidate is chosen.
     """
 
     fitter: Fitter
     pixel_precise: Renderer
     fewest_rays: float
+    measure: str
     fits: list[Fitted] = field(default_factory=list)
 
     def fit_all(self, candidates: list[Candidate]) -> Iterator[Fitted]:
@@ -66,7 +68,8 @@ class Study:
 
     def choose(self) -> tuple[Choice, Fitted]:
         """The recommended candidate and its fit."""
-        choice = choose([fitted.evidence for fitted in self.fits], self.fitter.observations.footprint)
+        evidence = [fitted.evidence for fitted in self.fits]
+        choice = choose(evidence, self.fitter.observations.footprint, self.measure)
         return choice, next(fitted for fitted in self.fits if fitted.evidence is choice.chosen)
 
     def check(self, chosen: Fitted, views: Views, settings: CheckSettings) -> dict[str, float]:

@@ -14,7 +14,8 @@ KINDS = {  # kinds of candidates by the beginning of their names: label, colour,
     "union": ("unions of boxes", "#009e73", "P"),
     "": ("one part", "#d55e00", "o"),
 }
-AXES = {"parameters": "parameters", "flops_per_query": "FLOPs per query"}
+FLOPS = "flops_per_query"
+AXES = {"stored": "stored numbers", "free": "free numbers", "bytes": "bytes", FLOPS: "FLOPs per query"}
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,17 @@ class Candidates:
     @staticmethod
     def of(metrics: dict[str, Any]) -> "Candidates":
         """The candidates of a record's metrics."""
-        fits = [name.removesuffix(".parameters") for name in metrics if name.endswith(".parameters")]
+        fits = [name.removesuffix(".stored") for name in metrics if name.endswith(".stored")]
         names = [name for name in fits if name not in ("auto", "frugal")]  # further fits of candidates
         numbers = {
             name: {k[len(name) + 1 :]: v for k, v in metrics.items() if k.startswith(f"{name}.")} for name in names
         }
         return Candidates([CandidateResult(name, numbers[name]) for name in names], metrics)
+
+    @property
+    def measure(self) -> str:
+        """The measure of size by which the choice is made; older records have none, and theirs is by free numbers."""
+        return self.metrics.get("recommended_by", "free")
 
     @property
     def footprint(self) -> float:
@@ -78,11 +84,11 @@ class Candidates:
 
 
 def panels(axes: np.ndarray, candidates: Candidates) -> None:
-    """Draws the error over parameters and over FLOPs per query, with a ring around the recommended candidate."""
-    for axis, (key, heading) in zip(axes, AXES.items(), strict=True):
+    """Draws the error over the size and over FLOPs per query, with a ring around the recommended candidate."""
+    for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
         panel(axis, candidates, key)
         name_chosen(axis, candidates, key)
-        axis.set_xlabel(heading)
+        axis.set_xlabel(AXES[key])
     axes[0].set_ylabel("held-out error (scene units)")
     handles, labels = axes[-1].get_legend_handles_labels()
     axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=4)

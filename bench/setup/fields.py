@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from bench.config import nearest
 from bench.setup.auto import AUTO
-from renderers.checks import check_at_least, check_share
+from renderers.checks import check_at_least, check_choice, check_share
 
 PRIOR = "prior"
 PARTS = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
@@ -13,6 +13,8 @@ SIZED = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+"}  # and
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
 FORMS = "union_K, network_LAYERSxWIDTH, grid_N"
 MOST_SAMPLES = 256  # of a grid along an axis: 64 MiB of values
+STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.models.model.Size`
+SIZE_WORDS = {STORED: "stored numbers", FREE: "free numbers", BYTES: "bytes"}
 
 
 def parsed(name: str) -> tuple[str, tuple[int, ...]]:
@@ -119,13 +121,16 @@ class ModelSettings:
     """The fields to choose from, and the settings of their fits.
 
     Args:
-        candidates: their names, the smallest first; see `bench.models.candidates.candidate`.
+        candidates: their names, the smallest first by free numbers; see `bench.models.candidates.candidate`.
+        size: the measure by which one is the smallest: "stored", "free" or "bytes"; see `bench.models.model.Size`.
+            They are tried in its order, see `bench.models.candidates.by_size`.
         fit: settings of each fit.
         growth: settings of `field=auto`.
         views: of a known shape, where candidates are fitted to one.
     """
 
     candidates: tuple[str, ...]
+    size: str
     fit: FitSettings
     growth: GrowthSettings
     views: ViewSettings
@@ -136,6 +141,7 @@ class ModelSettings:
             raise ValueError(f"models.candidates must name each candidate once, not {', '.join(self.candidates)}")
         for name in self.candidates:
             parsed(name)
+        check_choice("models.size", self.size, tuple(SIZE_WORDS))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from datasets.scene import View
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.rendering import Renderer, at_iteration
+from renderers.rendering import Observed, Renderer, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEPTH, POINTS = "depth", "points"  # what a depth loss takes the mean of; see `bench.tasks.completion.Completion`
@@ -91,6 +91,7 @@ class GivenView:
         error = depth_error(self.settings.depth_loss, found, self.depth, self.depth_of_distance)
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
         if self.mask is not None:
-            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, self.mask)
+            given = torch.where(self.observed, self.depth / self.depth_of_distance, torch.nan)
+            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, Observed(self.mask, given))
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms

@@ -21,7 +21,7 @@ from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
-from renderers.rendering import Rendering
+from renderers.rendering import Observed, Rendering
 
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
 WARM_UP = 8  # pixels per side of the image that is rendered before the timing
@@ -230,7 +230,7 @@ class Workbench:
     def _step(self, field: Field, rays: Rays, mask: Tensor) -> float:
         """Takes one step and gives the seconds of its backward pass."""
         rendering = rendered(self.renderer, field, rays)
-        silhouette = silhouette_loss(self.renderer, field, rays, rendering, mask.to(self.device))
+        silhouette = silhouette_loss(self.renderer, field, rays, rendering, Observed(mask.to(self.device)))
         loss = rendering.distance[rendering.hit].sum() + silhouette
         synchronise(self.device)
         start = time.perf_counter()

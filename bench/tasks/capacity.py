@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
-from bench.models.candidates import PAPERS, candidate
+from bench.models.candidates import PAPERS, by_size
 from bench.models.choice import Choice, Evidence
+from bench.models.field import SIZES
 from bench.models.fit import Fitter
 from bench.models.growth import Growth, grow
-from bench.models.model import FLOAT
+from bench.models.model import Size
 from bench.models.observations import RayObservations
 from bench.models.study import CheckSettings, Study
 from bench.models.views import Views
@@ -16,6 +17,7 @@ from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
+from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.problem import check_field_gradient
@@ -27,8 +29,10 @@ from renderers.silhouette import SilhouetteLoss
 
 TINY = 1e-9  # seconds: for a clock that did not move
 NEEDS = {
-    "recommended_field, recommended_parameters, recommended_error": "the smallest candidate, by parameters, whose "
-    "held-out error is within one standard error of the best one's or under the footprint; its size, its error",
+    "recommended_field, recommended_error": "the smallest candidate, by recommended_by, whose held-out error is within "
+    "one standard error of the best one's or under the footprint; its error",
+    "recommended_by": "models.size: stored numbers, free numbers or bytes",
+    "recommended_free, recommended_stored, recommended_bytes": "its sizes, as NAME.free",
     "recommended_within, recommended_enough": "1 where the first, the second of these holds",
     "best_field": "the candidate of the least held-out error",
     "footprint": "half a pixel where the shape may be nearest (DIST, Eq. 10, theta = 0), in scene units",
@@ -37,8 +41,10 @@ NEEDS = {
     "It also chooses which candidate a later one begins with; held_out_seeds do not depend on that",
     "NAME.standard_error": "of that mean, by the jackknife over views",
     "NAME.failed": "why its fit failed",
-    "NAME.parameters, NAME.bytes, NAME.flops_per_query": "their number; what it takes to keep the field in float32; "
-    "floating-point operations per value, an estimate for formulas",
+    "NAME.free, NAME.stored, NAME.bytes": SIZES,
+    "NAME.sparse_bytes": "of a grid: size of a file with the fitted samples, a bit per sample that tells which they "
+    "are, and the previous field, from which the other samples can be computed; no choice uses it",
+    "NAME.flops_per_query": "floating-point operations per value, an estimate for formulas",
     "NAME.seconds, NAME.evaluations, NAME.flops": "of its fit, with finding its start and the warm start, "
     "without checkpoints",
     "NAME.seconds_at_auto, NAME.flops_at_auto, NAME.evaluations_at_auto": "at the first checkpoint with the error of "
@@ -93,10 +99,10 @@ class Capacity:
                 write_line({"candidate": name, **line})
                 run.progress(f"fitting {name}", line["iteration"] + 1, models.fit.iterations, line["total"])
 
-            candidates = [candidate(name) for name in models.candidates]
+            candidates = by_size(models.candidates, models.size)
             fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
             pixel_precise, settings_notes = inputs.pixel_precise
-            study = Study(fitter, pixel_precise, self.frugal_rays)
+            study = Study(fitter, pixel_precise, self.frugal_rays, models.size)
             growth = grow(fitter, candidates, models.growth)
             for fitted in study.fit_all(candidates):
                 record.metrics |= costs(fitted.candidate.name, fitted.evidence)  # in case the run is stopped
@@ -138,7 +144,7 @@ def _note_costs(run: RunContext, fitter: Fitter, observations: RayObservations, 
 
 def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     """A fit's error and costs as metrics NAME.…; for a failed fit, its reason."""
-    known = {key: getattr(evidence, key) for key in ("parameters", "bytes", "flops_per_query")}
+    known = {**sizes(evidence.size), "flops_per_query": evidence.flops_per_query}
     spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops")}
     error = evidence.error
     failure = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
@@ -146,12 +152,19 @@ def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     return {f"{name}.{key}": value for key, value in {**known, **spent, **errors, **failure}.items()}
 
 
+def sizes(size: Size) -> dict[str, int]:
+    """The free and stored numbers and the bytes by their names in a record; of a grid also those of a sparse file."""
+    sparse = {} if size.sparse_bytes is None else {"sparse_bytes": size.sparse_bytes}
+    return {**{measure: size.by(measure) for measure in SIZE_WORDS}, **sparse}
+
+
 def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str, Any]:
     """The choice and the evidence of every candidate, as metrics."""
     chosen, last = choice.chosen, growth.fitted.evidence
     metrics = {
         "recommended_field": chosen.candidate,
-        "recommended_parameters": chosen.parameters,
+        "recommended_by": choice.measure,
+        **{f"recommended_{measure}": chosen.size.by(measure) for measure in SIZE_WORDS},
         "recommended_error": chosen.mean,
         "recommended_within": int(choice.within),
         "recommended_enough": int(choice.enough),
@@ -180,10 +193,12 @@ def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
         (candidate for candidate in evidence if candidate.candidate == PAPERS.name and candidate.error is not None),
         None,
     )
-    network = {"parameters": PAPERS.size, "flops_per_query": PAPERS.flops, "bytes": FLOAT * PAPERS.size}
+    size = Size(PAPERS.stored, PAPERS.stored)
+    ratios = {measure: size.by(measure) / chosen.size.by(measure) for measure in SIZE_WORDS}
+    ratios["flops_per_query"] = PAPERS.flops / chosen.flops_per_query
     if fitted is not None:
-        network["seconds"] = fitted.seconds
-    return {f"saved_{key}": value / max(getattr(chosen, key), TINY) for key, value in network.items()}
+        ratios["seconds"] = fitted.seconds / max(chosen.seconds, TINY)
+    return {f"saved_{key}": ratio for key, ratio in ratios.items()}
 
 
 def pixel_precision_summary(metrics: dict[str, Any], candidate: str) -> list[str]:
@@ -204,7 +219,8 @@ def summary(choice: Choice, growth: Growth) -> str:
     hint = "; no candidate is under half a pixel: more iterations may help" if best.mean > growth.footprint else ""
     noise = best.error.standard_error
     return (
-        f"needs {chosen.candidate}, {chosen.parameters} parameters: held-out error (x1000) {1000 * chosen.mean:.3g} is "
-        f"{why} ({best.candidate}, {1000 * best.mean:.3g} +- {1000 * noise:.2g}){hint}; field=auto ends on "
+        f"needs {chosen.candidate}, {chosen.size}, the smallest by {SIZE_WORDS[choice.measure]}: "
+        f"held-out error (x1000) {1000 * chosen.mean:.3g} is {why} ({best.candidate}, "
+        f"{1000 * best.mean:.3g} +- {1000 * noise:.2g}){hint}; field=auto ends on "
         f"{growth.fitted.evidence.candidate}, {1000 * growth.fitted.evidence.mean:.3g}"
     )

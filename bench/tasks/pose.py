@@ -25,7 +25,7 @@ from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
-from renderers.rendering import Renderer, at_iteration
+from renderers.rendering import Observed, Renderer, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 REACH = 1.05  # half the side of the cube of a known shape's samples: the unit sphere with a margin
@@ -251,7 +251,8 @@ class PoseProblem:
         count = compared.sum().clamp_min(1)
         found, at_one = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
         error = depth_error(self.settings.depth_loss, found, self.depth, at_one)
-        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, self.mask)
+        given = Observed(self.mask, torch.where(self.mask, self.depth / at_one, torch.nan))
+        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, given)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,

@@ -16,7 +16,7 @@ from bench.models.choice import Evidence, choose
 from bench.models.fit import Fitter
 from bench.models.growth import cost, grow
 from bench.models.held_out import MISSED, HeldOut, HeldOutError
-from bench.models.model import Model, Seen
+from bench.models.model import Model, Seen, Size
 from bench.models.observations import Holdout, hold_out, together
 from bench.models.views import Views
 from bench.records.record import RunStatus
@@ -80,9 +80,10 @@ def an_error(mean: float, spread: float = 0.0) -> HeldOutError:
     return HeldOutError(np.stack([10 * means, [10.0] * 4, [0.0] * 4, [10.0] * 4], axis=1), 0.1)
 
 
-def evidence_of(name: str, parameters: int, error: HeldOutError | None) -> Evidence:
+def evidence_of(name: str, size: int | Size, error: HeldOutError | None) -> Evidence:
     status = RunStatus.OK if error else RunStatus.DIVERGED
-    return Evidence(name, parameters, 4 * parameters, 10, error, status, "" if error else "it rose")
+    size = size if isinstance(size, Size) else Size(size, size)
+    return Evidence(name, size, 10, error, status, "" if error else "it rose")
 
 
 @pytest.mark.parametrize("name", SIZES)
@@ -90,8 +91,9 @@ def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
     ball = Model("sphere", [torch.zeros(1, requires_grad=True)], lambda free: sphere(0.5), 0.1, metric=True)
     seen = Seen(points(500).float(), ball, 0, CPU)
     for model in candidate(name).starts(seen):
-        assert model.size == SIZES[name]
-        assert model.bytes == 4 * SIZES[name]
+        assert model.size == Size(SIZES[name], SIZES[name])
+        assert model.size.bytes == 4 * SIZES[name]
+        assert candidate(name).stored == SIZES[name]
         assert model.field().flops.value == candidate(name).flops
         values = model.field()(points(50).float())
         values.sum().backward()
@@ -99,8 +101,8 @@ def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
 
 
 def test_the_papers_network_has_1_8_million():
-    assert PAPERS.size == 1_839_614
-    assert PAPERS.flops == pytest.approx(2 * PAPERS.size, rel=0.01)
+    assert PAPERS.stored == 1_839_614
+    assert PAPERS.flops == pytest.approx(2 * PAPERS.stored, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,7 @@ def test_the_papers_network_has_1_8_million():
 )  # fmt: skip
 def test_an_unknown_candidate_is_an_error(name, message):
     with pytest.raises(ValueError, match=message):
-        ModelSettings((name,), FIT, GROWTH, VIEWS)
+        ModelSettings((name,), "stored", FIT, GROWTH, VIEWS)
 
 
 def test_a_rounded_box_can_be_a_box_and_a_capsule():
@@ -159,8 +161,10 @@ def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
     (model,) = candidate("grid_24").starts(Seen(torch.tensor([[0.9, 0.9, 0.9]]), ball, 0, CPU))
     cell = 2 * REACH / 23
     shell = 4 * np.pi * 0.5**2 * 4 * cell / cell**3  # two cells to both sides
-    assert model.size == pytest.approx(shell + 4**3, rel=0.15)
-    assert model.bytes == 4 * 24**3
+    assert model.size.free == pytest.approx(shell + 4**3, rel=0.15)
+    assert model.size.stored == candidate("grid_24").stored == 24**3
+    assert model.size.bytes == 4 * 24**3
+    assert model.size.sparse_bytes == 4 * model.size.free + 24**3 / 8 + 4  # the previous field has one number
     where = 0.5 * points(200).float()
     assert (model.field()(where) - sphere(0.5)(where)).abs().max() < 0.5 * cell
     model.parameters[0].data.fill_(1.0)
@@ -241,14 +245,14 @@ CASES = {
 def test_the_choice_is(case):
     candidates, footprint, chosen, within, enough = CASES[case]
     ladder = [evidence_of(str(size), size, an_error(mean, 0.0015)) for size, mean in candidates]  # s.e. about 0.00097
-    choice = choose([evidence_of("failed", 1, None), *ladder], footprint)
-    assert (choice.chosen.parameters, choice.within, choice.enough) == (chosen, within, enough)
+    choice = choose([evidence_of("failed", 1, None), *ladder], footprint, "stored")
+    assert (choice.chosen.size.stored, choice.within, choice.enough) == (chosen, within, enough)
     assert choice.best.mean == pytest.approx(min(mean for _, mean in candidates))
 
 
 def test_a_choice_without_a_successful_fit_is_an_error():
     with pytest.raises(ValueError, match="all fits failed; the last: it rose"):
-        choose([evidence_of("failed", 1, None)], 0.01)
+        choose([evidence_of("failed", 1, None)], 0.01, "stored")
 
 
 def test_a_warm_start_alone_finds_a_sphere_and_a_box():
@@ -294,7 +298,7 @@ def test_growth_ends_on_a_sufficient_candidate():
     assert list(boxed.fields) == ["sphere", "box"]
     assert boxed.fitted.evidence.mean < views_of("box").footprint
     assert boxed.total("evaluations") > boxed.fitted.evidence.evaluations
-    assert boxed.summary("auto")[0].startswith("field=auto: sphere -> box, 9 parameters, held-out error 0.0")
+    assert boxed.summary("auto")[0].startswith("field=auto: sphere -> box, 9 numbers, held-out error 0.0")
 
 
 def test_growth_ends_with_patience_and_budget():
@@ -426,4 +430,4 @@ def test_unions_without_points_have_distinct_parts():
 
 def test_a_repeated_candidate_is_an_error():
     with pytest.raises(ValueError, match="name each candidate once"):
-        ModelSettings(("sphere", "box", "sphere"), FIT, GROWTH, VIEWS)
+        ModelSettings(("sphere", "box", "sphere"), "stored", FIT, GROWTH, VIEWS)

@@ -14,7 +14,7 @@ from bench.setup.inputs import set_up
 from renderers.adaptive_samples import Following, Seen, at_max_samples, final_note, follow, fresh, thickness, thinnest
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.rendering import Renderer, Scheduled, at_iteration
+from renderers.rendering import Observed, Renderer, Scheduled, Status, at_iteration
 from tests.renderers.analytic_cases import vector
 from tests.tiny import camera_of, silent
 
@@ -128,11 +128,15 @@ def test_it_is_a_renderer_with_the_loss_and_the_schedule_of_the_inner_one():
     assert isinstance(following, Renderer) and isinstance(following, Scheduled)
     assert following.capabilities == DVR.capabilities
     rendering, mask = hits_of(PLATE, RAYS), torch.ones(32, 32, dtype=torch.bool)
-    losses = []
-    for renderer in (DVR, following):
+    losses, at_depth = [], replace(DVR, occupied_at="depth")
+    nothing = replace(rendering, status=torch.full_like(rendering.status, Status.MISS))
+    given = Observed(mask, torch.full_like(rendering.distance, 2.0))
+    for renderer in (DVR, following, at_depth, follow(at_depth)):
         torch.manual_seed(0)
-        losses.append(renderer.silhouette_loss(PLATE, RAYS, rendering, mask))
-    assert torch.equal(*losses)
+        losses.append([renderer.silhouette_loss(PLATE, RAYS, rendering, mask)])
+        losses[-1] += [renderer.observed_loss(PLATE, RAYS, nothing, given)]
+    assert losses[0] == losses[1] and losses[2] == losses[3]
+    assert losses[0][0] == losses[2][0] and losses[0][1] != losses[2][1]
 
     class Turning(type(DVR)):
         def at_iteration(self, iteration):

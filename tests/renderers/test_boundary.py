@@ -12,17 +12,18 @@ from renderers.boundary import BrokenContract, check_gradients, rendered, silhou
 from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, sphere
-from renderers.rendering import Capabilities, Rendering
+from renderers.rendering import Capabilities, Observed, Rendering
 from tests.tiny import camera_of
 
 IDR = load("renderer", "idr")
 RAYS = camera_of(8).rays()
 MASK = torch.ones(RAYS.shape, dtype=torch.bool)
+SEEN = Observed(MASK)
 BOTH = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
 NEITHER = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
 
 
-def changed(rendering: Rendering, **parts: Any) -> Rendering:
+def changed(rendering: Any, **parts: Any) -> Any:
     """A rendering with other parts, which do not pass through the checks of types that tests alone have."""
     made = replace(rendering)
     for name, value in parts.items():
@@ -109,7 +110,7 @@ def test_the_renderer_within_a_following_one_is_named():
     with pytest.raises(BrokenContract, match=r"Mine\.render must return a Rendering"):
         rendered(following, ball(), RAYS)
     with pytest.raises(BrokenContract, match=r"Mine\.silhouette_loss must return a tensor"):
-        silhouette_loss(Following(Mine(loss=lambda loss: None)), ball(), RAYS, IDR.render(ball(), RAYS), MASK)
+        silhouette_loss(Following(Mine(loss=lambda loss: None)), ball(), RAYS, IDR.render(ball(), RAYS), SEEN)
 
 
 def test_values_are_data_not_a_number_among_them():
@@ -158,15 +159,39 @@ def test_a_broken_silhouette_loss_is_an_error(name):
     change, message = LOSSES[name]
     field = ball(free=True)
     with pytest.raises(BrokenContract, match=message):
-        silhouette_loss(Mine(loss=change), field, RAYS, IDR.render(field, RAYS), MASK)
+        silhouette_loss(Mine(loss=change), field, RAYS, IDR.render(field, RAYS), SEEN)
+
+
+@dataclass
+class Told(Mine):
+    """IDR, with a loss that takes the given distances: their mean."""
+
+    def observed_loss(self, field, rays, rendering, observed):
+        return self.loss(observed.distance.mean())
+
+
+def test_given_distances_reach_a_renderer_that_takes_them_and_no_other():
+    field, seen = ball(), Observed(MASK, torch.full(RAYS.shape, 1.25))
+    rendering = IDR.render(field, RAYS)
+    assert silhouette_loss(Told(), field, RAYS, rendering, seen) == 1.25
+    assert silhouette_loss(Mine(), field, RAYS, rendering, seen) == IDR.silhouette_loss(field, RAYS, rendering, MASK)
+    with pytest.raises(BrokenContract, match=r"Told\.observed_loss must return a tensor with one number, not None"):
+        silhouette_loss(Told(loss=lambda loss: None), field, RAYS, rendering, seen)
+
+
+def test_observations_of_a_wrong_shape_or_type_are_errors():
+    with pytest.raises(ValueError, match=r"mask must be boolean, not torch\.float32: compare a picture with"):
+        changed(SEEN, mask=MASK.float()).__post_init__()
+    with pytest.raises(ValueError, match=r"distance must have the mask's shape \[8, 8\], not \[3\]: give NaN where no"):
+        changed(SEEN, distance=torch.ones(3)).__post_init__()
 
 
 def test_a_silhouette_loss_of_zero_needs_no_gradient():
     field = ball(free=True)
     rendering = IDR.render(field, RAYS)
-    assert silhouette_loss(Mine(loss=lambda loss: torch.zeros(())), field, RAYS, rendering, MASK) == 0
+    assert silhouette_loss(Mine(loss=lambda loss: torch.zeros(())), field, RAYS, rendering, SEEN) == 0
     with pytest.raises(BrokenContract, match="towards the rays"):
-        silhouette_loss(Mine(loss=lambda loss: torch.ones(())), ball(), free_rays(), rendering, MASK)
+        silhouette_loss(Mine(loss=lambda loss: torch.ones(())), ball(), free_rays(), rendering, SEEN)
 
 
 def test_missing_gradients_of_a_hit_are_errors_where_they_are_claimed():
@@ -189,7 +214,7 @@ def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
     expected_loss = renderer.silhouette_loss(plain, RAYS, expected, MASK)
     torch.manual_seed(0)
     found = rendered(renderer, checked, RAYS)
-    found_loss = silhouette_loss(renderer, checked, RAYS, found, MASK)
+    found_loss = silhouette_loss(renderer, checked, RAYS, found, SEEN)
     assert torch.equal(found.distance, expected.distance) and found_loss.item() == expected_loss.item()
     if free:
         (expected.distance.sum() + expected_loss).backward()

@@ -1,7 +1,7 @@
 """DVR and IDR: what is found, what is missed, gradients and mask losses, by hand."""
 
 from dataclasses import replace
-from math import log, log1p
+from math import exp, log, log1p, nan
 
 import pytest
 import torch
@@ -14,7 +14,8 @@ from renderers.field import Kind, Meter, occupancy_field
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.fields.occupancy import OccupancyNetwork
 from renderers.gradients import implicit
-from renderers.rendering import Rendering, Spaced, Status, at_iteration
+from renderers.rendering import Observed, Rendering, Spaced, Status, at_iteration
+from renderers.silhouette import Own
 from tests.renderers.analytic_cases import CASES, Case, vector
 
 DVR = load("renderer", "dvr", mask_weight=1.0)
@@ -158,6 +159,64 @@ def test_dvr_mask_losses_by_hand():
         values.append((0.64 + z**2) ** 0.5 - 0.5)
     free, occupied = (softplus(torch.tensor(sign * v / width)).item() for sign, v in ((-1, values[0]), (1, values[1])))
     assert loss.item() == pytest.approx((log(2) + free + occupied) / 6, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["own", "occupancy"])
+def test_a_shrunk_sphere_grows_where_depth_is_given(name):
+    """A ray through the mask that passes the sphere by is judged exactly at its given distance, by hand."""
+    width, rays = 0.1, along_z(0.6)
+    dvr = replace(DVR, occupancy_width=width, occupied_at="depth")
+    loss = Own() if name == "own" else load("silhouette", name, width=width, weight=1.0, occupied_at="depth")
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    rendering = dvr.render(sphere(radius), rays)
+    seen = Observed(torch.tensor([True]), torch.tensor([1.9], dtype=torch.float64))
+    found = loss(dvr, sphere(radius), rays, rendering, seen)
+    value = ((0.6**2 + 0.1**2) ** 0.5 - 0.5) / width  # at z = -0.1
+    assert found.item() == pytest.approx(log1p(exp(value)), rel=1e-9)
+    (slope,) = torch.autograd.grad(found, radius)
+    assert slope.item() == pytest.approx(-1 / (1 + exp(-value)) / width, rel=1e-9)
+
+
+def observed_losses(renderer, mask: list[bool], given: list[float], *heights: float) -> list[float]:
+    """The loss of each ray with the distances that are given, and of the mask alone, from the same draws."""
+    rays, found = along_z(*heights), []
+    rendering = renderer.render(sphere(0.5), rays)
+    seen = Observed(torch.tensor(mask), torch.tensor(given, dtype=torch.float64))
+    for observed in (seen, Observed(seen.mask)):
+        torch.manual_seed(0)
+        found.append(renderer.observed_loss(sphere(0.5), rays, rendering, observed).item())
+    torch.manual_seed(0)
+    assert renderer.silhouette_loss(sphere(0.5), rays, rendering, seen.mask).item() == found[1]
+    return found
+
+
+CASES_AT_RANDOM = {  # mask, distance; a chord at height 0.6 goes from distance 1.2 to 2.8
+    "no distance is given": (True, nan),
+    "it lies before the sphere": (True, 1.0),
+    "it lies behind the sphere": (True, 3.0),
+    "the ray is background": (False, 2.0),
+}
+
+
+@pytest.mark.parametrize("case", CASES_AT_RANDOM)
+def test_a_point_is_drawn_where(case):
+    mask, given = CASES_AT_RANDOM[case]
+    with_depth, without = observed_losses(replace(DVR, occupied_at="depth"), [mask], [given], 0.6)
+    assert with_depth == without
+
+
+def test_at_random_given_distances_change_no_digit():
+    heights = 0.0, 0.6, 0.7, 0.8, 1.5
+    mask, given = [True, True, True, False, True], [1.5, 2.0, 1.9, 2.0, 2.0]
+    with_depth, without = observed_losses(replace(DVR, occupied_at="random"), mask, given, *heights)
+    assert with_depth == without
+    moved, _ = observed_losses(replace(DVR, occupied_at="depth"), mask, given, *heights)
+    assert moved != without
+
+
+def test_a_place_that_is_not_built_is_refused():
+    with pytest.raises(ValueError, match="occupied_at must be one of random, depth, not 'hull'"):
+        replace(DVR, occupied_at="hull")
 
 
 def test_the_loss_takes_values_of_a_level_set_as_logits():

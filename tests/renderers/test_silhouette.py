@@ -10,7 +10,7 @@ from bench.config import CONF, load
 from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
-from renderers.rendering import Capabilities, Renderer
+from renderers.rendering import Capabilities, Observed, Renderer
 from renderers.silhouette import Hinge, SilhouetteLoss
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
@@ -91,7 +91,7 @@ def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tup
     origins = torch.stack([HEIGHTS, torch.zeros_like(HEIGHTS), torch.full_like(HEIGHTS, -2.0)], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 3))
     torch.manual_seed(0)  # some losses draw points
-    value = loss(renderer, sphere(radius), rays, renderer.render(sphere(radius), rays), torch.tensor(mask))
+    value = loss(renderer, sphere(radius), rays, renderer.render(sphere(radius), rays), Observed(torch.tensor(mask)))
     slope = torch.autograd.grad(value, radius, allow_unused=True)[0] if value.requires_grad else None
     return value.item(), 0.0 if slope is None else slope.item()
 
@@ -130,6 +130,7 @@ def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
         ("cross_entropy", {"sharpness": -1.0}, "sharpness must be positive, not -1.0"),
         ("occupancy", {"width": 0.0}, "width must be positive, not 0.0"),
         ("occupancy", {"weight": -1.0}, "weight must be at least 0, not -1.0"),
+        ("occupancy", {"occupied_at": "hull"}, "occupied_at must be one of random, depth, not 'hull'"),
     ],
 )
 def test_what_cannot_be_is_told(loss, values, message):

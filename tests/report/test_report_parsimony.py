@@ -18,7 +18,8 @@ from bench.report.write.result import latex
 from tests.report.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture
 
 PAPERS = 1_839_614
-SIZES = {"sphere": 4, "box": 9, "union_3": 30, "grid_24": 3000, NETWORK: PAPERS}
+SIZES = {"sphere": 4, "box": 9, "union_3": 30, "grid_24": 3000, NETWORK: PAPERS}  # free numbers
+STORED = SIZES | {"grid_24": 13_824}
 COSTS = {"seconds": 2.0, "evaluations": 1000, "flops": 1_000_000}
 VIEWS = {"fitted": 12, "held_out": 8, "share": 0.1}
 CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIEWS, "fit": {"iterations": 100}}}
@@ -31,14 +32,17 @@ def climbed(
     known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
     known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": enough}
     for name, error in errors.items():
-        spent = {"parameters": SIZES[name], "bytes": 4 * SIZES[name], "flops_per_query": 2 * SIZES[name], **COSTS}
+        spent = {"free": SIZES[name], "stored": STORED[name], "bytes": 4 * STORED[name], **COSTS}
+        spent |= {"flops_per_query": 2 * SIZES[name]}
         spent |= {"failed": "nan: why"} if name in failed else {"error": 0.02 * error, "standard_error": 0.001}
         spent |= dict.fromkeys((f"{cost}_at_auto" for cost in COSTS), at_auto if name == NETWORK else None)
         known |= {f"{name}.{key}": value for key, value in spent.items()}
     best = min((name for name in errors if name not in failed), key=lambda name: errors[name])
-    known |= {"recommended_field": needs, "recommended_parameters": SIZES[needs], "best_field": best}
-    known |= {"recommended_error": known[f"{needs}.error"], "saved_parameters": PAPERS / SIZES[needs]}
-    known |= {"auto.field": needs, "auto.parameters": SIZES[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
+    known |= {"recommended_field": needs, "best_field": best, "recommended_by": "stored"}
+    known |= {f"recommended_{size}": known[f"{needs}.{size}"] for size in ("free", "stored", "bytes")}
+    known |= {"recommended_error": known[f"{needs}.error"], "saved_free": PAPERS / SIZES[needs]}
+    known |= {"saved_stored": PAPERS / STORED[needs], "saved_bytes": PAPERS / STORED[needs]}
+    known |= {"auto.field": needs, "auto.stored": STORED[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
     known |= {
         "auto.seconds": 4.0,
         "auto.evaluations": 500,
@@ -46,7 +50,7 @@ def climbed(
         "auto.overhead": 1.5,
         "auto.overhead_judged": 2.5,
     }
-    known |= {"frugal.parameters": SIZES[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
+    known |= {"frugal.stored": STORED[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
     known |= {"frugal.seconds": 1.0, "precision.evaluations": 1000, "precision.evaluations_auto": 400}
     known |= {"precision.hits": 100, "precision.lost": 1, "precision.gained": 7} | metrics
     known = {name: value for name, value in known.items() if value is not ...}
@@ -106,12 +110,15 @@ def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(four):
 def test_a_row_tells_the_need_and_what_it_saves(four):
     cells = row(four, parsimony.make, "box")
     assert cells["Recommended"] == "box"
-    assert cells["Parameters"] == "9"
+    assert (cells["Stored numbers"], cells["Free numbers"], cells["Size of the file"]) == ("9", "9", "36 B")
+    grid = row(four, parsimony.make, "car")
+    assert (grid["Stored numbers"], grid["Free numbers"], grid["Size of the file"]) == ("13,824", "3,000", "55.3 kB")
     assert cells["Error × 1000"] == "10.0 ± 1.00"
     assert cells["Half a pixel × 1000"] == "20.0"
     assert (cells["Best candidate"], cells["Best error × 1000"]) == ("grid 24", "4.00 ± 1.00")
     assert (cells["Seeds within 1 s.e."], cells["Seeds held"]) == ("60 %", "95 %")
-    assert cells["Saved parameters"] == "204k×"
+    assert cells["Saved stored numbers"] == cells["Saved free numbers"] == "204k×"
+    assert (grid["Saved stored numbers"], grid["Saved free numbers"]) == ("133×", "613×")
     assert cells["Saved fit seconds"] == "–"  # the papers' network was not fitted
     assert cells["Chamfer × 1000"] == "1.00"
 
@@ -160,7 +167,7 @@ def test_half_a_pixel_and_the_band_above_the_best_are_drawn(four):
 
 
 def test_a_place_that_is_left_over_holds_the_legend(four):
-    figure = parsimony.draw([*scene_runs(chosen(four)), scene_runs(chosen(four))[0]], "parameters")
+    figure = parsimony.draw([*scene_runs(chosen(four)), scene_runs(chosen(four))[0]], "stored")
     assert len(figure.axes) == 8 and not figure.legends
     assert figure.axes[-1].get_legend() is not None
 
@@ -169,7 +176,8 @@ def test_need_over_what_the_best_single_part_leaves(four):
     made = made_of(four, parsimony.make_needs)
     data = made.data.set_index("scene")
     assert list(data["single_part_error_footprints"][:3]) == pytest.approx([0.01, 0.5, 8])
-    assert list(data["recommended_parameters"][:3]) == [4, 9, 3000]
+    assert list(data["recommended_free"][:3]) == [4, 9, 3000]
+    assert list(data["recommended_stored"][:3]) == [4, 9, 13_824]
     assert data.loc["torus", "single_part_error_footprints"] is None
     assert "3 of 4 scenes are drawn." in made.caption
     axis = made.figure.axes[0]
@@ -177,7 +185,51 @@ def test_need_over_what_the_best_single_part_leaves(four):
     levels = [line.get_ydata()[0] for line in axis.lines if line.get_label() in ("a tenth of it", "papers' network")]
     assert levels == pytest.approx([PAPERS, PAPERS / 10])
     colours = {to_hex(c.lines[0].get_color()): list(c.lines[0].get_ydata()) for c in axis.containers}
-    assert colours == {KINDS[""][1]: [4, 9], KINDS["grid"][1]: [3000]}
+    assert colours == {KINDS[""][1]: [4, 9], KINDS["grid"][1]: [13_824]}
+
+
+PAGES = (parsimony.make, parsimony.make_flops, parsimony.make_needs)
+# As records were before sizes were told apart: NAME.parameters are the free numbers, NAME.bytes of the stored ones.
+OLDER = {"recommended_by": ..., "recommended_free": ..., "recommended_stored": ..., "recommended_bytes": ...}
+OLDER |= {"saved_free": ..., "saved_stored": ..., "saved_bytes": PAPERS / 13_824, "saved_parameters": PAPERS / 3000}
+OLDER |= {"recommended_parameters": 3000, "auto.stored": ..., "frugal.stored": ...}
+
+
+def older(results, scene) -> None:
+    """A run of an older record, whose choice was by free numbers."""
+    names = ("box", "grid_24")
+    sizes = {f"{name}.{size}": ... for name in names for size in ("free", "stored")}
+    sizes |= {f"{name}.parameters": SIZES[name] for name in names}
+    climbed(results, scene, {"box": 8, "grid_24": 0.5}, needs="grid_24", **OLDER, **sizes)
+
+
+def test_older_records_have_their_sizes_and_their_measure(tmp_path):
+    older(tmp_path, "car")
+    made = parsimony.make(chosen(tmp_path))
+    cells = made.table.set_index("Scene").loc["car"]
+    assert (cells["Stored numbers"], cells["Free numbers"], cells["Size of the file"]) == ("13,824", "3,000", "55.3 kB")
+    assert (cells["Saved stored numbers"], cells["Saved free numbers"]) == ("133×", "613×")
+    assert "free numbers" in made.title and "The size of a field is its free numbers." in made.notes
+    assert made.figure.axes[0].get_xlabel() == "free numbers"
+    data = parsimony.make_needs(chosen(tmp_path)).data
+    assert (data["recommended_stored"].item(), data["recommended_free"].item()) == (13_824, 3000)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_captions_and_notes_say_by_which_size_the_choice_is(four, page):
+    made = made_of(four, page)
+    assert "The size of a field is its stored numbers." in made.notes
+    assert page is parsimony.make_flops or "tored numbers" in made.caption
+    if page is not parsimony.make_needs:
+        assert any("the smallest candidate by stored numbers whose error" in note for note in made.notes)
+
+
+def test_choices_by_different_sizes_are_told(tmp_path):
+    older(tmp_path, "car")
+    climbed(tmp_path, "box", {"sphere": 7, "box": 0.5}, needs="box")
+    told = "not the same for all scenes: stored numbers for box; free numbers for car."
+    for page in (*PAGES, parsimony_auto.make):
+        assert any(note.endswith(told) for note in page(chosen(tmp_path)).notes)
 
 
 def test_names_of_near_points_do_not_cover_each_other(tmp_path):

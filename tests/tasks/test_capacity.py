@@ -14,6 +14,7 @@ from bench.models.choice import Evidence
 from bench.models.field import verdict
 from bench.models.growth import grow
 from bench.models.held_out import HeldOutError
+from bench.models.model import Size
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus, read_record
 from bench.run.execute import execute
@@ -52,9 +53,11 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert (record.status, record.reason) == ("ok", "")
     metrics = record.metrics
     assert metrics["recommended_field"] == "rounded_box"
-    assert metrics["recommended_parameters"] == 10 == metrics["rounded_box.parameters"]
+    assert metrics["recommended_by"] == "stored"
+    for size, number in (("free", 10), ("stored", 10), ("bytes", 40)):
+        assert metrics[f"recommended_{size}"] == number == metrics[f"rounded_box.{size}"]
     assert metrics["recommended_error"] == metrics["rounded_box.error"] < metrics["footprint"]
-    assert metrics["saved_parameters"] == PAPERS.size / 10
+    assert metrics["saved_stored"] == metrics["saved_free"] == metrics["saved_bytes"] == PAPERS.stored / 10
     assert "saved_seconds" not in metrics  # the network was not fitted
     for name in ("sphere", "network_1x16"):
         assert metrics[f"{name}.error"] > metrics["footprint"]
@@ -66,7 +69,9 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert metrics["frugal.evaluations"] < metrics["rounded_box.evaluations"]
     assert 0 <= metrics["held_out_seeds_within"] <= metrics["held_out_seeds_held"] == 1
     assert metrics["chamfer_l2"] < 0.01
-    assert any("needs rounded_box, 10 parameters" in note for note in record.notes)
+    assert any(
+        "needs rounded_box, 10 numbers, the smallest by stored numbers: held-out" in note for note in record.notes
+    )
     settings = [note for note in record.notes if note.startswith("pixel precision: renderer.")]
     assert [note.split()[2] for note in settings] == ["renderer.epsilon=auto", "renderer.steps=auto"]
     saved = next(note for note in record.notes if note.startswith("pixel precision: error"))
@@ -86,8 +91,23 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert read_record(tmp_path)["metrics"]["recommended_field"] == "rounded_box"
     show(tmp_path, record, tmp_path)
     shown = capsys.readouterr().out
-    assert re.search(r"=> +rounded box +10 ", shown)
+    assert re.search(r"=> +rounded box +10 +10 +40 ", shown)
     assert "half a pixel is" in shown
+
+
+@pytest.mark.parametrize(("measure", "needs"), [("free", "grid_12"), ("stored", "network_1x64")])
+def test_a_real_fit_whose_choice_depends_on_the_measure(compose_config, tmp_path, measure, needs):
+    """Both candidates are under half a pixel, which is wide here: a grid of 1,728 samples, of which few are fitted."""
+    ladder, few = "models.candidates=[grid_12,network_1x64]", ("task.checks.views=3", "task.checks.drawn=2")
+    fits = ("models.fit.iterations=8", "models.fit.warm_iterations=150", "view.resolution=8")
+    record = run(
+        *(tmp_path, compose_config, "task=capacity", "dataset=sphere", ladder, f"models.size={measure}", *few, *fits)
+    )
+    metrics = record.metrics
+    assert (record.status, metrics["recommended_field"], metrics["recommended_by"]) == ("ok", needs, measure)
+    assert metrics["grid_12.stored"] == 1728 == metrics["grid_12.bytes"] / 4 > metrics["network_1x64.stored"]
+    assert metrics["grid_12.free"] < metrics["network_1x64.free"] == metrics["network_1x64.stored"]
+    assert metrics["grid_12.sparse_bytes"] < metrics["grid_12.bytes"]
 
 
 def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
@@ -118,7 +138,7 @@ def test_the_final_number_of_samples_is_noted_for_the_recommended_candidate(comp
 
 
 def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
-    ladder = ModelSettings(("sphere",), FIT, GROWTH, VIEWS)
+    ladder = ModelSettings(("sphere",), "stored", FIT, GROWTH, VIEWS)
     run = run_of(tmp_path, Blind(), ball_prior(), camera_of(8), field=FieldChoice("prior", ladder))
     task = Capacity("depth", 10.0, Own(), 10.0, 0.5, CheckSettings(4, 2, 2))
     with pytest.raises(Unsupported, match="no gradient towards the field"):
@@ -127,8 +147,8 @@ def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
 
 def test_saved_time_is_given_only_where_the_network_was_fitted():
     error = HeldOutError(np.array([[0.1, 10, 0, 10]] * 3), 0.1)
-    chosen = Evidence("sphere", 4, 16, 10, error, seconds=2.0)
-    network = Evidence(PAPERS.name, PAPERS.size, 4 * PAPERS.size, PAPERS.flops, error, seconds=300.0)
+    chosen = Evidence("sphere", Size(4, 4), 10, error, seconds=2.0)
+    network = Evidence(PAPERS.name, Size(PAPERS.stored, PAPERS.stored), PAPERS.flops, error, seconds=300.0)
     failed = replace(network, error=None, status=RunStatus.DIVERGED)
     assert saved(chosen, [chosen, network])["saved_seconds"] == 150
     assert "saved_seconds" not in saved(chosen, [chosen, failed])
@@ -159,7 +179,8 @@ def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     record = run(tmp_path, compose_config, *overrides, *asked, *BETTER)
     assert record.status == "ok", record.reason
     assert record.metrics["field"] == ends
-    assert record.metrics["field_parameters"] == {"box": 9, "sphere": 4}[ends]
+    assert record.metrics["field_free"] == record.metrics["field_stored"] == {"box": 9, "sphere": 4}[ends]
+    assert record.metrics["field_bytes"] == 4 * record.metrics["field_stored"]
     assert record.metrics["field_error"] < 3 * record.metrics["field_footprint"]
     assert record.evaluations["iterations"] >= 20
     assert record.evaluations["observed"] >= 50
@@ -178,7 +199,7 @@ def test_a_pose_is_found_with_a_grown_shape(compose_config, tmp_path):
     )
     record = run(tmp_path, compose_config, *overrides, "task.optimiser.iterations=3", "models.fit.warm_iterations=80")
     assert record.status in ("ok", "not_reached"), record.reason
-    assert any(note.startswith("field=auto: sphere -> box, 9 parameters") for note in record.notes)
+    assert any(note.startswith("field=auto: sphere -> box, 9 numbers") for note in record.notes)
     assert record.metrics["mask_iou"] > 0.5
 
 

@@ -127,6 +127,24 @@ def test_the_mask_is_given_to_the_renderers_own_loss(problem_of):
     assert renderer.asked.tolist() == MASK
 
 
+@dataclass
+class Told(Fake):
+    """A fake whose loss takes the given distances as well."""
+
+    def observed_loss(self, field, rays, rendering, observed):
+        self.asked = observed.distance
+        return rendering.closest.sum() * 0 + SILHOUETTE
+
+
+def test_given_distances_are_told_to_a_loss_that_takes_them(problem_of):
+    renderer = Told()
+    problem = problem_of(renderer, points="2")
+    values(problem)
+    given = renderer.asked.isfinite()
+    assert torch.equal(given, problem.observed) and given.sum() == 2
+    assert renderer.asked[given].tolist() == pytest.approx([2.0 / COSINE] * 2)
+
+
 def test_without_a_mask_there_is_no_silhouette_term(problem_of):
     renderer = Fake()
     terms = values(problem_of(renderer, points="3", mask=False))

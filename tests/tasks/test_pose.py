@@ -70,6 +70,23 @@ def test_a_renderer_that_claims_a_gradient_towards_rays_and_lacks_it_is_told(sce
         SETTINGS.execute(run)
 
 
+def test_the_distances_of_the_view_are_told_to_a_loss_that_takes_them(scene):
+    asked = []
+
+    class Told(type(DIST)):
+        """Keeps what it is asked about."""
+
+        def observed_loss(self, field, rays, rendering, observed):
+            asked.append((rays, observed))
+            return self.silhouette_loss(field, rays, rendering, observed.mask)
+
+    problem_of(scene, Told(**vars(DIST)), degrees=0.0, shift=0.0).loss(0)
+    ((rays, observed),) = asked
+    assert torch.equal(observed.distance.isfinite(), scene.view.mask)
+    points = rays.at(observed.distance.nan_to_num())[scene.view.mask]
+    assert box(SIZES)(points).abs().max() < 1e-4  # on the true surface
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
 def test_the_error_of_a_turn_is_its_angle(angle):
     axis = torch.tensor([0.6, 0.0, 0.8])

@@ -7,10 +7,10 @@ from functools import cached_property
 from pathlib import PurePath
 from typing import Any
 
-from bench.pictures.size_chart import Candidates
+from bench.pictures.size_chart import AXES, Candidates
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, Record, family, index, measured, row_of, setting
+from bench.report.data.records import SCALE, Record, family, grouped, index, measured, row_of, setting
 
 PARSIMONY = Selection("parsimony", ("capacity",), ("dataset",), setup=("scenes", "pixels", "machine"))
 NETWORK = "network_8x512"  # the papers' network: that of DeepSDF and DIST, without a code
@@ -29,6 +29,10 @@ NAMING: tuple[tuple[Callable[[Record], Any], str], ...] = (  # parts of a scene'
     (index, "shape {}"),
     (lambda record: record["seed"], "seed {}"),
 )
+
+
+FLOAT = 4  # bytes of a number
+SIZES = ("stored", "free", "bytes")
 
 
 @dataclass(frozen=True)
@@ -121,8 +125,44 @@ def scene_runs(experiment: Experiment) -> list[SceneRun]:
     runs = []
     for record in experiment.records:
         name = ", ".join([short[family(record)], *(words.format(part(record)) for part, words in naming)])
+        record = record | {"metrics": sized(record["metrics"])}
         runs.append(SceneRun(name, record, Candidates.of(record["metrics"] if record["status"] == "ok" else {})))
-    return sorted(runs, key=lambda run: (not run.ok, run.number("recommended_parameters") or 0, run.name))
+    size = f"recommended_{measure_of(runs)}"
+    return sorted(runs, key=lambda run: (not run.ok, run.number(size) or 0, run.name))
+
+
+def sized(metrics: dict[str, Any]) -> dict[str, Any]:
+    """The metrics with the sizes that older records lack.
+
+    These have NAME.parameters, the free numbers, and NAME.bytes, of all stored numbers; they chose by the former.
+    """
+    known = dict(metrics)
+    for name in [key.removesuffix(".parameters") for key in metrics if key.endswith(".parameters")]:
+        known[f"{name}.free"] = known.pop(f"{name}.parameters")
+        if (size := known.get(f"{name}.bytes")) is not None:
+            known[f"{name}.stored"] = size // FLOAT
+    if "recommended_parameters" in known:
+        chosen = known["recommended_field"]
+        del known["recommended_parameters"]
+        known |= {f"recommended_{size}": known.get(f"{chosen}.{size}") for size in SIZES}
+    if "saved_parameters" in known:
+        known |= {"saved_free": known.pop("saved_parameters"), "saved_stored": known.get("saved_bytes")}
+    return known
+
+
+def measure_of(runs: list[SceneRun]) -> str:
+    """The measure of size by which the runs chose; where they differ, "stored", which all of them have."""
+    measures = {run.candidates.measure for run in runs if run.ok}
+    return measures.pop() if len(measures) == 1 else "stored"
+
+
+def measure_note(runs: list[SceneRun]) -> str:
+    """By which measure of size the choices are made."""
+    scenes = grouped((run for run in runs if run.ok), lambda run: run.candidates.measure)
+    if len(scenes) < 2:
+        return f"The size of a field is its {AXES[measure_of(runs)]}."
+    parts = (f"{AXES[measure]} for {', '.join(run.name for run in some)}" for measure, some in scenes.items())
+    return f"The size by which the choice is made is not the same for all scenes: {'; '.join(parts)}."
 
 
 def named_settings(experiment: Experiment) -> dict[str, float]:

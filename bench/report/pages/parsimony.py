@@ -1,4 +1,4 @@
-"""Model selection: each candidate's error over its parameters and over the FLOPs of a query, and a scene's need.
+"""Model selection: each candidate's error over its size and over the FLOPs of a query, and a scene's need.
 
 A scene's need is the size of its recommended field; its complexity is measured as the error of the best single part.
 """
@@ -13,10 +13,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.pictures.size_chart import AXES, KINDS, CandidateResult, panel
+from bench.pictures.size_chart import AXES, FLOPS, KINDS, CandidateResult, panel
 from bench.records import format
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import PARSIMONY, SceneRun, factor, failures, named_settings, over, scene_runs, spread
+from bench.report.data.parsimony import (
+    PARSIMONY,
+    SIZES,
+    SceneRun,
+    factor,
+    failures,
+    measure_note,
+    measure_of,
+    named_settings,
+    over,
+    scene_runs,
+    spread,
+)
 from bench.report.data.records import grouped
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -33,14 +45,18 @@ NOTES = (
     "views', the mean distance along the field's normal between the observed and the rendered point, at most 10 half "
     "pixels, which also counts for a ray that only one of them hits. Half a pixel is measured at the smallest distance "
     "that a shape can have.",
-    "Recommended is the candidate with the fewest parameters whose error is within one standard error (s.e.) of the "
-    "best candidate's, or under half a pixel.",
+    "Recommended is the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
+    "candidate's, or under half a pixel.",
+    "Free numbers are those that the optimiser may change; stored ones are those that a file must hold so that the "
+    "field can be evaluated, of a grid all its samples; bytes are of that file, in float32.",
     "Panels are sorted by the size of the recommended candidate, each with its own scale of errors; a cross at the "
     "upper edge is a candidate whose fit failed; a run that did not end ok has its status in place of the points.",
 )
 TABLE = (
     "Seeds: the share of {seeds:g} draws of {drawn:g} further views on which the recommended candidate is within one "
     "standard error of the draw's best; held also counts those on which it is under half a pixel.",
+    "Of a grid, a file with the fitted samples, a bit per sample and the previous field would do as well, since the "
+    "other samples are computed from that field: sparse_bytes in the CSV; no choice uses it.",
     "Saved: the papers' network (8 layers of 512, without a code) over the recommended candidate; for seconds of the "
     "fits, – where the network was not fitted.",
     "Chamfer distance to the true surface is computed afterwards and takes no part in the choice; as points are "
@@ -52,7 +68,7 @@ QUERY = (
 )
 MOST_ERROR = 10.0  # half pixels: largest error of a ray
 NEEDS_NOTES = (
-    "A single part is a sphere or a kind of box with at most 11 parameters: the error of the best one measures the "
+    "A single part is a sphere or a kind of box with at most 11 numbers: the error of the best one measures the "
     f"complexity of the scene from the data alone. The error of a ray is at most {MOST_ERROR:g} half pixels.",
     "The dashed line is the size of the papers' network, the dotted one a tenth of it.",
 )
@@ -62,50 +78,59 @@ MOST = 4  # most panels in a row
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line and a panel per scene: its recommended candidate, the reason, and the savings."""
     runs = scene_runs(experiment)
-    about = named_settings(experiment)
+    size = AXES[measure_of(runs)]
     return Result(
         experiment,
-        "The smallest sufficient field for each scene.",
-        "Held-out error of each candidate over its parameters, a panel per scene.",
+        f"The smallest sufficient field for each scene, by {size}.",
+        f"Held-out error of each candidate over its {size}, by which the choice is made, a panel per scene.",
         interval=INTERVAL,
-        remarks=(*(note.format(**about) for note in (*NOTES, *TABLE)), *failures(runs, _failed)),
+        remarks=(measure_note(runs), *_notes(experiment, size, *NOTES, *TABLE), *failures(runs, _failed)),
         data=to_data(CANDIDATES, _candidate_lines(runs)),
         table=scene_table(COLUMNS, runs),
-        figure=draw(runs, "parameters"),
+        figure=draw(runs, measure_of(runs)),
     )
 
 
 def make_flops(experiment: Experiment) -> Result:
     """Makes the page with a panel per scene over FLOPs per query."""
     runs = scene_runs(experiment)
-    about = named_settings(experiment)
     return Result(
         experiment,
         "Error over the cost of a query of the field.",
         "Held-out error of each candidate over its FLOPs per query, a panel per scene.",
         interval=INTERVAL,
-        remarks=(QUERY, *(note.format(**about) for note in NOTES)),
-        data=to_data(FLOPS, _candidate_lines(runs)),
-        figure=draw(runs, "flops_per_query"),
+        remarks=(QUERY, measure_note(runs), *_notes(experiment, AXES[measure_of(runs)], *NOTES)),
+        data=to_data(QUERIES, _candidate_lines(runs)),
+        figure=draw(runs, FLOPS),
     )
 
 
 def make_needs(experiment: Experiment) -> Result:
     """Makes the page with a point per scene: the size of its recommended field over its complexity."""
     runs = scene_runs(experiment)
-    lines = [(run, _need(run)) for run in runs]
+    measure = measure_of(runs)
+    lines = [(run, _need(run, measure)) for run in runs]
     needs = [need for _, need in lines if need]
     unknown = [run.name for run, need in lines if run.ok and not need]
     return Result(
         experiment,
-        "Parameters that each scene needs over its complexity.",
-        "Number of parameters of the recommended field over the held-out error of the best single part, in half "
-        f"pixels; {len(needs)} of {len(runs)} scenes are drawn.",
+        "Size of the field that each scene needs over its complexity.",
+        f"{AXES[measure].capitalize()} of the recommended field, by which it is the smallest sufficient one, over the "
+        f"held-out error of the best single part, in half pixels; {len(needs)} of {len(runs)} scenes are drawn.",
         interval=INTERVAL,
-        remarks=(f"Not drawn, as no single part was fitted: {', '.join(unknown)}." if unknown else "", *NEEDS_NOTES),
+        remarks=(
+            f"Not drawn, as no single part was fitted: {', '.join(unknown)}." if unknown else "",
+            measure_note(runs),
+            *NEEDS_NOTES,
+        ),
         data=to_data(NEEDS, lines),
-        figure=draw_needs(needs, papers_size(runs)),
+        figure=draw_needs(needs, papers_size(runs, measure), AXES[measure]),
     )
+
+
+def _notes(experiment: Experiment, size: str, *notes: str) -> list[str]:
+    """The notes with the experiment's settings and the measure of size in words."""
+    return [note.format(**named_settings(experiment), size=size) for note in notes]
 
 
 def _candidate_lines(runs: list[SceneRun]) -> list[tuple[SceneRun, CandidateResult | None]]:
@@ -194,36 +219,36 @@ def _error(result: CandidateResult) -> str:
     return spread(result.error, result.numbers.get("standard_error"))
 
 
-def papers_size(runs: list[SceneRun]) -> float | None:
-    """The number of parameters of the papers' network, computed from the runs' savings; None where unknown."""
-    known = ((run.number("saved_parameters"), run.number("recommended_parameters")) for run in runs)
+def papers_size(runs: list[SceneRun], measure: str) -> float | None:
+    """The size of the papers' network, computed from the runs' savings; None where unknown."""
+    known = ((run.number(f"saved_{measure}"), run.number(f"recommended_{measure}")) for run in runs)
     return next((saved * size for saved, size in known if saved and size), None)
 
 
 @style.styled
-def draw_needs(needs: list[dict[str, Any]], papers: float | None) -> Figure:
-    """Draws the size over the complexity, with a colour per kind of candidate."""
+def draw_needs(needs: list[dict[str, Any]], papers: float | None, size: str) -> Figure:
+    """Draws the size, of the measure in words, over the complexity, with a colour per kind of candidate."""
     figure, ((axes,),) = chart.sheet(3.4)
     of_kind = grouped(needs, itemgetter("kind"))
     for kind, (label, colour, marker) in KINDS.items():
         if kind in of_kind:
-            x, y, bars = ([need[key] for need in of_kind[kind]] for key in ("complexity", "parameters", "spread"))
+            x, y, bars = ([need[key] for need in of_kind[kind]] for key in ("complexity", "size", "spread"))
             axes.errorbar(x, y, xerr=bars, fmt=marker, color=colour, ms=6, elinewidth=0.7, label=label)
     if papers is not None:
-        for size, line, label in ((papers, "--", "papers' network"), (papers / 10, ":", "a tenth of it")):
-            axes.axhline(size, color="#777777", lw=0.9, ls=line, label=label)
+        for height, line, label in ((papers, "--", "papers' network"), (papers / 10, ":", "a tenth of it")):
+            axes.axhline(height, color="#777777", lw=0.9, ls=line, label=label)
     axes.axvline(1.0, color="#bbbbbb", lw=0.8, zorder=0)
     small = {"textcoords": "offset points", "fontsize": 6, "color": "#777777", "va": "center"}
     axes.annotate("half a pixel", (1.0, 0.45), (3, 0), xycoords=("data", "axes fraction"), **small)
     axes.set(xlim=(-0.5, MOST_ERROR + 0.5), xlabel="held-out error of the best single part (half pixels)", yscale="log")
-    axes.set_ylabel("parameters of the recommended field")
+    axes.set_ylabel(f"{size} of the recommended field")
     axes.margins(y=0.1)
     style.legend_below(figure, axes, columns=6)
-    chart.name_points(axes, [(need["name"], need["complexity"], need["parameters"]) for need in needs])
+    chart.name_points(axes, [(need["name"], need["complexity"], need["size"]) for need in needs])
     return figure
 
 
-def _need(run: SceneRun) -> dict[str, Any]:
+def _need(run: SceneRun, measure: str) -> dict[str, Any]:
     """The complexity with its standard error, in half pixels, and the size and kind of the recommended candidate.
 
     Empty where the run did not end ok, or no single part was fitted.
@@ -234,18 +259,18 @@ def _need(run: SceneRun) -> dict[str, Any]:
     best = min(parts, key=lambda result: result.error)
     footprint, chosen = run.candidates.footprint, run.candidates.chosen
     spread = (best.numbers.get("standard_error") or 0.0) / footprint
-    need = {"name": run.name, "kind": chosen.kind, "parameters": chosen.numbers["parameters"]}
+    need = {"name": run.name, "kind": chosen.kind, "size": chosen.numbers[measure]}
     return {**need, "complexity": best.error / footprint, "spread": spread}
 
 
-SAVED = ("parameters", "flops_per_query", "bytes", "seconds")
+SAVED = ("stored", "free", "bytes", "flops_per_query", "seconds")
 SPENT = ("seconds", "evaluations", "flops")
 OF_SCENE = ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")
 SEEDS = ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")
 # Columns that identify a scene, for runs, and a candidate, for dictionaries.
 SCENE = (text("scene", "Scene", lambda run: run.name), *through(lambda run: run.record, *IDENTITY))
 CANDIDATE = tuple(map(Column, ("rung", "kind", "recommended", "best")))
-_CANDIDATE_NUMBERS = ("parameters", "bytes", "flops_per_query", "error", "standard_error", *SPENT, "failed")
+_CANDIDATE_NUMBERS = (*SIZES, "sparse_bytes", FLOPS, "error", "standard_error", *SPENT, "failed")
 CANDIDATES = (
     *through(lambda line: line[0], *SCENE, *map(Column, (*OF_SCENE, *SEEDS, *(f"saved_{name}" for name in SAVED)))),
     *through(_of_candidate, *CANDIDATE, *map(Column, (*_CANDIDATE_NUMBERS, *(f"{name}_at_auto" for name in SPENT)))),
@@ -253,7 +278,9 @@ CANDIDATES = (
 COLUMNS = (
     SCENE[0],
     shown("Recommended", lambda run: run.candidates.chosen.label),
-    shown("Parameters", lambda run: f"{run.candidates.chosen.numbers['parameters']:,}"),
+    shown("Stored numbers", lambda run: f"{run.candidates.chosen.numbers['stored']:,}"),
+    shown("Free numbers", lambda run: f"{run.candidates.chosen.numbers['free']:,}"),
+    shown("Size of the file", lambda run: format.size(run.candidates.chosen.numbers["bytes"])),
     shown("Error × 1000", lambda run: _error(run.candidates.chosen)),
     Column("footprint", "Half a pixel × 1000", show=thousandfold),
     shown("Why", _why),
@@ -261,16 +288,16 @@ COLUMNS = (
     shown("Best error × 1000", lambda run: _error(run.candidates.best)),
     Column("held_out_seeds_within", "Seeds within 1 s.e.", show=percent),
     Column("held_out_seeds_held", "Seeds held", show=percent),
-    Column("saved_parameters", "Saved parameters", show=factor),
+    Column("saved_stored", "Saved stored numbers", show=factor),
+    Column("saved_free", "Saved free numbers", show=factor),
     Column("saved_flops_per_query", "Saved FLOPs per query", show=factor),
-    Column("saved_bytes", "Saved bytes", show=factor),
     Column("saved_seconds", "Saved fit seconds", show=factor),
     Column("chamfer_l2", "Chamfer × 1000", show=thousandfold),
     shown("Failed candidates", lambda run: f"{len(_failed_fits(run))} of {len(run.candidates.results)}"),
 )
-FLOPS = (
+QUERIES = (
     *through(lambda line: line[0], *SCENE, Column("footprint")),
-    *through(_of_candidate, *CANDIDATE, *map(Column, ("flops_per_query", "error", "standard_error", "failed"))),
+    *through(_of_candidate, *CANDIDATE, *map(Column, (FLOPS, "error", "standard_error", "failed"))),
 )
 NEEDS = (  # of a run and its need
     *through(lambda line: line[0], *SCENE),
@@ -278,6 +305,7 @@ NEEDS = (  # of a run and its need
     Column("single_part_standard_error_footprints", value=lambda line: line[1].get("spread")),
     *through(lambda line: line[0], Column("footprint"), Column("recommended_field")),
     Column("kind", value=lambda line: KINDS[line[1]["kind"]][0] if line[1] else None),
-    *through(lambda line: line[0], Column("recommended_parameters")),
-    Column("share_of_papers_network", value=lambda line: over(1.0, line[0].number("saved_parameters"))),
+    *through(lambda line: line[0], Column("recommended_by"), *(Column(f"recommended_{size}") for size in SIZES)),
+    Column("share_of_papers_network_stored", value=lambda line: over(1.0, line[0].number("saved_stored"))),
+    Column("share_of_papers_network_free", value=lambda line: over(1.0, line[0].number("saved_free"))),
 )

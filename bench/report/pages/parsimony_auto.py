@@ -11,7 +11,17 @@ from bench.pictures.size_chart import KINDS
 from bench.records import format
 from bench.report.data import parsimony
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import COSTS, FAILED, NOT_REACHED, PARSIMONY, REACHED, SceneRun, factor, scene_runs
+from bench.report.data.parsimony import (
+    COSTS,
+    FAILED,
+    NOT_REACHED,
+    PARSIMONY,
+    REACHED,
+    SceneRun,
+    factor,
+    measure_note,
+    scene_runs,
+)
 from bench.report.pages.parsimony import SCENE, scene_table
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -57,7 +67,7 @@ def make(experiment: Experiment) -> Result:
         "Costs of field=auto and of the papers' network to the same error, and costs and error of a fit at pixel "
         "precision over those of the plain fit.",
         interval="± is one standard error, by the jackknife over views",
-        remarks=(_held(runs), *NOTES, *parsimony.failures(runs, _failed)),
+        remarks=(_held(runs), measure_note(runs), *NOTES, *parsimony.failures(runs, _failed)),
         data=to_data(COLUMNS, runs),
         table=scene_table(COLUMNS, runs),
         figure=draw(runs),
