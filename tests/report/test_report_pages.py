@@ -94,7 +94,7 @@ def test_the_reference_of_table_2_is_its_preset_under_any_label(tmp_path):
         write_run(tmp_path, "table2", label, task="completion", method=preset, metrics=metrics, settings=settings)
     made = table2.make_intervals(choose(read_records(tmp_path)[0], table2.READS[0], tmp_path))
     ratios = dict(zip(made.table["Method"], made.table["Ratio to the reference"], strict=True))
-    assert ratios == {"ours": "", "theirs": "2.00"}
+    assert ratios == {"ours": "", "theirs": "2.00 (n = 1)"}
 
 
 def test_two_presets_under_one_label_are_two_rows(tmp_path):

@@ -103,6 +103,41 @@ def test_failed_and_dominated_points_are_drawn(three):
     assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
 
 
+def test_one_draw_has_no_probability(tmp_path):
+    for label, errors in (("fast", [9, 6]), ("good", [9, 5, 1])):
+        completed(tmp_path, label, errors)
+    result = made(tmp_path, speed.make_front)
+    assert result.table["P(on the front)"].tolist() == ["–", "–"]
+    assert result.data["on_front"].isna().all() and result.data["error_low"].isna().all()
+    assert "One shape and one seed are one draw" in told(result)
+    assert not [text for text in result.figure.axes[0].texts if "1.00" in text.get_text()]
+
+
+def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path):
+    for index, (mine, other) in enumerate(((1.0, 1.2), (1.5, 1.1), (1.0, 1.4))):
+        for label, seconds in (("dist", mine), ("dist, K 3", other), ("dist, 20 steps", 0.9)):
+            error = 0.03 if "steps" in label else 0.01 + index / 1000
+            folder = rendered(tmp_path, label, seconds, error)
+            record = json.loads((folder / "record.json").read_text())
+            record["config"]["index"] = index
+            record["metrics"]["queries"] -= 500 * ("steps" in label)
+            (folder / "record.json").write_text(json.dumps(record))
+    data = made(tmp_path, speed.make_front).data.set_index("setting")
+    columns = ["seconds", "error", "evaluations", "on_front", "dominated"]
+    assert data.loc["dist", columns].tolist() == data.loc["dist, K 3", columns].tolist()
+    assert data.loc["dist", "seconds"] == pytest.approx(1.2)  # of 1.1, 1.3 and 1.2, the shapes' medians
+    assert data.loc["dist", "on_front"] == 1.0 and data.loc["dist, 20 steps", "seconds"] == 0.9
+
+
+def test_bands_are_drawn_from_six_shapes_on(three, tmp_path):
+    axis = made(three, speed_curves.make).figure.axes[0]
+    assert not axis.collections and len([line for line in axis.lines if line.get_linewidth() == 0.5]) > 3
+    for index in range(3, 6):
+        completed(tmp_path, "fast", [9, 6 + index], index=index)
+    axis = made(three, speed_curves.make).figure.axes[0]
+    assert axis.collections and not [line for line in axis.lines if line.get_linewidth() == 0.5]
+
+
 def test_the_page_works_without_a_network_and_leads_to_the_runs(three):
     write_paper(read_records(three)[0], three)
     page, index = (three / "paper" / "speed_front.html").read_text(), write_index(three).read_text()

@@ -69,8 +69,8 @@ def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
     broke(tmp_path, "wires", "DIST", -0.1)
     broke(tmp_path, "wires", "DVR", 1.1)
     row = made(tmp_path, stability.make).table.iloc[0]
-    assert row["DIST"] == "at once (5 of 5 failed, 57-100 %)"
-    assert row["DVR"] == "none (0 of 5 failed, 0-43 %)"  # Wilson: 0 of 5 still allows 43 %
+    assert row["DIST"] == "at once (5 of 5 failed, 48-100 %)"
+    assert row["DVR"] == "none (0 of 5 failed, 0-52 %)"  # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
 
 
 def test_what_did_not_end_ok_keeps_its_cell(tmp_path):

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from bench.pictures import style
 from bench.records.read import read_records
@@ -132,7 +133,7 @@ def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
     data = result.data.set_index("row")
     for row in (REFERENCE, OTHER):
         assert data.loc[row, "iqm_low"] < data.loc[row, "iqm"] < data.loc[row, "iqm_high"]
-        assert data.loc[row, "failed_high"] == pytest.approx(0.324, abs=1e-3)  # Wilson, 0 of 8
+        assert data.loc[row, "failed_high"] == pytest.approx(1 - 0.025 ** (1 / 8))  # 0 of 8
     assert data.loc[OTHER, "iqm"] == pytest.approx(2 * data.loc[REFERENCE, "iqm"])
     assert cell(result, OTHER, "Ratio to the reference") == "2.00 [2.00, 2.00]"
     assert cell(result, REFERENCE, "Mean rank") == "1.00"
@@ -165,7 +166,7 @@ def test_a_shape_that_a_row_lacks_is_a_failure_in_its_rank_and_no_part_of_its_ra
     completed(tmp_path, OTHER, 2.0, index=1)
     result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Mean rank") == "1.50"
-    assert cell(result, OTHER, "Ratio to the reference") == "0.222"
+    assert cell(result, OTHER, "Ratio to the reference") == "0.222 (n = 1)"
     assert "Shapes per cell: 1 to 2." in result.notes
 
 
@@ -176,8 +177,62 @@ def test_a_method_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
             completed(tmp_path, OTHER, None if points == "20" else 0.5, index=index, points=points)
     result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Ratio to the reference").startswith("∞")
-    assert cell(result, OTHER, "Shapes with a failure") == "100 % [61, 100]"
+    assert cell(result, OTHER, "Shapes with a failure") == "6 of 6 [54.1, 100] %"
     assert p_values(result) == [f"{OTHER} is no better (0 of 6 shapes) than {REFERENCE}: p = 0.031"]
+
+
+def test_wins_are_counted_on_the_runs_that_both_have(tmp_path):
+    for family in ("sofa", "plane"):
+        for index, (mine, other) in enumerate(((1.0, 2.0), (2.0, 2.0), (None, None), (None, 1.0))):
+            for label, value in ((REFERENCE, mine), (OTHER, other)):
+                folder = completed(tmp_path, label, value, index=index, dataset=family)
+                record = json.loads((folder / "record.json").read_text())
+                record["config"]["dataset"] = {"name": family}
+                (folder / "record.json").write_text(json.dumps(record))
+    completed(tmp_path, REFERENCE, 0.1, index=9)  # alone: no pair
+    result = made(tmp_path, table2.make_wins)
+    table = result.table.set_index("Row wins against")
+    # Per family a win, two ties (equal, both failed) and a loss: 2 of 4.
+    low, high = stats.binomtest(4, 8).proportion_ci(method="exact")
+    assert table.loc[REFERENCE, OTHER] == f"4 of 8: 50 % [{100 * low:.1f}, {100 * high:.1f}]"
+    assert table.loc[REFERENCE, REFERENCE] == ""
+    data = result.data.set_index(["family", "row"])
+    assert data.loc[("sofa", OTHER), ["won", "pairs", "shapes"]].tolist() == [2, 4, 4]
+    assert math.isnan(data.loc[("sofa", OTHER), "low"])
+
+
+def test_one_draw_gives_no_rank_and_no_probability(tmp_path):
+    for points in ("dense", "20"):
+        completed(tmp_path, REFERENCE, 1.0, points=points)
+        completed(tmp_path, OTHER, 2.0, points=points)
+    result = made(tmp_path, table2.make_intervals)
+    assert cell(result, OTHER, "Mean rank") == "–" and not p_values(result)
+    assert cell(result, OTHER, "dense") == "2.00 (n = 1)"
+    assert "One shape and one seed are one draw" in told(result)
+    wins = made(tmp_path, table2.make_wins).table.set_index("Row wins against")
+    assert wins.loc[REFERENCE, OTHER] == "2 of 2 (n = 1)"
+
+
+def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
+    def caption():
+        return made(tmp_path, table2.make).caption
+
+    def write(index, seed, **more):
+        task = {"points": "100", "_target_": "completion"}
+        settings = {"task": task, "index": index, "dataset": {"name": "sofa"}, "seed": seed, **more}
+        write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 0.001},
+                  settings=settings)  # fmt: skip
+
+    write(0, 0)
+    assert "Median error over one shape at each" in caption()
+    write(0, 1)
+    assert "Median error over seeds of one shape at each" in caption()
+    write(1, 0)
+    assert "Median error over shapes and seeds at each" in caption()
+    assert "nothing follows" not in caption()
+    write(0, 0, scale={"name": "smoke"})
+    assert caption().startswith("Made at scale=smoke, to try things out: nothing follows from these numbers.")
+    assert "Median error over one shape at each" in caption()
 
 
 def test_a_row_without_some_points_has_no_ratio(tmp_path):
@@ -240,6 +295,18 @@ def test_the_number_of_points_given_is_told_and_orders_the_figure(tmp_path):
     assert list(result.figure.axes[0].lines[0].get_xdata()) == [20, 50, 200]
 
 
+def test_the_figure_has_a_point_for_each_shape_below_six(tmp_path):
+    def small():
+        lines = made(tmp_path).figure.axes[0].lines
+        return sorted(y for line in lines if line.get_markersize() == 2 for y in line.get_ydata())
+
+    for index in range(5):
+        completed(tmp_path, REFERENCE, 1.0 + index, index=index)
+    assert small() == [1, 2, 3, 4, 5]
+    completed(tmp_path, REFERENCE, 6.0, index=5)
+    assert small() == []
+
+
 def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
     for points in ("dense", "20"):
         completed(tmp_path, REFERENCE, 1.0, points=points)
@@ -292,5 +359,5 @@ def test_all_files_are_written(tmp_path):
     completed(tmp_path, REFERENCE, 1.0)
     fitted(tmp_path, 0.2)
     written = {path.name for path in write_paper(read_records(tmp_path)[0], tmp_path)}
-    assert written == {"table2.csv", "table2_intervals.csv", "priors.csv"}
+    assert written == {"table2.csv", "table2_intervals.csv", "table2_wins.csv", "priors.csv"}
     assert pd.read_csv(tmp_path / "paper" / "table2.csv")["chamfer_l2"].tolist() == [0.001]

@@ -3,6 +3,8 @@
 import math
 
 import pytest
+from matplotlib.collections import LineCollection
+from scipy import stats
 
 from bench.records.read import read_records
 from bench.report.data import oracle
@@ -31,7 +33,7 @@ def found(results, experiment, label, chamfer, *, index=0, start=8.0, **task):
     )
 
 
-def posed(results, label, degrees, success, *, seed=0, task="pose", **changed):
+def posed(results, label, degrees, success, *, seed=0, task="pose", dataset=None, index=0, **changed):
     """A run of camera pose; None as its success is a run that failed."""
     return write_run(
         results,
@@ -44,7 +46,8 @@ def posed(results, label, degrees, success, *, seed=0, task="pose", **changed):
         settings={
             "task": {"degrees": degrees, "shift": 0.1, "success_degrees": 5.0, "success_distance": 0.05, "starts": 1},
             "seed": seed,
-            "dataset": {"name": "car"},
+            "index": index,
+            "dataset": dataset or {"name": "car"},
         },
         **{"seed": seed} | changed,
     )
@@ -143,13 +146,63 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
     posed(tmp_path, "DIST", 90, 0)
     result = made(tmp_path, fig6)
     mine, theirs = row(result, "DIST"), row(result, "ICP, point to plane")
-    assert mine["30°"].startswith("2 of 4 [15")  # a failed run is a pose that was not found
-    assert mine["90°"].startswith("0 of 1")
-    assert theirs["30°"].startswith("4 of 4")
+    assert mine["30°"] == "2 of 4 (n = 1)"  # a failed run is a pose that was not found; one shape, no interval
+    assert mine["90°"] == "0 of 1 (n = 1)"
+    assert theirs["30°"] == "4 of 4 (n = 1)"
+    assert "fewer than six shapes: points, no interval" in result.caption
     assert theirs["90°"] == ""
     assert (mine["Loop"], theirs["Loop"]) == ("2.00 s", "250 ms")
     assert "1 of 9 runs did not end ok: DIST, 30 degrees, seed 3: nan (" in result.caption
     assert "5 degrees and 0.05 scene units" in result.caption
+
+
+def test_views_of_one_mesh_are_one_shape(tmp_path):
+    for index in range(8):
+        posed(tmp_path, "DIST", 30, 1, dataset={"path": "/meshes/fandisk.obj", "strength": 0.0}, index=index)
+    result = made(tmp_path, fig6)
+    assert row(result, "DIST")["30°"] == "8 of 8 (n = 1)"
+    assert "n = 8 runs (1 shape, 8 views, 1 seed)" in result.caption
+
+
+def test_six_shapes_have_an_interval_that_does_not_count_their_views(tmp_path):
+    for shape in range(6):
+        for index in range(2):
+            mesh = {"path": f"/meshes/{shape}.obj", "strength": 0.0}
+            posed(tmp_path, "DIST", 30, int(shape > 0), dataset=mesh, index=index)
+    result = made(tmp_path, fig6)
+    low, high = stats.binomtest(5, 6).proportion_ci(method="exact")  # as one trial per shape
+    assert row(result, "DIST")["30°"] == f"10 of 12 [{100 * low:.1f}, {100 * high:.1f}] %"
+    assert "95 % intervals over shapes (Clopper and Pearson)" in result.caption
+    (bars,) = [c for c in result.figure.axes[0].collections if isinstance(c, LineCollection)]
+    assert bars.get_segments()[0][:, 1] == pytest.approx([100 * low, 100 * high])
+
+
+def test_few_shapes_are_drawn_as_points_and_six_as_a_band(tmp_path):
+    for index in range(5):
+        for focal in (0.5, 1.0):
+            found(tmp_path, "fig10", "DIST", 1.0 + index, index=index, focal=focal)
+    result = made(tmp_path, fig10)
+    axis = result.figure.axes[0]
+    small = [line for line in axis.lines if line.get_markersize() == 2]
+    assert sorted(small[0].get_ydata()) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert result.table["95 % interval"].tolist() == ["(n = 5)"] * len(result.table)
+    assert "fewer than six shapes: points, no interval" in result.caption
+    for focal in (0.5, 1.0):
+        found(tmp_path, "fig10", "DIST", 6.0, index=5, focal=focal)
+    result = made(tmp_path, fig10)
+    axis = result.figure.axes[0]
+    assert not [line for line in axis.lines if line.get_markersize() == 2] and axis.collections
+    assert result.table["95 % interval"].tolist() == ["[1.00, 6.00]"] * len(result.table)
+    assert "95 % bootstrap intervals over shapes." in result.caption  # one seed: no word of seeds
+
+
+def test_table_3_has_intervals_from_six_shapes_on(tmp_path):
+    for index in range(6):
+        assert row(made(tmp_path, table3), "DIST")["Interquartile mean"].endswith(f"(n = {index})") if index else True
+        found(tmp_path, "table3", "DIST", 1.0 + index, index=index)
+    ours = row(made(tmp_path, table3), "DIST")
+    assert ours["Interquartile mean"].startswith("3.50 [")
+    assert ours["Failed"] == "0 of 6 [0, 45.9] %"
 
 
 def test_all_three_are_written(tmp_path):

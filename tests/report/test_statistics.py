@@ -6,11 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.integrate import quad
 
 from bench.report.data.statistics import (
+    FEWEST_SHAPES,
     Interval,
     bootstrap,
+    clopper_pearson,
     compare,
     dominated,
     front,
@@ -22,7 +23,8 @@ from bench.report.data.statistics import (
     median,
     paired_bootstrap,
     rank,
-    wilson,
+    share,
+    wins,
 )
 
 INF = math.inf
@@ -43,7 +45,7 @@ def seen(statistic) -> tuple:
 
     def noting(values):
         result = statistic(values)
-        if values.shape[0] > 1:
+        if values.ndim == 2 and values.shape[0] > 1:
             noted.extend(result)
         return result
 
@@ -94,41 +96,6 @@ def test_a_run_counted_as_failed_never_improves_an_average(errors, data):
         assert average(fewer) >= average(errors)
 
 
-# Populations of one run's errors: what draws [shapes, seeds], and the true interquartile mean. The mean of the middle
-# half is the integral of the quantile function from 1/4 to 3/4, times two.
-def middle(distribution) -> float:
-    return 2 * quad(distribution.ppf, 0.25, 0.75)[0]
-
-
-NORMAL = (lambda generator, n: generator.normal(5, 1, (n, 1)), 5.0)
-LOGNORMAL = (lambda generator, n: generator.lognormal(0, 1, (n, 1)), middle(stats.lognorm(1)))
-SEEDS = (
-    lambda generator, n: np.exp(0.8 * generator.normal(size=(n, 1)) + 0.4 * generator.normal(size=(n, 3))),
-    middle(stats.lognorm(math.sqrt(0.8**2 + 0.4**2))),
-)
-
-
-@pytest.mark.parametrize("n", [8, 16])
-@pytest.mark.parametrize("population, truth", [NORMAL, LOGNORMAL, SEEDS], ids=["normal", "lognormal", "seeds"])
-def test_interval_covers_the_true_interquartile_mean(population, truth, n):
-    generator, covered = np.random.default_rng(n), 0
-    for repetition in range(1000):
-        interval = bootstrap(list(population(generator, n)), interquartile_mean, seed=repetition, draws=300)
-        covered += interval.low <= truth <= interval.high
-    assert 930 <= covered < 990  # of 1000; below 990: not by being much too wide
-
-
-@pytest.mark.parametrize("n", [8, 16])
-def test_paired_interval_covers_the_true_ratio(n):
-    generator, covered, truth = np.random.default_rng(n), 0, 1.25
-    for repetition in range(1000):
-        shapes, noise = generator.normal(size=(n, 1)), generator.normal(size=(2, n, 1))
-        first, second = np.exp(shapes + 0.3 * noise) * np.array([truth, 1])[:, None, None]
-        interval = paired_bootstrap(list(first), list(second), interquartile_mean, seed=repetition, draws=300)
-        covered += interval.low <= truth <= interval.high
-    assert 930 <= covered < 990
-
-
 @pytest.mark.parametrize("level", [0.8, 0.95])
 def test_interval_of_a_mean_is_that_of_student(level):
     # A draw's mean varies by the shapes' variance (over n) and by the seeds' within a shape. With one seed the widening
@@ -146,22 +113,47 @@ def test_interval_of_a_mean_is_that_of_student(level):
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
 
-def test_a_single_shape_draws_its_seeds_only():
-    seeds = 10 + stats.norm.ppf((np.arange(16) + 0.5) / 16)
-    half = stats.t.ppf(0.975, 15) * seeds.std(ddof=1) / 4
-    interval = bootstrap([seeds], mean, seed=0, draws=40_000)
-    assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
-    alone = bootstrap(singles(3), mean, seed=0)
-    assert alone.value == 3 and math.isnan(alone.low) and math.isnan(alone.high)
+@pytest.mark.parametrize("n", [1, 4, 5])
+def test_fewer_than_six_shapes_have_points_and_no_interval(n):
+    groups = [np.array([i, i + 2.0]) for i in range(n)]
+    for found in (
+        bootstrap(groups, mean, seed=0),
+        paired_bootstrap(groups, groups, mean, seed=0),
+        hypervolume_interval([(groups_plus_one(groups), groups_plus_one(groups))], reference=(9, 9), seed=0),
+        share(np.ones(n), 2 * np.ones(n)),
+        wins(groups, groups),
+    ):
+        assert math.isnan(found.low) and math.isnan(found.high) and not found.known and len(found.points) == n
+        assert str(found).endswith(f" (n = {n})")
+    found = bootstrap(groups, mean, seed=0)
+    assert found.value == n / 2 + 0.5 and found.points == tuple(i + 1.0 for i in range(n))
+    six = bootstrap(singles(*range(6)), mean, seed=0)
+    assert FEWEST_SHAPES == 6 and six.known and str(six) == f"2.50 {six.ends()}"
+
+
+def groups_plus_one(groups):
+    return [group + 1 for group in groups]
 
 
 def test_shapes_with_unequal_numbers_of_seeds():
-    # Draws AA, AB or BA, BB with chances 1/4, 1/2, 1/4 have means 0, 3/4, 1.
+    # A draw that takes the shape of three seeds k times has 3 k ones among 6 + 2 k runs.
     noting, noted = seen(mean)
-    assert bootstrap([np.zeros(1), np.ones(3)], noting, seed=0, draws=4000).value == 0.75
-    values, counts = np.unique(noted, return_counts=True)
-    assert values.tolist() == [0, 0.75, 1]
-    assert counts / 4000 == pytest.approx([0.25, 0.5, 0.25], abs=0.03)
+    groups = [*singles(0, 0, 0, 0, 0), np.ones(3)]
+    assert bootstrap(groups, noting, seed=0, draws=8000).value == 3 / 8
+    times = np.arange(7)
+    expected = stats.binom(6, 1 / 6).pmf(times)
+    values, counts = np.unique(np.round(noted, 6), return_counts=True)
+    assert values == pytest.approx(np.round(3 * times / (6 + 2 * times), 6)[: len(values)])
+    assert counts / 8000 == pytest.approx(expected[: len(values)], abs=0.02)
+
+
+def test_views_and_seeds_are_drawn_within_their_shape():
+    # A mean's variance over draws: of shapes over 6, of views in a shape over 12, of seeds in a view over 36.
+    shapes, views, seeds = np.arange(6.0)[:, None, None] * 3, np.array([-2.0, 2.0])[:, None], np.array([-1.0, 0.0, 1.0])
+    noting, noted = seen(mean)
+    groups = [list(shape) for shape in shapes + views + seeds]
+    assert bootstrap(groups, noting, seed=0, draws=20_000).value == pytest.approx(7.5)
+    assert np.var(noted) == pytest.approx(shapes.var() / 6 + views.var() / 12 + seeds.var() / 36, rel=0.03)
 
 
 def test_the_seed_decides_the_draws():
@@ -172,18 +164,18 @@ def test_the_seed_decides_the_draws():
 
 @pytest.mark.parametrize("average", [interquartile_mean, median, mean])
 def test_failures_make_infinite_ends(average):
-    assert bootstrap(singles(INF, INF, INF, INF), average, seed=0) == Interval(INF, INF, INF)
+    assert bootstrap(singles(*[INF] * 6), average, seed=0) == Interval(INF, INF, INF)
     half = bootstrap(singles(1, 2, 3, 4, 5, INF, INF, INF), average, seed=0)
     assert half.low < 5 and half.high == INF
-    uneven = bootstrap([np.array([1.0, INF]), np.array([2.0]), np.array([3.0, 4.0])], average, seed=0)
-    assert uneven.low < 2 and uneven.high == INF
+    uneven = bootstrap([np.array([1.0, INF]), *singles(INF, 2, 2, 2), np.array([3.0, 4.0])], average, seed=0)
+    assert uneven.low < 3 and uneven.high == INF
 
 
 def test_paired_ratio_of_failures():
-    good, bad = singles(1, 2, 3, 4), singles(INF, INF, INF, INF)
+    good, bad = singles(1, 2, 3, 4, 5, 6), singles(*[INF] * 6)
     for first, second, expected in ((bad, bad, 1), (bad, good, INF), (good, bad, 0), (good, good, 1)):
         assert paired_bootstrap(first, second, median, seed=0) == Interval(expected, expected, expected)
-    zero = singles(0, 0, 0, 0)
+    zero = singles(*[0] * 6)
     assert paired_bootstrap(zero, zero, median, seed=0).value == 1
     assert paired_bootstrap(good, zero, median, seed=0).low == INF
 
@@ -209,25 +201,65 @@ def test_bad_groups_and_levels():
         with pytest.raises(ValueError, match="must"):
             bootstrap(groups, median, seed=0)
     with pytest.raises(ValueError, match="level"):
-        bootstrap(singles(1, 2), median, seed=0, level=95)
+        bootstrap(singles(*range(6)), median, seed=0, level=95)
 
 
-@pytest.mark.parametrize("failures, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
+@pytest.mark.parametrize("successes, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
 @pytest.mark.parametrize("level", [0.9, 0.95])
-def test_wilson_formula(failures, n, level):
-    p, z = failures / n, stats.norm.ppf(0.5 + level / 2)
-    centre, half = p + z**2 / (2 * n), z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    interval = wilson(failures, n, level=level)
-    assert interval.value == p
-    assert (interval.low, interval.high) == pytest.approx(
-        ((centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)), abs=1e-12
+def test_clopper_pearson_is_the_exact_interval(successes, n, level):
+    expected = stats.binomtest(successes, n).proportion_ci(level, method="exact")
+    interval = clopper_pearson(successes / n, n, level=level)
+    assert (interval.low, interval.value, interval.high) == pytest.approx((expected.low, successes / n, expected.high))
+
+
+@pytest.mark.parametrize("value, n", [(0.5, 0), (-0.1, 3), (1.1, 3)])
+def test_clopper_pearson_needs_trials(value, n):
+    with pytest.raises(ValueError, match="count the trials"):
+        clopper_pearson(value, n)
+
+
+def test_a_share_counts_shapes_not_trials():
+    successes, trials = np.array([8, 8, 8, 8, 4, 0.0]), np.full(6, 8.0)
+    found = share(successes, trials)
+    assert found == clopper_pearson(36 / 48, 6) and found.points == (1, 1, 1, 1, 0.5, 0)
+    assert share(10 * successes, 10 * trials) == found
+    for bad in (([1.0], [0.0]), ([3.0], [2.0]), ([-1.0], [2.0]), ([], []), ([1.0], [1.0, 1.0])):
+        with pytest.raises(ValueError, match="successes must be"):
+            share(np.array(bad[0]), np.array(bad[1]))
+
+
+def test_wins_are_of_pairs_and_ties_are_half():
+    first, second = singles(1, 2, 3, INF, INF, 1), singles(2, 2, 1, INF, 1, INF)
+    assert wins(first, second).points == (1, 0.5, 0, 0.5, 0, 1)
+    assert wins(first, second).value == wins(second, first).value == 0.5
+    seeds = [np.array([1.0, 1.0]), *singles(1, 1, 1, 1, 1)]
+    better = wins(seeds, [np.array([2.0, 0.5]), *singles(2, 2, 2, 2, 2)])
+    assert better.value == 6 / 7 and better.points == (0.5, 1, 1, 1, 1, 1)
+    assert (better.low, better.high) == pytest.approx((clopper_pearson(6 / 7, 6).low, clopper_pearson(6 / 7, 6).high))
+    with pytest.raises(ValueError, match="same shapes and seeds"):
+        wins(first, second[1:])
+
+
+def test_one_run_of_each_gives_no_probability_and_no_rank():
+    assert math.isnan(wins(singles(1), singles(2)).value)
+    assert wins(singles(1, 1), singles(2, 2)).value == wins([np.ones(2)], [np.full(2, 2.0)]).value == 1
+    assert np.isnan(front([point([1], [1]), point([2], [2])], seed=0)).all()
+    assert front([point([1, 1], [1, 1]), point([2, 2], [2, 2])], seed=0) == [1, 0]
+    assert np.isnan(list(rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())).all()
+    points = {"a": {(20, "cow"): 1.0, (50, "cow"): 1.0}, "b": {(20, "cow"): 2.0}}
+    assert np.isnan(list(rank(points, draw=lambda key: key[1]).values())).all()
+    assert rank(points) == {"a": 1, "b": 2}
+
+
+def test_equal_settings_have_equal_probabilities_and_ranks():
+    errors = np.random.default_rng(0).lognormal(size=6)
+    chances = front(
+        [point(np.ones(6), errors), point(np.ones(6), errors), point(np.full(6, 2.0), errors[::-1])], seed=0
     )
-
-
-@pytest.mark.parametrize("failures, n", [(0, 0), (-1, 3), (4, 3)])
-def test_wilson_needs_runs(failures, n):
-    with pytest.raises(ValueError, match="count the runs"):
-        wilson(failures, n)
+    assert chances[0] == chances[1]
+    assert dominated([1, 1, 2], [1, 1, 1]).tolist() == [False, False, True]
+    alike = {"cow": 1.0, "car": 2.0}
+    assert rank({"a": alike, "b": alike, "c": {"cow": 0.5, "car": 3.0}}) == {"a": 2, "b": 2, "c": 2}
 
 
 def test_kaplan_meier_worked_example():
@@ -236,18 +268,24 @@ def test_kaplan_meier_worked_example():
     assert survival.times.tolist() == [0, 1, 3, 4, 5, 7]
     remaining = np.array([5 / 6, 2 / 3, 4 / 9])
     assert survival.remaining == pytest.approx([1, *remaining, 4 / 9, 4 / 9])
-    # log-log: S^exp(+-z s), s^2 = sum(d / (r (r - d))) / log(S)^2 over the steps so far (Greenwood)
-    spread = 1.959964 * np.sqrt(np.cumsum([1 / 30, 1 / 20, 1 / 6])) / np.abs(np.log(remaining))
-    assert survival.low[1:4] == pytest.approx(remaining ** np.exp(spread))
-    assert survival.high[1:4] == pytest.approx(remaining ** np.exp(-spread))
-    assert survival.low[0] == survival.high[0] == 1
+    # Greenwood: s^2 = S^2 sum(d / (r (r - d))); runs without censoring that would give it: S (1 - S) / s^2
+    variance = remaining**2 * np.cumsum([1 / 30, 1 / 20, 1 / 6])
+    exact = [clopper_pearson(s, s * (1 - s) / v) for s, v in zip(remaining, variance, strict=True)]
+    assert survival.low[1:4] == pytest.approx([one.low for one in exact])
+    assert survival.high[1:4] == pytest.approx([one.high for one in exact])
+    assert (survival.low[0], survival.high[0]) == pytest.approx((0.025 ** (1 / 6), 1))  # none has reached it: 6 of 6
 
 
 def test_kaplan_meier_where_none_or_all_reach():
     assert kaplan_meier([3, 2], [False, False]).remaining.tolist() == [1, 1, 1]
     everyone = kaplan_meier([3.0, 2.0], [True, True])
     assert (everyone.times.tolist(), everyone.remaining.tolist()) == ([0, 2, 3], [1, 0.5, 0])
-    assert everyone.low[1] < 0.5 < everyone.high[1] and math.isnan(everyone.low[2])
+    assert np.isnan(everyone.low).all() and np.isnan(everyone.high).all()  # fewer than six
+    six = kaplan_meier([1, 2, 3, 4, 5, 6], [True] * 6)
+    expected = [clopper_pearson(left / 6, 6) for left in (6, 5, 4, 3, 2, 1)]
+    assert six.low[:6] == pytest.approx([one.low for one in expected])
+    assert six.high[:6] == pytest.approx([one.high for one in expected])
+    assert (six.low[6], six.high[6]) == pytest.approx((0, 0.975))  # one at risk
     assert kaplan_meier([2.0], [True]).remaining.tolist() == [1, 0]
     assert kaplan_meier([2.0], [False]).remaining.tolist() == [1, 1]
 
@@ -296,17 +334,20 @@ def test_rank_worked_example():
     }
     # cow 1.5, 1.5, 3; car 2, 1, fails; sofa fails, fails, 1; a hat nobody makes does not count; failing has rank 3
     assert rank(table) == pytest.approx({"a": (1.5 + 2 + 3) / 3, "b": (1.5 + 1 + 3) / 3, "c": (3 + 3 + 1) / 3})
-    assert rank({"a": {"cow": None}, "b": {}}) == {"a": 2, "b": 2}
+    assert rank({"a": {"cow": None, "car": None}, "b": {}}) == {"a": 2, "b": 2}
     assert rank({}) == {}
 
 
 RUN = st.sampled_from([0.0, 1.0, 2.0, 3.0]) | st.sampled_from([None, INF, math.nan])
-TABLE = st.dictionaries(st.sampled_from("abcd"), st.dictionaries(st.integers(0, 4), RUN), min_size=1)
+TABLE = st.dictionaries(st.sampled_from("abcd"), st.dictionaries(st.integers(0, 4), RUN), min_size=1).map(
+    # a method that failed everywhere plans two shapes more, so that ranks are always of several
+    lambda table: {**table, "z": {5: None, 6: None}}
+)
 
 
 @given(TABLE, st.data())
 def test_leaving_out_runs_never_improves_a_rank(table, data):
-    method = data.draw(st.sampled_from(sorted(table)))
+    method = data.draw(st.sampled_from(sorted(table)[:-1]))  # not z
     runs = table[method]
     failed = [shape for shape, error in runs.items() if error is None or not math.isfinite(error)]
     gone = data.draw(st.sets(st.sampled_from(failed))) if failed else set()
@@ -391,5 +432,5 @@ def test_hypervolume_interval_is_that_of_the_median():
     assert (interval.value, interval.high, interval.low) == pytest.approx(
         (-math.log10(expected.value), -math.log10(expected.low), -math.log10(expected.high))
     )
-    failed = [point((1, 1), (INF, INF))]
+    failed = [point((1,) * 6, (INF,) * 6)]
     assert hypervolume_interval(failed, reference=(100, 1), seed=3) == Interval(0, 0, 0)

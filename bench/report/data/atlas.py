@@ -7,7 +7,7 @@ from typing import Any
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, Row, measured, row_of, setting
-from bench.report.data.statistics import wilson
+from bench.report.data.statistics import clopper_pearson
 
 STABILITY = Selection("stability", ("stability",), ("stress",), ("stress",), setup=("machine",))
 FAILED = "failed_"  # beginning of the metrics that count failed trials by kind
@@ -119,11 +119,11 @@ class Cell:
         return int(self.number(f"{end}_successes") or 0), int(self.number(f"{end}_trials") or 0)
 
     def _count(self, end: str) -> str:
-        """The number of failed trials at an end of the sweep, with Wilson's interval."""
+        """The number of failed trials at an end of the sweep, with the interval of their share."""
         successes, n = self._trials(end)
         if not n:
             return "not tried"
-        rate = wilson(n - successes, n)
+        rate = clopper_pearson(1 - successes / n, n)
         return f"{n - successes} of {n} failed, {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
 
     def failures(self) -> dict[str, int]:

@@ -60,6 +60,12 @@ class Completions:
         common = [run for run in mine if run in others]
         return [by_shape({run: errors[run] for run in common}) for errors in (mine, others)]
 
+    def all_errors(self, row: Row, name: str = "") -> dict[RunKey, float]:
+        """The errors of a row by shape, view, seed, family and points; of one family, or of all."""
+        found = {(*cell, run): error for cell, errors in self.errors.items() for run, error in errors.items()}
+        mine = {key: error for key, error in found.items() if key[1] == row and name in ("", key[0])}
+        return {(*run, of, points): error for (of, _, points, run), error in mine.items()}
+
     def failures(self, name: str, row: Row) -> tuple[int, int]:
         """The number of a row's runs in a family that did not end ok, and the number of all."""
         total = sum((self.statuses.get((name, row, points), Counter()) for points in self.points), Counter())
@@ -69,8 +75,8 @@ class Completions:
         """The number of a row's shapes in a family with a run that did not end ok, and the number of all."""
         cells = [self.errors.get((name, row, points), {}) for points in self.points]
         worst: dict[object, float] = {}
-        for (shape, _), error_of_run in [item for cell in cells for item in cell.items()]:
-            worst[shape] = max(worst.get(shape, 0.0), error_of_run)
+        for run, error_of_run in [item for cell in cells for item in cell.items()]:
+            worst[run[0]] = max(worst.get(run[0], 0.0), error_of_run)
         return sum(map(math.isinf, worst.values())), len(worst)
 
     def given(self, name: str, points: str) -> float | None:
@@ -80,13 +86,9 @@ class Completions:
 
 
 def shapes_per_cell(runs: Completions) -> str:
-    """The number of shapes per cell, and the largest coverage of an interval over so few, as a note."""
+    """The number of shapes per cell, as a note."""
     counts = {len(by_shape(errors)) for errors in runs.errors.values()}
-    least = min(counts)
-    number = f"{least}" if len(counts) == 1 else f"{least} to {max(counts)}"
-    bound = 100 * (1 - 2.0 ** (1 - least))
-    few = f" An interval of {least} covers {bound:.0f} % at most." if 1 < least < 6 else ""
-    return f"Shapes per cell: {number}.{few}"
+    return f"Shapes per cell: {min(counts)}{f' to {max(counts)}' if len(counts) > 1 else ''}."
 
 
 def heading(points: str) -> str:

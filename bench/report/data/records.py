@@ -26,7 +26,7 @@ FORMER = {
     "DIST with mask": "dist_mask",
 }
 Record = dict[str, Any]
-RunKey = tuple[Hashable, Hashable]  # shape, seed
+RunKey = tuple[Any, ...]  # solid, view, seed, and further conditions, such as the number of points
 Item, Key = TypeVar("Item"), TypeVar("Key", bound=Hashable)
 
 
@@ -117,9 +117,24 @@ def shape(record: Record) -> tuple[str, Any]:
     return family(record), index(record)
 
 
+def solid(record: Record) -> tuple[str, Any]:
+    """The shape of a run, one for all numbers of a mesh file that is not deformed: these are its views."""
+    return family(record), None if _is_view(record) else index(record)
+
+
+def view(record: Record) -> Any:
+    """The number of the view of a mesh file that is not deformed; 0 for others, whose shapes have a view each."""
+    return index(record) if _is_view(record) else 0
+
+
+def _is_view(record: Record) -> bool:
+    path, strength = (setting(record["config"], "dataset", key) for key in ("path", "strength"))
+    return bool(path) and bool(Path(path).suffix) and strength == 0
+
+
 def run_key(record: Record) -> RunKey:
-    """The shape and the seed, which runs of different rows must share to be compared."""
-    return shape(record), record["seed"]
+    """The shape, the view and the seed, which runs of different rows must share to be compared."""
+    return solid(record), view(record), record["seed"]
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
@@ -130,10 +145,14 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
     return groups
 
 
-def by_shape(values: dict[RunKey, float]) -> list[np.ndarray]:
-    """The numbers of runs as an array per shape, with an entry per seed."""
-    shapes = grouped(values, lambda run: run[0]).values()
-    return [np.array([values[run] for run in runs]) for runs in shapes]
+def by_shape(values: dict[RunKey, float]) -> list[Any]:
+    """The numbers of runs as an array per shape, with an entry per seed; where shapes have views, as a list of these.
+
+    Runs with equal solid and view are of one array, whatever else their keys have.
+    """
+    shapes = [grouped(runs, lambda run: run[1]).values() for runs in grouped(values, lambda run: run[0]).values()]
+    arrays = [[np.array([values[run] for run in runs]) for runs in views] for views in shapes]
+    return arrays if any(len(views) > 1 for views in arrays) else [of_view for (of_view,) in arrays]
 
 
 def definitions(records: list[Record], names: dict[str, str]) -> list[str]:

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -74,6 +74,7 @@ class Setting:
     trial: Trial
     records: list[Record]
     keys: list[RunKey]  # of all settings of the trial
+    alike: tuple[Record, ...] = ()  # the runs of all settings that compute the same as this one, including its own
 
     @property
     def name(self) -> str:
@@ -113,15 +114,20 @@ class Setting:
     @property
     def point(self) -> tuple[float, float]:
         """Median seconds and median error."""
-        return tuple(float(statistics.median(np.concatenate(groups))) for groups in (self.costs, self.errors))
+        return tuple(float(statistics.median(statistics.flat(groups))) for groups in (self.costs, self.errors))
 
     def _groups(self, value: Callable[[Record], float | None]) -> list[np.ndarray]:
         def sound(record: Record) -> float:
             number = value(record) if record["status"] == "ok" else None
             return math.inf if number is None or math.isnan(number) else float(number)
 
-        found = {run_key(record): sound(record) for record in self.records}
-        return by_shape({key: found.get(key, math.inf) for key in self.keys})
+        found = {key: [sound(record) for record in runs] for key, runs in grouped(self._pooled, run_key).items()}
+        return by_shape({key: float(np.median(found.get(key, [math.inf]))) for key in self.keys})
+
+    @property
+    def _pooled(self) -> list[Record]:
+        """Its runs and, where it has any, those of the settings that are alike, so that equal settings are equal."""
+        return list(self.alike) or self.records
 
 
 @dataclass(frozen=True)
@@ -133,7 +139,7 @@ class Placed:
         x, y: where it is drawn: its median seconds and error, or the edge of the chart where one is infinite.
         infinite: whether one is infinite.
         dominated: whether another setting is no worse in both and better in one.
-        chance: the probability of being on the front.
+        chance: the probability of being on the front; nan where a single run was made of each.
     """
 
     row: Setting
@@ -150,10 +156,10 @@ class Placed:
 
     @property
     def label(self) -> str:
-        """The setting without its renderer's name, and the probability."""
+        """The setting without its renderer's name, and the probability where there is one."""
         name, prefix = self.row.name, f"{self.row.renderer}, "
         name = name[len(prefix) :] if name.lower().startswith(prefix) else name
-        return name if self.infinite else f"{name} ({self.chance:.2f})"
+        return name if self.infinite or math.isnan(self.chance) else f"{name} ({self.chance:.2f})"
 
 
 def front_line(panel: list[Placed]) -> list[Placed]:
@@ -176,7 +182,26 @@ def settings(experiment: Experiment | None, trial: Trial) -> list[Setting]:
     compared = _compared(experiment, trial)
     keys = sorted(set(map(run_key, compared)), key=str)
     rows = grouped(compared, row_of)
-    return [Setting(row, base_renderer(records[0]), trial, records, keys) for row, records in rows.items()]
+    return _with_alike([Setting(row, base_renderer(runs[0]), trial, runs, keys) for row, runs in rows.items()])
+
+
+def _with_alike(rows: list[Setting]) -> list[Setting]:
+    """The settings, of which those that compute the same share their runs: else noise in the times would rank them."""
+    groups: list[list[Setting]] = []
+    for row in rows:
+        found = next((group for group in groups if _same(row, group[0])), None)
+        groups.append([row]) if found is None else found.append(row)
+    runs = {one.row: tuple(record for other in group for record in other.records) for group in groups for one in group}
+    return [replace(row, alike=runs[row.row]) for row in rows]
+
+
+def _same(one: Setting, other: Setting) -> bool:
+    """Whether two settings compute the same: equal errors after equal numbers of field values on all shapes.
+
+    They then have an equal configuration, or differ in what their trial does not use.
+    """
+    outcomes = [np.array([statistics.flat(row.errors), statistics.flat(row.evaluations)]) for row in (one, other)]
+    return one.renderer == other.renderer and np.array_equal(*outcomes) and bool(np.isfinite(outcomes[0]).any())
 
 
 def _compared(experiment: Experiment, trial: Trial) -> list[Record]:

@@ -1,13 +1,16 @@
 """Statistics of methods' errors over runs: averages, intervals, tests, ranks and Pareto fronts.
 
 Lower is better. A run that failed or is missing has the error +inf. A method's errors are groups: an array per shape,
-with the errors of its seeds. Where methods are compared, the same index in their groups means the same shape and seed.
+with the errors of its seeds, or a list per shape with an array per view. Where methods are compared, the same place in
+their groups means the same shape, view and seed.
+
+The independent unit is the shape. Below `FEWEST_SHAPES` no interval is given: its ends are nan, and the values of the
+shapes stand in `Interval.points` to be shown instead. From one run alone no probability and no rank is given.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,22 +20,46 @@ from scipy import stats
 from bench.records import format
 
 Values = np.ndarray | Sequence[float]
-Groups = Sequence[np.ndarray]
+Groups = Sequence[Any]  # of each shape an array of its seeds, or a sequence of such arrays, one per view
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
 Point = tuple[Groups, Groups]  # the costs and the errors of one setting
+FEWEST_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and the ends of its confidence interval; nan ends where there are too few runs for one."""
+    """An estimate and the ends of its confidence interval; nan ends where there are too few shapes for one.
+
+    `points` are the estimates of the single shapes, which are shown where there is no interval.
+    """
 
     value: float
     low: float
     high: float
+    points: tuple[float, ...] = field(default=(), compare=False, repr=False)
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an interval."""
+        return not math.isnan(self.low)
+
+    def below(self, edge: float) -> "Interval":
+        """The same with what is beyond the edge set to it, to be drawn."""
+        value, low, high, *points = np.minimum([self.value, self.low, self.high, *self.points], edge).tolist()
+        return Interval(value, low, high, tuple(points))
+
+    def times(self, scale: float) -> "Interval":
+        """The same times a number."""
+        value, low, high, *points = (scale * x for x in (self.value, self.low, self.high, *self.points))
+        return Interval(value, low, high, tuple(points))
+
+    def ends(self, scale: float = 1.0) -> str:
+        """The interval, its ends times `scale`, or else the number of shapes, such as (n = 4)."""
+        return format.interval(scale * self.low, scale * self.high) if self.known else f"(n = {len(self.points)})"
 
     def __str__(self) -> str:
-        """The estimate, and its interval where there is one."""
-        return f"{format.number(self.value)} {format.interval(self.low, self.high)}".strip()
+        """The estimate, and its interval or else the number of shapes."""
+        return f"{format.number(self.value)} {self.ends()}"
 
 
 @dataclass(frozen=True)
@@ -59,45 +86,86 @@ def median(values: Values) -> float | np.ndarray:
 
 
 def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, level: float = 0.95, draws: int = 2000) -> Interval:
-    """The statistic of all runs with its bootstrap interval over shapes and seeds.
+    """The statistic of all runs with its hierarchical bootstrap interval over shapes, views and seeds.
 
-    A draw takes shapes with replacement and, of each, seeds with replacement (Davison and Hinkley 1997, Sec. 3.8); for
-    a single shape, seeds only. The percentiles are widened for few shapes (Hesterberg 2015, "What teachers should know
-    about the bootstrap": expanded percentile interval). The interval covers 95 % or more with six shapes or more. With
-    fewer, no percentile interval can: the extremes of n values enclose a median with probability 1 - 2^(1 - n), 94 %
-    for five, 88 % for four. Where seeds vary as much as shapes it is too wide (covers 99 %), as their spread enters at
-    both stages.
+    A draw takes shapes with replacement, of each drawn shape views with replacement, and of each drawn view seeds with
+    replacement (Davison and Hinkley 1997, Sec. 3.8). The percentiles are widened for few shapes (Hesterberg 2015, "What
+    teachers should know about the bootstrap": expanded percentile interval). The interval covers 95 % or more with six
+    shapes or more; where seeds vary as much as shapes it is too wide (covers 99 %), as their spread enters at each
+    stage.
 
     Args:
-        statistic: reduces the last axis. It gets the runs of all shapes together: a shape with more seeds weighs more.
+        statistic: reduces the last axis. It gets the runs of all shapes together: a shape with more runs weighs more.
 
     Returns:
-        Ends are draws, never interpolated, so they can be +inf; nan for one shape with one seed.
+        Ends are draws, never interpolated, so they can be +inf; nan below `FEWEST_SHAPES`.
     """
-    (value,), (drawn,), n = _resample([groups], statistic, seed, draws)
-    return _interval(value, drawn, n, level)
+    (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
+    return _interval(value, drawn, points[0], level)
 
 
 def paired_bootstrap(
     first: Groups, second: Groups, statistic: Statistic, *, seed: int, level: float = 0.95, draws: int = 2000
 ) -> Interval:
-    """The ratio of the first's statistic to the second's, with its interval over the same draws of shapes and seeds.
+    """The ratio of the first's statistic to the second's, with its interval over the same draws of both.
 
     Equal statistics have the ratio 1, also if both are +inf or 0: where both fail, neither is better.
 
     Raises:
-        ValueError: the two do not have the same shapes with the same numbers of seeds.
+        ValueError: the two do not have the same shapes with the same numbers of views and seeds.
     """
-    value, drawn, n = _resample([first, second], statistic, seed, draws)
-    return _interval(_ratio(*value), _ratio(*drawn), n, level)
+    value, drawn, points = _resample([first, second], statistic, seed, draws)
+    return _interval(_ratio(*value), _ratio(*drawn), _ratio(*points), level)
 
 
-def wilson(failures: int, n: int, *, level: float = 0.95) -> Interval:
-    """The share of failures among n runs with Wilson's interval (1927), as a share of 1."""
-    if not 0 <= failures <= n or n < 1:
-        raise ValueError(f"failures must be in 0..n and n at least 1, but they are {failures} and {n}: count the runs")
-    ends = stats.binomtest(failures, n).proportion_ci(level, method="wilson")
-    return Interval(failures / n, float(ends.low), float(ends.high))
+def share(successes: Values, trials: Values, *, level: float = 0.95) -> Interval:
+    """The share of successes among all trials of all shapes, with an interval over shapes.
+
+    The interval is that of `clopper_pearson` with as many trials as there are shapes. Trials of one shape depend on
+    each other, so that all of them are worth between one trial and their number; the design effect that would say how
+    many (Rao and Scott 1992) cannot be estimated from so few shapes: intervals with it cover 91 % at 16 shapes.
+
+    Args:
+        successes: per shape; a tie is half a success.
+        trials: per shape, one or more.
+
+    Returns:
+        A share of 1; nan ends below `FEWEST_SHAPES`.
+    """
+    k, m = np.asarray(successes, dtype=float), np.asarray(trials, dtype=float)
+    if k.shape != m.shape or not k.size or not ((k >= 0) & (k <= m) & (m >= 1)).all():
+        raise ValueError(f"successes must be in 0..trials, trials 1 or more per shape, but they are {k} and {m}")
+    value, points = float(k.sum() / m.sum()), tuple((k / m).tolist())
+    if len(k) < FEWEST_SHAPES:
+        return Interval(value, math.nan, math.nan, points)
+    return replace(clopper_pearson(value, len(k), level=level), points=points)
+
+
+def clopper_pearson(value: float, n: float, *, level: float = 0.95) -> Interval:
+    """A share among n independent trials with its exact interval (Clopper and Pearson 1934); n need not be whole."""
+    if not 0 <= value <= 1 or n < 1:
+        raise ValueError(f"the share must be in 0..1 and n at least 1, but they are {value} and {n}: count the trials")
+    k, tail = value * n, (1 - level) / 2
+    low = 0.0 if value == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
+    high = 1.0 if value == 1 else float(stats.beta.ppf(1 - tail, k + 1, n - k))
+    return Interval(value, low, high)
+
+
+def wins(first: Groups, second: Groups, *, level: float = 0.95) -> Interval:
+    """The probability that the first has a lower error than the second on the same shape, view and seed.
+
+    It is the share of such pairs in which it is lower; equal errors, and two failures, are half a win each.
+
+    Returns:
+        The interval is that of `share`; nan ends below `FEWEST_SHAPES`, and all nan for one pair alone.
+    """
+    if _sizes(first) != _sizes(second):
+        raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
+    pairs = [(_checked(flat([a])), _checked(flat([b]))) for a, b in zip(first, second, strict=True)]
+    if sum(len(a) for a, _ in pairs) < 2:
+        return Interval(math.nan, math.nan, math.nan)
+    won = [float(((a < b) + 0.5 * (a == b)).sum()) for a, b in pairs]
+    return share(won, [len(a) for a, _ in pairs], level=level)
 
 
 def kaplan_meier(times: Values, reached: np.ndarray | Sequence[bool], *, level: float = 0.95) -> Survival:
@@ -108,19 +176,27 @@ def kaplan_meier(times: Values, reached: np.ndarray | Sequence[bool], *, level: 
         reached: whether the run reached its goal. A run that did not is censored at its end.
 
     Returns:
-        The interval is log-log (Kalbfleisch and Prentice); nan where all or none remain, but 1 at time 0.
+        The interval at a time is that of `clopper_pearson` for the number of runs without censoring that would give
+        the share its variance by Greenwood's formula (Rothman 1978, Journal of Chronic Diseases 31) or, where all or
+        none remain, for those at risk. It takes runs as independent; nan below `FEWEST_SHAPES` runs.
     """
     times, reached = np.asarray(times, dtype=float), np.asarray(reached, dtype=bool)
     if times.shape != reached.shape or times.ndim != 1 or not times.size:
         raise ValueError(f"times and reached must be as many, one or more, but are {times.shape} and {reached.shape}")
     if not (np.isfinite(times) & (times >= 0)).all():
         raise ValueError(f"times must be finite and 0 or more, but are {times}: give the time at which a run ended")
-    left = stats.ecdf(stats.CensoredData.right_censored(times, ~reached)).sf
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # scipy warns of the nan that the docstring describes
-        ends = left.confidence_interval(level, method="log-log")
-    steps = (left.probabilities, ends.low.probabilities, ends.high.probabilities)
-    return Survival(np.append(0.0, left.quantiles), *(np.append(1.0, step) for step in steps))
+    steps = np.unique(times)
+    at_risk = np.append(len(times), (times >= steps[:, None]).sum(axis=1))
+    ended = np.append(0, ((times == steps[:, None]) & reached).sum(axis=1))
+    left = np.cumprod(1 - ended / at_risk)
+    ends = np.full((2, len(left)), math.nan)
+    if len(times) >= FEWEST_SHAPES:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = left**2 * np.cumsum(ended / (at_risk * (at_risk - ended)))
+            worth = np.where((left > 0) & (left < 1), left * (1 - left) / variance, at_risk)
+        intervals = [clopper_pearson(value, n, level=level) for value, n in zip(left, worth, strict=True)]
+        ends = np.array([(one.low, one.high) for one in intervals]).T
+    return Survival(np.append(0.0, steps), left, *ends)
 
 
 def holm(p_values: Values) -> np.ndarray:
@@ -142,7 +218,7 @@ def compare(first: Groups, second: Groups) -> float:
     """
     if len(first) != len(second):
         raise ValueError(f"both must have the same shapes, but have {len(first)} and {len(second)}: fill in with inf")
-    a, b = (np.array([median(group) for group in groups]) for groups in (first, second))
+    a, b = (np.array([median(flat([group])) for group in groups]) for groups in (first, second))
     differ = a != b
     difference = a[differ] - b[differ]
     ranks = np.rint(2 * stats.rankdata(np.abs(difference))).astype(int)  # doubled, so that ties have integer ranks
@@ -153,12 +229,20 @@ def compare(first: Groups, second: Groups) -> float:
     return min(1.0, 2 * float(chance[: min(positive, ranks.sum() - positive) + 1].sum()))
 
 
-def rank(table: dict[Any, dict[Hashable, float | None]]) -> dict[Any, float]:
+def rank(
+    table: dict[Any, dict[Any, float | None]], *, draw: Callable[[Any], Hashable] = lambda shape: shape
+) -> dict[Any, float]:
     """Each method's mean rank over the shapes, 1 is the best; equal errors share their mean rank.
 
     A method without a finite error for a shape has the worst rank there: the number of methods. A shape at which all
-    methods fail is left out.
+    methods fail is left out. From one draw no rank is given: nan.
+
+    Args:
+        table: the errors of each method by shape, or by anything else that is compared.
+        draw: gives the shape and seed to which such a key belongs.
     """
+    if len({draw(key) for errors in table.values() for key in errors}) < 2:
+        return dict.fromkeys(table, math.nan)
     errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
     return errors.rank(axis=1).fillna(len(table)).mean().fillna(len(table)).to_dict()
 
@@ -174,9 +258,12 @@ def dominated(costs: Values, errors: Values) -> np.ndarray:
 def front(points: Sequence[Point], *, seed: int, draws: int = 2000) -> list[float]:
     """The probability of each setting to be on the Pareto front of medians, over bootstrap draws of shapes and seeds.
 
-    All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front.
+    All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front. One
+    run of each gives no probability: nan.
     """
-    _, drawn, _ = _resample([groups for point in points for groups in point], median, seed, draws)
+    if points and not several(points[0][0]):
+        return [math.nan] * len(points)
+    _, drawn, _ = _resample([groups for point in points for groups in point], median, seed, draws, fewest=1)
     costs, errors = drawn[0::2].T, drawn[1::2].T
     return (~dominated(costs, errors) & np.isfinite(costs) & np.isfinite(errors)).mean(axis=0).tolist()
 
@@ -206,9 +293,19 @@ def hypervolume_interval(
     points: Sequence[Point], *, reference: tuple[float, float], seed: int, level: float = 0.95, draws: int = 2000
 ) -> Interval:
     """The hypervolume of the settings' medians with its interval; all settings get the same shapes and seeds."""
-    value, drawn, n = _resample([groups for point in points for groups in point], median, seed, draws)
-    area = hypervolume(drawn[0::2].T, drawn[1::2].T, reference=reference)
-    return _interval(hypervolume(value[0::2], value[1::2], reference=reference), area, n, level)
+    resampled = _resample([groups for point in points for groups in point], median, seed, draws)
+    value, drawn, shapes = (hypervolume(v[0::2].T, v[1::2].T, reference=reference) for v in resampled)
+    return _interval(value, drawn, shapes, level)
+
+
+def several(groups: Groups) -> bool:
+    """Whether there is more than one run: from one alone no probability and no rank is given."""
+    return len(flat(groups)) > 1
+
+
+def flat(groups: Groups) -> np.ndarray:
+    """The values of all runs, shape after shape."""
+    return np.concatenate([group if isinstance(group, np.ndarray) else flat(group) for group in groups])
 
 
 def _checked(values: Values) -> np.ndarray:
@@ -227,36 +324,57 @@ def _ratio(first: float | np.ndarray, second: float | np.ndarray) -> np.ndarray:
         return np.where(first == second, 1.0, np.divide(first, second))
 
 
+_SAME = "all must have the same shapes and seeds, one or more, but have"
+
+
+def _sizes(groups: Groups) -> list[list[int]]:
+    """The number of shapes, then that of views of each shape, then that of seeds of each view; without views, two."""
+    sizes = [[len(groups)]]
+    while groups and not isinstance(groups[0], np.ndarray):
+        sizes.append([len(group) for group in groups])
+        groups = [part for group in groups for part in group]
+    return [*sizes, [len(group) for group in groups]]
+
+
 def _resample(
-    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """The statistic of each series [series], that of each draw [series, draws], and the number of shapes or seeds."""
-    sizes = [[len(group) for group in groups] for groups in series]
-    if not sizes or not sizes[0] or any(other != sizes[0] for other in sizes) or not min(sizes[0]):
-        raise ValueError(f"all must have the same shapes and seeds, one or more, but have {sizes}: fill in with inf")
-    values = _checked(np.stack([np.concatenate(groups) for groups in series]))
-    drawn = [np.stack([statistic(row[index]) for row in values]) for index in _draw(np.array(sizes[0]), seed, draws)]
-    n = len(sizes[0]) if len(sizes[0]) > 1 else sizes[0][0]
-    return np.asarray(statistic(values)), np.concatenate(drawn, axis=1), n
+    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = FEWEST_SHAPES
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The statistic of each series [series], of each draw [series, draws], and of each shape [series, shapes].
+
+    Without draws where there are fewer shapes than `fewest`.
+    """
+    sizes = [_sizes(groups) for groups in series]
+    if not sizes or any(other != sizes[0] for other in sizes) or not all(min(level, default=0) for level in sizes[0]):
+        raise ValueError(f"{_SAME} {sizes}: fill in with inf")
+    values = _checked(np.stack([flat(groups) for groups in series]))
+    shapes = np.array([[statistic(_checked(flat([group]))) for group in groups] for groups in series], dtype=float)
+    drawn = [np.empty((len(series), 0))]
+    if len(series[0]) >= fewest:
+        drawn = [np.stack([statistic(row[index]) for row in values]) for index in _draw(sizes[0], seed, draws)]
+    return np.asarray(statistic(values)), np.concatenate(drawn, axis=1), shapes
 
 
-def _draw(sizes: np.ndarray, seed: int, draws: int) -> list[np.ndarray]:
-    """The indices of the drawn runs, for shapes of the given numbers of seeds: an array [draws, runs] per run count."""
+def _draw(sizes: list[list[int]], seed: int, draws: int) -> list[np.ndarray]:
+    """The indices of the drawn runs, for the sizes of `_sizes`: an array [draws, runs] per number of runs."""
     generator = np.random.default_rng(seed)
-    shape = generator.integers(len(sizes), size=(draws, len(sizes), 1))
-    size, start = sizes[shape], (np.cumsum(sizes) - sizes)[shape]
-    run = start + generator.integers(size, size=(draws, len(sizes), sizes.max()))
-    kept = np.arange(sizes.max()) < size  # a shape gives as many runs as it has seeds
-    total = kept.sum(axis=(1, 2))
-    return [run[total == n][kept[total == n]].reshape(-1, n) for n in np.unique(total)]
+    (n,) = sizes[0]
+    node, kept = generator.integers(n, size=(draws, n)), np.ones((draws, n), dtype=bool)
+    for level in map(np.array, sizes[1:]):
+        size, start = level[node][..., None], (np.cumsum(level) - level)[node][..., None]
+        part = start + generator.integers(size, size=(*node.shape, level.max()))
+        kept = kept[..., None] & (np.arange(level.max()) < size)  # a shape gives as many runs as it has
+        node, kept = part.reshape(draws, -1), kept.reshape(draws, -1)
+    total = kept.sum(axis=1)
+    return [node[total == n][kept[total == n]].reshape(-1, n) for n in np.unique(total)]
 
 
-def _interval(value: float | np.ndarray, drawn: np.ndarray, n: int, level: float) -> Interval:
-    """The expanded percentile interval of the statistic's draws, for n shapes or seeds."""
+def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray, level: float) -> Interval:
+    """The expanded percentile interval of the statistic's draws, and the statistic of each shape."""
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, but is {level}: 0.95 is usual")
-    if n < 2:
-        return Interval(float(value), math.nan, math.nan)
+    n, shapes = len(points), tuple(points.tolist())
+    if n < FEWEST_SHAPES:
+        return Interval(float(value), math.nan, math.nan, shapes)
     tail = stats.norm.cdf(math.sqrt(n / (n - 1)) * stats.t.ppf((1 - level) / 2, n - 1))
     low, high = np.quantile(drawn, tail, method="lower"), np.quantile(drawn, 1 - tail, method="higher")
-    return Interval(float(value), float(low), float(high))
+    return Interval(float(value), float(low), float(high), shapes)

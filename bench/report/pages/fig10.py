@@ -5,7 +5,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
     ONE_WAY,
@@ -42,7 +41,7 @@ RUNS = (
 )
 COLUMNS = (
     *(text("family", "Family"), text("method", "Method"), text("condition", "Condition"), Column("median", "Median")),
-    shown("95 % interval", lambda line: format.interval(line["low"], line["high"])),
+    shown("95 % interval", lambda line: line["cell"].ends()),
 )
 
 
@@ -51,14 +50,15 @@ def make(experiment: Experiment) -> Result:
     cells = _cells(experiment)
     lines = [
         {"family": name, "method": row.name, "condition": f"{PANELS[key]}: {value:g}"}
-        | {"median": cell.value, "low": cell.low, "high": cell.high}
+        | {"median": cell.value, "cell": cell}
         for (name, row, key, value), cell in cells.items()
     ]
     return Result(
         experiment,
         "Shape from many views under other focal lengths and starts.",
         "Median Chamfer distance from truth to prediction (squared scene units, times 1000).",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=cells.values(),
         remarks=NOTES,
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
@@ -91,8 +91,9 @@ def draw(cells: dict[Cell, Interval]) -> Figure:
     for line, name in zip(axes, families, strict=True):
         for axis, key in zip(line, PANELS, strict=True):
             selected = {(row, x): cell for (n, row, k, x), cell in cells.items() if (n, k) == (name, key)}
-            known = [end for (n, *_), c in cells.items() if n == name for end in (c.value, c.high) if np.isfinite(end)]
-            _panel(axis, selected, 2 * max(known, default=1.0))
+            found = [cell for (n, *_), cell in cells.items() if n == name]
+            known = style.finite(end for cell in found for end in (cell.value, cell.high, *cell.points))
+            _panel(axis, selected, 2 * np.nanmax([*known, 0.5]) if np.isfinite(known).any() else 2.0)
             axis.set(xlabel=PANELS[key], title=name)
         style.log_axis(line[0], "y", known)
         line[0].set_ylabel("truth to prediction × 1000\n(scene units²)")
@@ -101,7 +102,7 @@ def draw(cells: dict[Cell, Interval]) -> Figure:
 
 
 def _panel(axis: Axes, cells: dict[tuple[Row, float], Interval], edge: float) -> None:
-    """Draws the medians of each row with their intervals; values beyond the edge are drawn at it."""
+    """Draws the medians of each row with their intervals or points; values beyond the edge are drawn at it."""
     for row, keys in grouped(cells, lambda key: key[0]).items():
-        low, middle, high = ([min(getattr(cells[key], end), edge) for key in keys] for end in ("low", "value", "high"))
-        chart.line(axis, row.preset, [x for _, x in keys], middle, band=(low, high), label=row.name)
+        found = [cells[key].below(edge) for key in keys]
+        chart.estimates(axis, row.preset, [x for _, x in keys], found, label=row.name)

@@ -19,12 +19,24 @@ from bench.report.data.records import (
     median_of_known,
     setting,
     shape,
+    solid,
     value_evaluations,
 )
-from bench.report.data.statistics import wilson
+from bench.report.data.statistics import Interval, share
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+from bench.report.write.table import (
+    FAMILY,
+    IDENTITY,
+    LOOP,
+    Column,
+    configured,
+    counted,
+    metrics,
+    text,
+    to_data,
+    to_table,
+)
 
 PLACE = 60
 SETUP = ("scenes", "pixels", "machine")
@@ -34,8 +46,9 @@ PLOTTED = (
     "error in rotation."
 )
 NOTES = (
-    "The initial camera is also shifted by {shift:g}. All methods have the same shapes, views and starts, {scenes} in "
-    "all. A run that did not end ok counts as a failure. Markers of one angle are drawn side by side.",
+    "The initial camera is also shifted by {shift:g}. All methods have the same views and starts, {scenes} in all; "
+    "an interval counts the views of one shape as one trial. A run that did not end ok counts as a failure. Markers of "
+    "one angle are drawn side by side.",
     "Times include the trials of all starts; iterative closest points run every start to its end. Times and "
     "evaluations are those of the loop, over runs that ended ok.",
 )
@@ -69,7 +82,8 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Camera pose from a depth image and a silhouette of a known shape.",
         PLOTTED.format(**settings),
-        interval="Wilson's 95 % intervals",
+        interval="95 % intervals over shapes (Clopper and Pearson)",
+        estimates=[_rate(of) for of_row in runs.values() for of in of_row.values()],
         remarks=[note.format(**settings, scenes=scenes) for note in NOTES],
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, lines),
@@ -95,12 +109,9 @@ def draw(runs: Runs, angles: list[float]) -> Figure:
 
 def _rates(axis: Axes, row: Row, runs: dict[float, list[Record]], offset: float) -> None:
     """Draws the success rate of a row at each angle, with a horizontal offset so that bars do not overlap."""
-    look, angles = style.look(row.preset), sorted(runs)
-    rates = [wilson(_found(runs[angle]), len(runs[angle])) for angle in angles]
-    shares, low, high = (100 * np.array([getattr(rate, end) for rate in rates]) for end in ("value", "low", "high"))
-    bars = np.maximum([shares - low, high - shares], 0)
-    how = {"color": look.colour, "marker": look.marker, "ls": look.line}
-    axis.errorbar(np.array(angles) + offset, shares, bars, elinewidth=0.7, label=row.name, **how)
+    angles = sorted(runs)
+    rates = [_rate(runs[angle]).times(100) for angle in angles]
+    chart.estimates(axis, row.preset, np.array(angles) + offset, rates, bars=True, label=row.name)
 
 
 def _angle(record: Record) -> float:
@@ -115,8 +126,13 @@ def _found(records: list[Record]) -> int:
 def _share(records: list[Record] | None) -> str:
     if not records:
         return ""
-    rate = wilson(_found(records), len(records))
-    return f"{_found(records)} of {len(records)} {format.interval(100 * rate.low, 100 * rate.high)}"
+    return counted(_found(records), len(records), _rate(records))
+
+
+def _rate(records: list[Record]) -> Interval:
+    """The share of poses that were found, with its interval over shapes, each of which may have several views."""
+    of_shape = grouped(records, solid).values()
+    return share([_found(runs) for runs in of_shape], [len(runs) for runs in of_shape])
 
 
 def _median(records: list[Record], value: Callable[[Record], float | None]) -> float | None:

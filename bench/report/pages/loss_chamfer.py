@@ -6,7 +6,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.curves import history_of, spearman
 from bench.report.data.experiments import Experiment
@@ -25,7 +24,7 @@ NOTES = (
 COLUMNS = (
     *(text("row", "Setting"), text("renderer"), text("runs", "Runs")),
     *(Column("within", "Within a run"), Column("low"), Column("high")),
-    shown("95 % interval", lambda line: format.interval(line.get("low"), line.get("high"))),
+    shown("95 % interval", lambda line: line["spread"].ends() if line["spread"] else ""),
     *(Column("together", "All together"), Column("looks")),
 )
 
@@ -40,7 +39,8 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Correlation of loss and Chamfer distance.",
         "Spearman's rank correlation of loss and Chamfer distance over the checkpoints of a run.",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=[line["spread"] for line in lines if line["spread"]],
         remarks=(sizes(rows), *NOTES),
         data=to_data(COLUMNS, lines),
         table=to_table(COLUMNS, lines),
@@ -54,8 +54,8 @@ def _line(row: Setting, histories: list[pd.DataFrame]) -> dict[str, Any]:
     spread = statistics.bootstrap(groups, statistics.median, seed=SEED) if groups else None
     numbers = {"within": spread.value, "low": spread.low, "high": spread.high} if spread else {}
     cloud = pd.concat(histories, ignore_index=True)
-    pooled = {"together": spearman(cloud), "looks": len(cloud), "runs": sum(map(len, groups))}
-    return {"row": row.name, "renderer": row.renderer, **numbers, **pooled}
+    pooled = {"together": spearman(cloud), "looks": len(cloud), "runs": sum(rho is not None for rho in within.values())}
+    return {"row": row.name, "renderer": row.renderer, "spread": spread, **numbers, **pooled}
 
 
 @style.styled

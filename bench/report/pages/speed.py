@@ -1,5 +1,6 @@
 """The Pareto front of error and time, and the hypervolume that each renderer's settings dominate in their plane."""
 
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from bench.report.data.experiments import Experiment, together
 from bench.report.data.records import grouped
 from bench.report.data.speed import SEED, TRIALS, Placed, Setting, front_line, left_out, resolution, sizes, trials
 from bench.report.write import chart, interactive
+from bench.report.write.caption import undefined
 from bench.report.write.result import Result
-from bench.report.write.table import Column, shown, text, to_data, to_table
+from bench.report.write.table import Column, defined, shown, text, to_data, to_table
 
 PLACE_FRONT = 80
 PLACE_VOLUME = 100
@@ -23,10 +25,11 @@ NOTES = (
     "Final error of a completion over the seconds of its loop, and depth error of one rendering (95th percentile over "
     "pixels, missed and spurious ones count as infinite) over its seconds. A run that did not end ok is infinite in "
     "both; so is a run that others have and a setting lacks.",
-    "Filled points are on the front, hollow ones are dominated, and a cross at the edge is an infinite median.",
-    "In brackets and in the last column: the probability of being on the front, over 2,000 bootstrap draws of shapes "
-    "and seeds, the same for all settings. Settings that differ only in what an optimisation uses have equal "
-    "renderings; noise in the times decides between them.",
+    "Filled points are on the front, hollow ones are dominated, and a cross at the edge is an infinite median. Below "
+    "six shapes the small points are the medians of each shape.",
+    "In brackets and in the last column: the probability of being on the front, over 2,000 bootstrap draws of {shapes "
+    "and seeds}, the same for all settings. Settings that compute the same, as those that differ only in what an "
+    "optimisation uses do when an image is rendered, share their times: the median of theirs on each shape.",
 )
 
 
@@ -40,9 +43,10 @@ def make_front(completion: Experiment | None, rendering: Experiment | None) -> R
     return Result(
         together(completion, rendering),
         "Error over time.",
-        "Median error of each setting over its median time, over shapes and seeds.",
-        interval="in the CSV, 95 % bootstrap intervals of interquartile means over shapes and seeds",
-        remarks=(left_out(rendering), sizes(*settings), *NOTES),
+        "Median error of each setting over its median time, over {shapes and seeds}.",
+        interval="in the CSV, 95 % bootstrap intervals of interquartile means over {shapes and seeds}",
+        estimates=[point.row.middle for point in points],
+        remarks=(left_out(rendering), sizes(*settings), *NOTES, undefined(point.chance for point in points)),
         data=to_data([*columns, text("resolution", value=lambda point: resolution(point.row.records[0]))], points),
         table=to_table(columns, points),
         figure=draw(panels),
@@ -53,13 +57,15 @@ def make_front(completion: Experiment | None, rendering: Experiment | None) -> R
 def make_volume(completion: Experiment | None, rendering: Experiment | None) -> Result:
     """Makes the page, with a line per renderer: the area that its settings dominate, with its interval."""
     settings = trials(completion, rendering)
-    lines = [line for rows in settings for line in _volumes(rows)]
+    areas = [area for rows in settings for area in _volumes(rows)]
+    lines = [line for line, _ in areas]
     return Result(
         together(completion, rendering),
         "Area that each renderer dominates in the plane of error and time.",
         "Area dominated by the medians of a renderer's settings, in powers of ten of seconds times powers of ten of "
         "error, up to twice the largest finite median of either; larger is better.",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=[area for _, area in areas],
         remarks=(
             "More settings can only add to the area: it does not rank renderers with different numbers of settings.",
             sizes(*settings),
@@ -102,6 +108,9 @@ def _panel(axis: Axes, panel: list[Placed]) -> None:
     for point in panel:
         how = {"marker": "x"} if point.infinite else {} if point.on_front else {"mfc": "none"}
         chart.points(axis, point.row.renderer, point.x, point.y, ms=5, **how)
+        if not point.row.middle.known:
+            shapes = [[float(statistics.median(statistics.flat([group]))) for group in groups] for groups in _of(point)]
+            chart.points(axis, point.row.renderer, *map(style.finite, shapes), ms=2, alpha=0.5, zorder=1.5)
     line = front_line(panel)
     how = {"where": "post", "color": "#999999", "lw": 0.8, "zorder": 0}
     axis.step([point.x for point in line], [point.y for point in line], **how)
@@ -112,8 +121,8 @@ def _panel(axis: Axes, panel: list[Placed]) -> None:
     axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
 
 
-def _volumes(rows: list[Setting]) -> list[dict[str, Any]]:
-    """The lines of a trial, one per renderer; none where all medians are infinite."""
+def _volumes(rows: list[Setting]) -> list[tuple[dict[str, Any], statistics.Interval]]:
+    """The lines of a trial, one per renderer, and their areas; none where all medians are infinite."""
     finite = np.array([row.point for row in rows if np.isfinite(row.point).all()])
     if not len(finite):
         return []
@@ -123,9 +132,15 @@ def _volumes(rows: list[Setting]) -> list[dict[str, Any]]:
         points = [(row.costs, row.errors) for row in of_renderer]
         area = statistics.hypervolume_interval(points, reference=reference, seed=SEED)
         identity = {"trial": rows[0].trial.title, "renderer": renderer, "settings": len(points)}
-        numbers = {"hypervolume": area.value, "low": area.low, "high": area.high}
-        lines.append({**identity, **numbers, "reference_seconds": reference[0], "reference_error": reference[1]})
+        numbers = {"hypervolume": area.value, "low": area.low, "high": area.high, "ends": area.ends()}
+        limits = {"reference_seconds": reference[0], "reference_error": reference[1]}
+        lines.append(({**identity, **numbers, **limits}, area))
     return lines
+
+
+def _of(point: Placed) -> tuple[statistics.Groups, statistics.Groups]:
+    """The seconds and the errors of a point, per shape."""
+    return point.row.costs, point.row.errors
 
 
 def _settings(point: Placed) -> dict[str, Any]:
@@ -147,7 +162,7 @@ COLUMNS = (  # of a point
     Column(
         "evaluations",
         "Evaluations",
-        lambda p: float(statistics.median(np.concatenate(p.row.evaluations))),
+        lambda p: float(statistics.median(statistics.flat(p.row.evaluations))),
         format.count,
     ),
     Column("error", "Error × 1000", lambda point: point.row.point[1]),
@@ -158,12 +173,12 @@ COLUMNS = (  # of a point
     Column("runs", value=lambda point: len(point.row.records)),
     Column("missing", value=lambda point: point.row.missing),
     shown("Failed", _failed),
-    Column("on_front", "P(on the front)", lambda point: point.chance),
+    Column("on_front", "P(on the front)", lambda point: point.chance, defined),
     Column("dominated", value=lambda point: point.dominated),
 )
 VOLUME = (
     *(text("trial", "Trial"), text("renderer", "Renderer"), text("settings", "Settings")),
     *(Column("hypervolume", "Hypervolume"), Column("low"), Column("high")),
-    shown("95 % interval", lambda line: format.interval(line["low"], line["high"])),
+    shown("95 % interval", itemgetter("ends")),
     *(Column("reference_seconds"), Column("reference_error")),
 )

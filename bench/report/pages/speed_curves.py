@@ -14,7 +14,7 @@ from bench.report.data.curves import HISTORY, history_of
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, Row, loop_seconds
 from bench.report.data.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
-from bench.report.data.statistics import kaplan_meier
+from bench.report.data.statistics import FEWEST_SHAPES, kaplan_meier
 from bench.report.write import chart, interactive
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, text, through, to_data, to_table
@@ -57,13 +57,23 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Error over time and over field values.",
         "Error over seconds and over field values, and the share of runs that have not reached the target.",
-        interval="bands are the quartiles of the runs",
+        interval=_bands(rows),
         remarks=(sizes(rows), *NOTES),
         data=to_data(POINTS, points),
         table=to_table(COLUMNS, [_line(row, of_row) for row, of_row in times.items()]),
         figure=draw(main_settings(rows), shown, times),
         page=interactive.curves(rows, shown),
     )
+
+
+def _bands(rows: list[Setting]) -> str:
+    """What is drawn around the medians."""
+    return "thin lines are the runs, fewer than six shapes" if _few(rows) else "bands are the quartiles of the runs"
+
+
+def _few(rows: list[Setting]) -> bool:
+    """Whether there are too few shapes for a band."""
+    return len({run[0] for row in rows for run in row.keys}) < FEWEST_SHAPES
 
 
 def _line(row: Row, times: list[Reached]) -> dict[str, Any]:
@@ -80,8 +90,10 @@ def draw(rows: list[Setting], shown: Histories, times: dict[Row, list[Reached]])
         everything = []  # positions with finite medians: a logarithmic axis needs a point
         for row in rows:
             where, low, middle, high = band(shown[row.row], [r["status"] != "ok" for r in row.records], along)
-            how = {"band": (style.finite(low), style.finite(high)), "marker": "", "label": row.name}
-            chart.line(axis, row.renderer, where, style.finite(middle), **how)
+            quartiles = None if _few(rows) else (style.finite(low), style.finite(high))
+            chart.line(axis, row.renderer, where, style.finite(middle), band=quartiles, marker="", label=row.name)
+            for history in shown[row.row] if _few(rows) else []:
+                chart.line(axis, row.renderer, history[along], history["error"], marker="", lw=0.5, alpha=0.5)
             everything += [*where] if np.isfinite(middle).any() else []
         errors = [x for row in rows for history in shown[row.row] for x in history["error"]]
         style.log_axis(axis, "x", everything)

@@ -18,7 +18,7 @@ from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table
+from bench.report.write.table import IDENTITY, Column, defined, shown, text, through, to_data, to_table
 
 PLACE = 120
 PLACE_COST = 130
@@ -27,7 +27,7 @@ NOTES = (
     "The adaptive search makes {share:.0f} % of a full grid's trials; every renderer gets the same trials at a "
     "severity. Renderings have {resolution}×{resolution} pixels.",
     "“At once”: breaks at the mildest severity; “none”: does not break at the severest; both with the number of failed "
-    "trials there and Wilson's interval of their share. – is a renderer without that setting.",
+    "trials there and the interval of their share (Clopper and Pearson). – is a renderer without that setting.",
     "Success: {hits:g} of the true hits within the pixel's footprint and false hits of at most {false_hits:g} of them; "
     "a gradient whose cosine is at least {cosine:g} and whose relative length is within {scale:g} of 1; a fit within "
     "{surface_error:g} scene units of the surface.",
@@ -49,7 +49,7 @@ COLUMNS = (  # of an axis and a cell
 COSTS = (
     text("row", "Renderer"),
     Column("axes"),
-    Column("rank", "Mean rank"),
+    Column("rank", "Mean rank", show=defined),
     text("at_once", "At once"),
     text("never", "None"),
     Column("cost", "Field values per ray"),
@@ -176,7 +176,7 @@ def draw_cost(lines: dict[Row, dict[str, Any]]) -> Figure:
         places[place] += 1
     style.log_axis(axes, "x", [line["cost"] for line in lines.values()])
     axes.set(xlabel="field values per ray at the mild end, median over axes", ylabel="mean rank over axes (1 is best)")
-    axes.set_ylim(max(line["rank"] for line in lines.values()) + 0.5, 0.5)
+    axes.set_ylim(max(place for line in lines.values() for place in (line["rank"], 1) if place == place) + 0.5, 0.5)
     figure.legend(loc="outside right upper")
     return figure
 

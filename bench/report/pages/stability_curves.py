@@ -12,7 +12,7 @@ from bench.report.data import curves
 from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, Row, grouped
-from bench.report.data.statistics import wilson
+from bench.report.data.statistics import clopper_pearson
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data
@@ -24,7 +24,8 @@ SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COLUMNS = (text("axis"), text("row"), *(Column(name) for name in SHARES))
 NOTES = (
     "Curves are logistic, with the most probable breakdown and width. Dots are shares of the trials at a severity; the "
-    "CSV has their number and Wilson's intervals. Renderers are shifted a little upwards, so that none hides another.",
+    "CSV has their number and intervals (Clopper and Pearson). Renderers are shifted a little upwards, so that none "
+    "hides another.",
     "A dashed line is the predicted breakdown of the renderer of its colour, a dotted one that of a second formula, as "
     "published: DIST, Eqs. 8 and 10.",
 )
@@ -112,6 +113,6 @@ def _shares(experiment: Experiment, record: Record) -> pd.DataFrame:
     for level, tried in sorted(grouped(trials, lambda trial: float(trial["level"])).items()):
         severity, successes = float(tried[0]["severity"]), sum(bool(trial.get("success")) for trial in tried)
         if math.isfinite(severity):
-            rate = wilson(successes, len(tried))
+            rate = clopper_pearson(successes / len(tried), len(tried))
             rows.append([level, severity, successes, len(tried), rate.value, rate.low, rate.high])
     return pd.DataFrame(rows, columns=SHARES)

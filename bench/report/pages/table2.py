@@ -1,8 +1,9 @@
 """Table 2 of DIST: shape completion over the sparsity of the depth image, measured and published; with intervals.
 
-The second page has interquartile means, failures, paired ratios, ranks and tests.
+The second page has interquartile means, failures, paired ratios, ranks and tests, the third each row's wins.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,17 +14,31 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records.record import NOT_RUN
-from bench.report.data import statistics
+from bench.report.data import statistics, wins
 from bench.report.data.completions import ERROR, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import LABEL, NOTE, oracles
 from bench.report.data.records import Row, RunKey, by_shape, grouped, iterations_of, row_of
 from bench.report.write import chart
+from bench.report.write.caption import undefined
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+from bench.report.write.table import (
+    FAMILY,
+    IDENTITY,
+    LOOP,
+    Column,
+    configured,
+    counted,
+    defined,
+    metrics,
+    text,
+    to_data,
+    to_table,
+)
 
 PLACE = 20
 PLACE_INTERVALS = 30
+PLACE_WINS = 35
 READS = (TABLE2,)
 REFERENCE = "dist_mask"  # the preset with which the other rows are compared
 SEED = 0  # of the bootstrap
@@ -46,15 +61,16 @@ PUBLISHED = {
     },
 }
 NOTES = (
-    "Dense depth implies the mask. “Paper's as printed” is the setting of DIST, B.4 (the mean of the squared code from "
-    "the official code); conf/README.md, “The paper's setting, and the default”, says what the other rows are.",
+    "Below six shapes the small points are the shapes. Dense depth implies the mask. “Paper's as printed” is the "
+    "setting of DIST, B.4 (the mean of the squared code from the official code); conf/README.md, “The paper's setting, "
+    "and the default”, says what the other rows are.",
     NOTE,
     "“Published” is DIST, Table 2: 200 shapes of ShapeNet, with another prior and camera, and another number of points "
     "per share, so it cannot be compared directly with the measured rows.",
 )
 INTERVAL_NOTES = (
-    "Shapes with a failure: the share of shapes with a run, at any number of points, that did not end ok, with "
-    "Wilson's interval.",
+    "Shapes with a failure: the number of shapes with a run, at any number of points, that did not end ok, with the "
+    "interval of their share (Clopper and Pearson).",
     "The ratio is the interquartile mean of the row over that of {reference}, for each shape's geometric mean over all "
     "numbers of points, paired by shape; it is infinite where a failure is in the middle half.",
     "The rank is the mean over shapes and points; a failed or missing run ranks last.",
@@ -83,7 +99,7 @@ def make(experiment: Experiment) -> Result:
     return Result(
         experiment,
         "Shape completion from one depth image, over its sparsity.",
-        "Median error of shapes and seeds over the number of given depth points.",
+        "Median error over {shapes and seeds} at each number of given depth points.",
         remarks=(ERROR, shapes_per_cell(runs), _given(runs), _iterations(experiment), *NOTES),
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, [line for name in runs.families for line in _lines(runs, name, oracle.get(name))]),
@@ -131,9 +147,17 @@ def _panel(axis: Axes, runs: Completions, name: str) -> list[float]:
         medians = style.finite(runs.median(name, row, points) for points in runs.points)
         everything += medians
         chart.line(axis, row.preset, [places[i] for i in order], [medians[i] for i in order], label=row.name)
+        chart.shapes(axis, row.preset, places, [_points(runs, name, row, points) for points in runs.points])
     axis.set(title=name, xlabel="depth points given")
     style.log_axis(axis, "x", [] if None in given else places)
     return everything
+
+
+def _points(runs: Completions, name: str, row: Row, points: str) -> statistics.Interval:
+    """The medians of the shapes of a cell, to be drawn below six shapes."""
+    shapes = by_shape(runs.errors.get((name, row, points), {}))
+    drawn = style.finite(map(_middle, shapes)) if len(shapes) < statistics.FEWEST_SHAPES else []
+    return statistics.Interval(math.nan, math.nan, math.nan, tuple(drawn))
 
 
 def _given(runs: Completions) -> str:
@@ -166,17 +190,22 @@ def make_intervals(experiment: Experiment) -> Result:
         *(text(points, heading(points)) for points in runs.points),
         text("failed", "Shapes with a failure"),
         text("ratio", "Ratio to the reference"),
-        Column("rank", "Mean rank"),
+        Column("rank", "Mean rank", show=defined),
     ]
     notes = [note.format(reference=f"“{reference.name}”") for note in INTERVAL_NOTES]
+    lines = [line for name in runs.families for line in _intervals(runs, name, means, reference)]
     return Result(
         experiment,
         "Shape completion from one depth image, with intervals.",
         "Interquartile mean of the error at each number of depth points.",
-        interval="95 % bootstrap intervals over shapes and seeds (expanded percentiles, 2,000 draws)",
-        remarks=(ERROR, shapes_per_cell(runs), *notes, *_tests(runs, reference)),
+        interval="95 % bootstrap intervals over {shapes and seeds} (expanded percentiles, 2,000 draws)",
+        estimates=means.values(),
+        remarks=(
+            *(ERROR, shapes_per_cell(runs), *notes, *_tests(runs, reference)),
+            undefined(line["rank"] for line in lines),
+        ),
         data=pd.DataFrame([_statistics(runs, cell, mean) for cell, mean in means.items()], dtype=object),
-        table=to_table(columns, [line for name in runs.families for line in _intervals(runs, name, means, reference)]),
+        table=to_table(columns, lines),
     )
 
 
@@ -195,15 +224,15 @@ def _intervals(
         row: {(p, run): e for p in runs.points for run, e in runs.errors.get((name, row, p), {}).items()}
         for row in runs.rows_of(name)
     }
-    ranks = statistics.rank(errors)
+    ranks = statistics.rank(errors, draw=lambda key: key[1])  # of points and run
     for row in errors:
-        share = statistics.wilson(*runs.failed_shapes(name, row))
+        failed, shapes = runs.failed_shapes(name, row)
         first, second = runs.pair(name, row, reference)
         compared = row != reference and first
         yield {
             **{"family": name, "row": row.name, "rank": ranks[row]},
             **{points: means.get((name, row, points)) for points in runs.points},
-            "failed": f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]",
+            "failed": counted(failed, shapes, statistics.share(np.arange(shapes) < failed, np.ones(shapes))),
             "ratio": statistics.paired_bootstrap(first, second, statistics.interquartile_mean, seed=SEED)
             if compared
             else "",
@@ -214,7 +243,8 @@ def _statistics(runs: Completions, cell: Cell, mean: statistics.Interval) -> dic
     """All statistics of a cell: a line of the CSV."""
     errors, statuses = runs.errors[cell], runs.statuses[cell]
     failed = statuses.total() - statuses["ok"]
-    share = statistics.wilson(failed, statuses.total())
+    lost = [np.isinf(statistics.flat([group])) for group in by_shape(errors)]
+    share = statistics.share([float(group.sum()) for group in lost], [len(group) for group in lost])
     return {
         **{"family": cell[0], "row": cell[1].name, "points": cell[2]},
         **{"shapes": len(by_shape(errors)), "runs": len(errors)},
@@ -224,15 +254,40 @@ def _statistics(runs: Completions, cell: Cell, mean: statistics.Interval) -> dic
     }
 
 
+def _middle(group: Any) -> float:
+    """The median of a shape's runs."""
+    return float(statistics.median(statistics.flat([group])))
+
+
 def _tests(runs: Completions, reference: Row) -> list[str]:
     """A note for each row: whether it is better than the reference over the shapes of all families, Holm's p-value."""
     found: dict[str, float] = {}
     for row in runs.rows:
         pairs = [runs.pair(name, row, reference) for name in runs.families]
         first, second = ([group for pair in pairs for group in pair[side]] for side in (0, 1))
-        if row != reference and first:
-            wins = sum(statistics.median(a) < statistics.median(b) for a, b in zip(first, second, strict=True))
-            better = f"{'better' if 2 * wins > len(first) else 'no better'} ({wins} of {len(first)} shapes)"
+        if row != reference and len(first) > 1:
+            won = sum(_middle(a) < _middle(b) for a, b in zip(first, second, strict=True))
+            better = f"{'better' if 2 * won > len(first) else 'no better'} ({won} of {len(first)} shapes)"
             found[f"{row.name} is {better} than {reference.name}"] = statistics.compare(first, second)
     adjusted = statistics.holm([*found.values()]) if found else []
     return [f"{test}: p = {p:.2g}" for test, p in zip(found, adjusted, strict=True)]
+
+
+def make_wins(experiment: Experiment) -> Result:
+    """Makes the page with the wins of each row against each other, all families together; the CSV has each family."""
+    runs = Completions(experiment)
+    of_family = {
+        name: wins.duels({row: runs.all_errors(row, name) for row in runs.rows}) for name in ("", *runs.families)
+    }
+    pooled = of_family[""]
+    lines = [{"family": name or "all", **one.line} for name, found in of_family.items() for one in found if one.pairs]
+    return Result(
+        experiment,
+        "Shape completion from one depth image, row against row.",
+        "On how many of the shapes, seeds and numbers of points on which both ran a row has the lower error.",
+        interval="95 % intervals over shapes (Clopper and Pearson)",
+        estimates=[one.chance for one in pooled if one.pairs],
+        remarks=(ERROR, wins.NOTE, undefined(one.chance.value for one in pooled if one.pairs)),
+        data=pd.DataFrame(lines, dtype=object),
+        table=wins.table(pooled),
+    )

@@ -21,12 +21,13 @@ from bench.report.data.records import (
     median_of_known,
     row_of,
     run_key,
+    solid,
     value_evaluations,
 )
-from bench.report.data.statistics import bootstrap, interquartile_mean, median, wilson
+from bench.report.data.statistics import Interval, bootstrap, interquartile_mean, median, share
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, to_data, to_table
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, counted, metrics, text, to_data, to_table
 
 PLACE = 40
 READS = (Selection("table3", ("multiview",), ("dataset", "task", "view")),)
@@ -72,8 +73,10 @@ def make(experiment: Experiment) -> Result:
     return Result(
         experiment,
         "Shape from many views, without a mask.",
-        "Median initial and final error over shapes and seeds, and its cost.",
-        interval="95 % bootstrap intervals of interquartile means over shapes and seeds, Wilson's of failures",
+        "Median initial and final error over {shapes and seeds}, and its cost.",
+        interval="95 % bootstrap intervals of interquartile means over {shapes and seeds}, Clopper and Pearson's of "
+        "failures over shapes",
+        estimates=[_middle(of) for all in experiment.families().values() for of in grouped(all, row_of).values()],
         remarks=NOTES,
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
@@ -92,22 +95,31 @@ def _lines(name: str, records: list[Record], oracle: float | None) -> list[dict[
 
 def _line(records: list[Record], oracle: float | None) -> dict[str, Any]:
     starts, ends = [_start(record) for record in records], [_end(record) for record in records]
-    middle = bootstrap(by_shape({run_key(record): _end(record) for record in records}), interquartile_mean, seed=0)
     finished = [record for record in records if record["status"] == "ok"]
     failed = len(records) - len(finished)
-    rate = wilson(failed, len(records))
     last = float(median(ends))
     left = float(median([_share(end, start) for end, start in zip(ends, starts, strict=True)]))
     return {
         "start": format.number(float(median(starts))),
         "end": last,
-        "middle": str(middle),
+        "middle": str(_middle(records)),
         "of_start": format.number(left),
         "of_oracle": format.number(last / oracle if oracle else None),
-        "failed": f"{failed} of {len(records)} {format.interval(100 * rate.low, 100 * rate.high)} %",
+        "failed": counted(failed, len(records), _rate(records)),
         "seconds": format.seconds(median_of_known(map(loop_seconds, finished))),
         "evaluations": format.count(median_of_known(map(value_evaluations, finished))),
     }
+
+
+def _middle(records: list[Record]) -> Interval:
+    """The interquartile mean of the final errors."""
+    return bootstrap(by_shape({run_key(record): _end(record) for record in records}), interquartile_mean, seed=0)
+
+
+def _rate(records: list[Record]) -> Interval:
+    """The share of runs that failed."""
+    of_shape = grouped(records, solid).values()
+    return share([sum(run["status"] != "ok" for run in runs) for runs in of_shape], [len(runs) for runs in of_shape])
 
 
 def _start(record: Record) -> float:

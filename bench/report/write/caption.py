@@ -1,29 +1,66 @@
 """Writes captions: what is plotted, n, the interval, what failed, and the machine; everything else becomes notes."""
 
+import math
 import textwrap
 from collections import Counter
+from collections.abc import Iterable
+from operator import itemgetter
 from typing import Any
 
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import Record, setting, shape
+from bench.report.data.records import Record, setting, solid, view
+from bench.report.data.statistics import Interval
 
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 MOST_FAILURES = 4  # most failed runs that a caption lists one by one
+OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
+SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."
+FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
 
 def caption(experiment: Experiment, plotted: str, *, n: str = "", interval: str = "") -> str:
-    """The caption of a page, in four sentences.
+    """The caption of a page, in four sentences, behind a warning where its runs are of scale=smoke.
 
     Args:
         experiment: the experiment that the page shows.
-        plotted: what is plotted, as a sentence.
+        plotted: what is plotted, as a sentence; `OVER` in it becomes that over which runs vary.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
-        interval: the kind of interval; empty for none.
+        interval: the kind of interval, likewise; empty for none.
     """
-    sample = (n or _sample(experiment)) + (f"; {interval}" if interval else "") + "."
+    sample = (n or _sample(experiment)) + (f"; {said(experiment, interval)}" if interval else "") + "."
     setup = _setup(experiment)
-    sentences = [plotted, f"n = {sample}", _outcome(experiment), f"{setup}." if setup else ""]
-    return " ".join(filter(None, sentences))
+    tried = any(setting(record["config"], "scale", "name") == "smoke" for record in experiment.records)
+    first = [SMOKE if tried else "", said(experiment, plotted)]
+    return " ".join(filter(None, [*first, f"n = {sample}", _outcome(experiment), f"{setup}." if setup else ""]))
+
+
+def said(experiment: Experiment, text: str) -> str:
+    """The text with that over which the runs of an experiment vary in place of `OVER`, such as shapes and seeds."""
+    shapes, views, seeds = _levels(experiment)
+    levels = [name for name, varies in (("views", views > 1), ("seeds", seeds > 1)) if varies]
+    words = " and ".join(["shapes", *levels] if shapes > 1 else levels)
+    return text.replace(OVER, words if shapes > 1 else f"{words} of one shape" if words else "one shape")
+
+
+def kind(interval: str, shown: Iterable[Interval], *, drawn: bool) -> str:
+    """The kind of interval of the estimates that are shown; that there is none where shapes are fewer than six.
+
+    Args:
+        interval: the kind.
+        shown: the estimates.
+        drawn: whether a figure draws points in place of intervals.
+    """
+    known = [estimate.known for estimate in shown]
+    none = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
+    if all(known):
+        return interval
+    return f"{interval}; {none}" if any(known) else none
+
+
+def undefined(values: Iterable[float]) -> str:
+    """A note on the probabilities and ranks that are not shown; empty where there is none."""
+    none = any(math.isnan(value) for value in values)
+    return "One shape and one seed are one draw: from it no probability and no rank is given (–)." if none else ""
 
 
 def warnings(experiment: Experiment) -> list[str]:
@@ -32,11 +69,16 @@ def warnings(experiment: Experiment) -> list[str]:
 
 
 def _sample(experiment: Experiment) -> str:
-    """The numbers of runs, shapes and seeds."""
-    shapes = {shape(record) for record in experiment.records}
-    seeds = {record["seed"] for record in experiment.records}
-    runs = _plural("run", len(experiment.records))
-    return f"{runs} ({_plural('shape', len(shapes))}, {_plural('seed', len(seeds))})"
+    """The numbers of runs, shapes, views where these are several, and seeds."""
+    shapes, views, seeds = _levels(experiment)
+    parts = [_plural("shape", shapes), *([_plural("view", views)] if views > 1 else []), _plural("seed", seeds)]
+    return f"{_plural('run', len(experiment.records))} ({', '.join(parts)})"
+
+
+def _levels(experiment: Experiment) -> tuple[int, int, int]:
+    """The numbers of shapes, of views of a shape, and of seeds."""
+    records = experiment.records
+    return tuple(len({part(record) for record in records}) for part in (solid, view, itemgetter("seed")))
 
 
 def _setup(experiment: Experiment) -> str:

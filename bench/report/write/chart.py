@@ -1,6 +1,6 @@
 """Pieces that the figures share: a sheet with axes, a grid of panels, the line of a row."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
 
 from bench.pictures import style
+from bench.report.data.statistics import Interval
 
 # Places of a name relative to its point: offsets in points, and the alignment.
 SIDES = ((0, 9, "center"), (0, -9, "center"), (6, 0, "left"), (-6, 0, "right"), (3, 9, "left"), (-3, 9, "right"))
@@ -44,6 +45,34 @@ def line(axis: Axes, preset: str, x: Any, y: Any, *, band: Any = None, **how: An
 def points(axis: Axes, preset: str, x: Any, y: Any, **how: Any) -> None:
     """Draws the points of a row with the marker and colour of its preset."""
     line(axis, preset, x, y, ls="none", **how)
+
+
+def estimates(axis: Axes, preset: str, x: Any, found: Sequence[Interval], *, bars: bool = False, **how: Any) -> None:
+    """Draws estimates of a row with their intervals; where one has none, the points of its shapes, small.
+
+    Args:
+        axis: where they are drawn.
+        preset: the row's preset.
+        x: positions.
+        found: the estimates.
+        bars: whether the intervals are bars, not a band.
+        how: settings of the line that replace those of the look.
+    """
+    value, low, high = (np.array([getattr(one, end) for one in found]) for end in ("value", "low", "high"))
+    if bars:
+        look = style.look(preset)
+        how = {"color": look.colour, "marker": look.marker, "ls": look.line, "elinewidth": 0.7, **how}
+        axis.errorbar(x, value, np.maximum([value - low, high - value], 0), **how)
+    else:
+        line(axis, preset, x, value, band=(low, high), **how)
+    shapes(axis, preset, x, found)
+
+
+def shapes(axis: Axes, preset: str, x: Any, found: Sequence[Interval]) -> None:
+    """Draws the points of the shapes of estimates that have no interval, in the colour of their row."""
+    drawn = [(at, point) for at, one in zip(x, found, strict=True) if not one.known for point in one.points]
+    if drawn:
+        points(axis, preset, *np.array(drawn, dtype=float).T, ms=2, alpha=0.5, zorder=1.5, label=None)
 
 
 def say(axis: Axes, text: str, **how: Any) -> None:

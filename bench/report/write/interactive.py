@@ -1,5 +1,6 @@
 """Interactive figures: hovering shows the setting, a click opens the run. They work without a network."""
 
+import math
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -107,10 +108,10 @@ def _about(point: Placed) -> str:
         f"<b>{escape(point.row.name)}</b>",
         f"{format.seconds(cost)}, error × 1000 {format.number(error)}",
         f"failed {point.row.failed} of {len(point.row.records)}",
-        f"on the front with probability {point.chance:.2f}",
+        "" if math.isnan(point.chance) else f"on the front with probability {point.chance:.2f}",
         *(f"{key} = {escape(str(value))}" for key, value in settings.items() if not key.startswith("_")),
     ]
-    return "<br>".join(lines)
+    return "<br>".join(filter(None, lines))
 
 
 def _hover(row: Setting, record: Record) -> str:

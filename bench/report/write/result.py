@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
 from bench.report.data.experiments import Experiment
+from bench.report.data.statistics import Interval
 from bench.report.write import caption, interactive
 
 # Special characters of LaTeX, and characters that its standard fonts lack.
@@ -55,6 +56,7 @@ class Result:
         plotted: what is plotted, as a sentence.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
+        estimates: those that are shown with it, if there are shapes enough; empty for intervals that always are there.
         remarks: notes of its own; empty ones are left out.
         data: the raw numbers, including those that the figure plots.
         table: the numbers as text for readers.
@@ -68,6 +70,7 @@ class Result:
     data: pd.DataFrame
     n: str = ""
     interval: str = ""
+    estimates: Iterable[Interval] = ()
     remarks: Iterable[str] = ()
     table: pd.DataFrame | None = None
     figure: Figure | None = None
@@ -76,12 +79,14 @@ class Result:
     @cached_property
     def caption(self) -> str:
         """What is plotted, n, the interval, what failed, and the machine."""
-        return caption.caption(self.experiment, self.plotted, n=self.n, interval=self.interval)
+        interval = caption.kind(self.interval, self.estimates, drawn=self.figure is not None)
+        return caption.caption(self.experiment, self.plotted, n=self.n, interval=interval)
 
     @cached_property
     def notes(self) -> list[str]:
         """Warnings, then the notes of its own."""
-        return [*caption.warnings(self.experiment), *filter(None, self.remarks)]
+        own = [caption.said(self.experiment, remark) for remark in self.remarks if remark]
+        return [*caption.warnings(self.experiment), *own]
 
 
 def write(result: Result, base: Path) -> list[Path]:

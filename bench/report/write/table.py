@@ -1,5 +1,6 @@
 """Tables: a `Column` defines a value, its name in the CSV, and its heading and text in the readable table."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,6 +11,7 @@ import pandas as pd
 from bench.records import format
 from bench.report.data import records
 from bench.report.data.records import SCALE, measured, row_of, setting
+from bench.report.data.statistics import Interval
 
 thousandfold = partial(format.number, scale=SCALE)
 
@@ -27,6 +29,16 @@ def word(value: Any) -> str:
 def percent(share: float | None) -> str:
     """A share of 1 in whole per cent."""
     return format.number(share) if share is None else f"{100 * share:.0f} %"
+
+
+def defined(value: float | None) -> str:
+    """A probability or a rank as text; missing where it is not a number, as there was one draw alone."""
+    return format.number(None if value is None or math.isnan(value) else value)
+
+
+def counted(part: float, whole: int, rate: Interval) -> str:
+    """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
+    return f"{part:g} of {whole} {rate.ends(100)}{' %' if rate.known else ''}"
 
 
 @dataclass(frozen=True)
