@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import reduce
-from math import inf
+from math import inf, sqrt
 from operator import or_
 from types import SimpleNamespace
 from typing import Any
@@ -15,11 +15,12 @@ from datasets.dataset import Split, seed_of
 from datasets.extract import extract
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from renderers.checks import check_at_least, check_choice, check_share
+from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
 VERSION = 1  # raise it when a builder changes, so that no prior of the old shapes is used for the new ones
 HALF_GRID = 1.5  # the sampled cube reaches from -1.5 to 1.5, wider than any shape before it is normalised
-SHEAR_BOUND = 0.8  # values of sheared parts are multiplied by this, so that they stay a bound at these slopes
+SHEAR_SCALE = 0.8  # values of sheared parts are multiplied by this; fillets depend on it, and so do the shipped priors
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class Family:
         return normalise(self._raw_mesh(split, index), self.radius)
 
     def formula(self, split: Split, index: int) -> Shape:
-        """The same shape as a field, the formula that its mesh was made from."""
+        """The same shape as a field: the formula that its mesh was made from, divided by its slope to be a bound."""
         centre, factor = fit_in_sphere(self._raw_mesh(split, index), self.radius)
-        return self._raw_shape(split, index).translate(tuple(-centre)).scale(factor)
+        return bounded(self._raw_shape(split, index)).translate(tuple(-centre)).scale(factor)
 
     def _raw_shape(self, split: Split, index: int) -> Shape:
         return BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
@@ -75,6 +76,14 @@ class Family:
         return {"version": VERSION, **asdict(self)}
 
 
+def bounded(shape: Shape) -> Shape:
+    """The shape with values divided by its Lipschitz bound where that is above 1: the same surface, never overshot."""
+    steepest = shape.lipschitz
+    if steepest is None:
+        raise ValueError("shape must have a Lipschitz bound, not None: state one in its builder")
+    return shape if steepest <= 1 else Shape(lambda p: shape(p) / steepest, Kind.BOUND, 1.0)
+
+
 def _all_of(parts: list[Shape]) -> Shape:
     return reduce(or_, parts)
 
@@ -87,14 +96,20 @@ def _mirror(part: Shape, axis: int) -> Shape:
 
 
 def _shear(part: Shape, *, along: int, by: int, slope: float) -> Shape:
-    """The part moved along one axis by `slope` times the coordinate on another."""
+    """The part moved along one axis by `slope` times the coordinate on another.
+
+    The shear lengthens gradients by its largest singular value at most.
+    """
+    stretch = (abs(slope) + sqrt(slope**2 + 4)) / 2
 
     def sheared(points: torch.Tensor) -> torch.Tensor:
         moved = points.clone()
         moved[..., along] = points[..., along] - slope * points[..., by]
-        return part(moved) * SHEAR_BOUND
+        return part(moved) * SHEAR_SCALE
 
-    return Shape(sheared, part.kind, None)
+    steepest = None if part.lipschitz is None else SHEAR_SCALE * stretch * part.lipschitz
+    known = steepest is not None and steepest <= 1 and part.kind is not Kind.LEVEL
+    return Shape(sheared, Kind.BOUND if known else Kind.LEVEL, steepest)
 
 
 def _sofa(p: SimpleNamespace) -> Shape:

@@ -64,6 +64,7 @@ class Stress:
         sweep: the range of severities.
         setting: the renderer's setting that takes the severity, if it is one.
         theory: a name of `bench.stress.theory.THEORIES`, if there is one.
+        repeats: 1 where repeats of a trial cannot differ, so that no interval is given; else null, for task.search's.
     """
 
     scene: str
@@ -72,11 +73,14 @@ class Stress:
     sweep: Sweep
     setting: str | None = None
     theory: str | None = None
+    repeats: int | None = None
 
     def __post_init__(self) -> None:
         check_choice("task.stress.group", self.group, GROUPS)
         check_choice("task.stress.measure", self.measure, MEASURES)
         check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else tuple(SCENES))
+        if self.repeats not in (None, 1):
+            raise ValueError(f"task.stress.repeats must be 1 or null, not {self.repeats}: set task.search.repeats")
         if self.theory is not None:
             check_choice("task.stress.theory", self.theory, tuple(THEORIES))
 

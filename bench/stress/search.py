@@ -3,6 +3,9 @@
 The chance of success falls along a logistic curve of the level, from 0 (mild) to 1 (severe). A table holds posterior
 probabilities of its middle and width; each trial is made where it is expected to be most informative (the psi method
 of Kontsevich and Tyler 1999). The interval is the central 95 % of the posterior.
+
+Where repeats of a trial cannot differ, a level is tried once, and the breakdown lies between two neighbouring levels;
+it has no interval.
 """
 
 from dataclasses import dataclass
@@ -48,12 +51,15 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Breakdown:
-    """The level at which half of the trials succeed, with its interval; below 0 or above 1 it is outside the sweep."""
+    """The level at which half of the trials succeed, with its interval; below 0 or above 1 it is outside the sweep.
+
+    Without repeats there are no interval and no width.
+    """
 
     level: float
-    low: float
-    high: float
-    width: float  # of the logistic curve, the most probable
+    low: float | None = None
+    high: float | None = None
+    width: float | None = None  # of the logistic curve, the most probable
 
 
 class Search:
@@ -67,6 +73,16 @@ class Search:
         self.probabilities = np.full((len(self.middles), len(WIDTHS)), 1.0 / len(self.middles) / len(WIDTHS))
         self.trials: list[tuple[int, bool]] = []  # the index of the level, and whether it succeeded
 
+    @property
+    def most(self) -> int:
+        """Largest number of trials."""
+        return self.settings.most
+
+    @property
+    def grid(self) -> int:
+        """Number of trials of the full grid."""
+        return self.settings.grid
+
     @cached_property
     def _success(self) -> np.ndarray:
         """The chance of success [level, middle, width]."""
@@ -79,15 +95,15 @@ class Search:
         The two ends come first. An end at or beyond which the breakdown lies is tried `repeats` times at least, so that
         a success rate is known for it.
         """
-        if len(self.trials) >= self.settings.most:
+        if len(self.trials) >= self.most:
             return None
         tried = [index for index, _ in self.trials]
         last = self.settings.levels - 1
         for end in (0, last):
             if tried.count(end) < 1:
                 return end
-        found = self.result()
-        if found.high - found.low <= 2 / last or found.low > 1 or found.high < 0:
+        found, (low, high) = self.result(), self._interval()
+        if high - low <= 2 / last or low > 1 or high < 0:
             incomplete = [
                 end for end in (0, last) if self._needs_count(end, found) and tried.count(end) < self.settings.repeats
             ]
@@ -103,15 +119,21 @@ class Search:
 
     def result(self) -> Breakdown:
         """The breakdown by the current table."""
-        below = self.probabilities.sum(axis=1).cumsum()
-        ends = [(1 - CERTAIN) / 2, 0.5, (1 + CERTAIN) / 2]
-        low, middle, high = (float(self.middles[min(int(np.searchsorted(below, e)), len(below) - 1)]) for e in ends)
-        return Breakdown(middle, low, high, WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
+        low, high = self._interval()
+        return Breakdown(self._quantile(0.5), low, high, WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
 
     def counts(self, index: int) -> tuple[int, int]:
         """How many trials at the level of an index succeeded, and how many there were."""
         outcomes = [success for at, success in self.trials if at == index]
         return sum(outcomes), len(outcomes)
+
+    def _interval(self) -> tuple[float, float]:
+        return self._quantile((1 - CERTAIN) / 2), self._quantile((1 + CERTAIN) / 2)
+
+    def _quantile(self, share: float) -> float:
+        """The middle below which this share of the posterior lies."""
+        below = self.probabilities.sum(axis=1).cumsum()
+        return float(self.middles[min(int(np.searchsorted(below, share)), len(below) - 1)])
 
     def _needs_count(self, end: int, found: Breakdown) -> bool:
         """Whether the sweep's end needs its full count: the breakdown lies at it or beyond."""
@@ -124,6 +146,55 @@ class Search:
         succeeds = (chance * self.probabilities).sum(axis=(1, 2))
         after = _entropy(chance * self.probabilities), _entropy((1 - chance) * self.probabilities)
         return int(np.argmin(succeeds * after[0] + (1 - succeeds) * after[1]))
+
+
+class Bisection:
+    """Halves the levels between the last success and the first failure, each tried once."""
+
+    def __init__(self, settings: SearchSettings) -> None:
+        self.settings = settings
+        self.levels = np.linspace(0.0, 1.0, settings.levels)
+        self.outcomes: dict[int, bool] = {}  # of each level that was tried, by its index
+
+    @property
+    def most(self) -> int:
+        """Largest number of trials: both ends, and one per halving."""
+        return 2 + (self.settings.levels - 2).bit_length()
+
+    @property
+    def grid(self) -> int:
+        """Number of trials of the full grid."""
+        return self.settings.levels
+
+    def next(self) -> int | None:
+        """The index of the next trial's level, the two ends first; None where the breakdown lies between neighbours."""
+        last = self.settings.levels - 1
+        for end in (0, last):
+            if end not in self.outcomes:
+                return end
+        if not self.outcomes[0] or self.outcomes[last]:
+            return None
+        success, failure = self._around()
+        return (success + failure) // 2 if failure - success > 1 else None
+
+    def note(self, index: int, success: bool) -> None:
+        """Keeps the outcome at the level of an index."""
+        self.outcomes[index] = success
+
+    def result(self) -> Breakdown:
+        """The middle between the last success and the first failure; half a step outside where an end decides."""
+        success, failure = self._around()
+        return Breakdown((success + failure) / 2 / (self.settings.levels - 1))
+
+    def counts(self, index: int) -> tuple[int, int]:
+        """How many trials at the level of an index succeeded, and how many there were: one at most."""
+        return int(self.outcomes.get(index, False)), int(index in self.outcomes)
+
+    def _around(self) -> tuple[int, int]:
+        """The indices of the last success before the first failure and of that failure; beyond an end without one."""
+        failure = min((index for index, success in self.outcomes.items() if not success), default=self.settings.levels)
+        before = [index for index, success in self.outcomes.items() if success and index < failure]
+        return max(before, default=-1), failure
 
 
 def _entropy(tables: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from bench.setup.inputs import RunContext
 from bench.solve.problem import Unsupported
 from bench.stress import fit, gradient, rendering
 from bench.stress.axes import Stress
-from bench.stress.search import Search, SearchSettings
+from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from renderers.checks import check_at_least
 from renderers.rendering import Renderer
@@ -21,9 +21,10 @@ from renderers.rendering import Renderer
 DEFINITIONS = {
     "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of the "
     "posterior, for a logistic curve with a lapse of 2 %; none where it is outside the sweep",
-    "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is outside the sweep",
+    "breakdown_low, breakdown_high": "ends of its 95 % interval, the milder first; none where it is outside the sweep, "
+    "and where repeats of a trial cannot differ (task.stress.repeats=1)",
     "level, level_low, level_high": "the same from 0, the mild end of the sweep, to 1, the severe one, and beyond",
-    "width": "of the logistic curve, in levels; the most probable of five",
+    "width": "of the logistic curve, in levels; the most probable of five; none without repeats",
     "trials": "renderings, gradients or fits that were made",
     "grid_trials": "trials of a full grid of task.search.levels and repeats",
     "mild_successes, mild_trials, severe_successes, severe_trials": "at the two ends of the sweep",
@@ -72,7 +73,8 @@ class Stability:
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
         self._check(renderer)
-        search, trials = Search(self._settings), _Trials()
+        search = Bisection(self._settings) if self.stress.repeats == 1 else Search(self._settings)
+        trials = _Trials()
         with curve_file(run.folder) as write_line:
             while (index := search.next()) is not None:
                 level = float(search.levels[index])
@@ -80,7 +82,7 @@ class Stability:
                 search.note(index, outcome.success)
                 trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
                 write_line(trials.line())
-                run.progress("searching", len(trials.all), self._settings.most, None)
+                run.progress("searching", len(trials.all), search.most, None)
         record.metrics = self._metrics(search, trials)
         for place, prediction in enumerate(self.stress.predicted(renderer, conditions)):
             name = f"predicted_{place}" if place else "predicted"
@@ -109,10 +111,10 @@ class Stability:
     def _unit(self) -> str:
         return self.stress.sweep.unit
 
-    def _metrics(self, search: Search, trials: "_Trials") -> dict[str, float | None]:
+    def _metrics(self, search: Search | Bisection, trials: "_Trials") -> dict[str, float | None]:
         found, last = search.result(), self._settings.levels - 1
         levels = {"": found.level, "_low": found.low, "_high": found.high}
-        within = {end: self.stress.sweep.severity(level) if 0 <= level <= 1 else None for end, level in levels.items()}
+        within = {end: self._severity(level) for end, level in levels.items()}
         (mild, milds), (severe, severes) = search.counts(0), search.counts(last)
         failed = Counter(trial.outcome.failure for trial in trials.all)
         return {
@@ -120,14 +122,19 @@ class Stability:
             **{f"level{end}": level for end, level in levels.items()},
             "width": found.width,
             "trials": len(trials.all),
-            "grid_trials": self._settings.grid,
+            "grid_trials": search.grid,
             "mild_successes": mild,
             "mild_trials": milds,
             "severe_successes": severe,
             "severe_trials": severes,
             "evaluations_per_ray": trials.spent(),
+            **trials.moved(found.level),
             **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
         }
+
+    def _severity(self, level: float | None) -> float | None:
+        """The severity at a level; None outside the sweep."""
+        return self.stress.sweep.severity(level) if level is not None and 0 <= level <= 1 else None
 
 
 @dataclass
@@ -175,3 +182,9 @@ class _Trials:
         costs = [trial.outcome.numbers.get("evaluations_per_ray") for trial in self.all if trial.level == 0]
         known = [cost for cost in costs if cost is not None]
         return float(np.median(known)) if known else None
+
+    def moved(self, level: float) -> dict[str, float]:
+        """How far a disturbance moved the surface at the level nearest to the breakdown; empty where it moved none."""
+        known = {trial.level: trial.outcome.numbers.get("surface_moved") for trial in self.all}
+        known = {at: moved for at, moved in known.items() if moved is not None}
+        return {"surface_moved": known[min(known, key=lambda at: abs(at - level))]} if known else {}

@@ -1,48 +1,73 @@
-"""Distortions of a distance field, as by a network, quantisation or an error. All still claim to be distances.
+"""Distortions of a cube's distance, as by a network, quantisation or an error. All still claim to be distances.
 
-A distortion takes a field, a severity in the units of conf/stress, and a random generator.
+A distortion takes the cube, a severity in the units of conf/stress, and a random generator. Some move the surface: they
+give the moved one, solved in float64, so that a renderer is judged by the surface of the field that it was given.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from datasets.stress.solids import ReferenceTruth, Solid, Truth, box
 from renderers.field import Field
 from renderers.fields.analytic import Shape
 
-Distortion = Callable[[Field, float, np.random.Generator], Field]
+CUBE = 0.5  # half the side length of the cube
 RIPPLES = 15.0  # radians per scene unit
 WAVES = 32  # random cosines that make a perturbation
+THINNEST = 5e-4  # scene units: parts of a perturbed cube that are thinner along a ray may be missed by the truth
 
 
-def scaled(field: Field, severity: float, draw: np.random.Generator) -> Field:
+@dataclass(frozen=True)
+class Distorted:
+    """A distorted field, and its own surface; None where that is still the cube's."""
+
+    field: Field
+    surface: Truth | None = None
+
+
+Distortion = Callable[[Solid, float, np.random.Generator], Distorted]
+
+
+def scaled(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
     """A cube whose distance is multiplied by a factor."""
-    return Shape(lambda points: severity * field(points))
+    return Distorted(Shape(lambda points: severity * cube.field(points)))
 
 
-def ripples(field: Field, severity: float, draw: np.random.Generator) -> Field:
+def ripples(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
     """A cube whose distance is multiplied by 1 + a sin(15 x) sin(15 y) sin(15 z): same surface, wrong steps."""
-    return Shape(lambda points: field(points) * (1 + severity * torch.sin(RIPPLES * points).prod(dim=-1)))
-
-
-def perturbed(field: Field, severity: float, draw: np.random.Generator) -> Field:
-    """A cube with a smooth random field of a standard deviation, in scene units, added: a network's error."""
-    frequencies, phases = (
-        torch.from_numpy(10 * draw.normal(size=(3, WAVES))),
-        torch.from_numpy(draw.uniform(0, 6.28, WAVES)),
+    return Distorted(
+        Shape(lambda points: cube.field(points) * (1 + severity * torch.sin(RIPPLES * points).prod(dim=-1)))
     )
+
+
+def perturbed(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+    """A cube with a smooth random field of a standard deviation, in scene units, added: a network's error.
+
+    The frequencies and phases are numbers of float32, so that the field is the same function in float64. A ray can
+    cross the moved surface often: the truth is the first crossing, but for parts thinner than `THINNEST`.
+    """
+    frequencies = torch.from_numpy(10 * draw.normal(size=(3, WAVES))).float()
+    phases = torch.from_numpy(draw.uniform(0, 6.28, WAVES)).float()
+    height = severity * (2 / WAVES) ** 0.5
 
     def value(points: Tensor) -> Tensor:
         waves = torch.cos(points @ frequencies.to(points) + phases.to(points))
-        return field(points) + severity * (2 / WAVES) ** 0.5 * waves.sum(-1)
+        return cube.field(points) + height * waves.sum(-1)
 
-    return Shape(value)
+    steepest = 1 + height * float(frequencies.norm(dim=0).sum())
+    return Distorted(Shape(value), ReferenceTruth(Shape(value), steepest, THINNEST))
 
 
-def coarse_floats(field: Field, severity: float, draw: np.random.Generator) -> Field:
-    """A cube with points and values rounded to `severity` bits of mantissa: float32 has 24, bfloat16 has 8."""
+def coarse_floats(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+    """A cube with points and values rounded to `severity` bits of mantissa: float32 has 24, bfloat16 has 8.
+
+    A point belongs to it where its coordinates, rounded, are at most `CUBE`, a power of two. Such a coordinate is above
+    `CUBE` by at most half the spacing of the numbers there, so that its surface is that of a larger cube.
+    """
     bits = round(severity)
 
     def rounded(numbers: Tensor) -> Tensor:
@@ -50,27 +75,32 @@ def coarse_floats(field: Field, severity: float, draw: np.random.Generator) -> F
         scale = 2.0**bits
         return numbers + (torch.ldexp(torch.round(mantissa * scale) / scale, exponent) - numbers).detach()
 
-    return Shape(lambda points: rounded(field(rounded(points))))
+    larger = box((CUBE + 0.5 * 2.0**-bits,) * 3)
+    return Distorted(Shape(lambda points: rounded(cube.field(rounded(points)))), larger)
 
 
-def quantised(field: Field, severity: float, draw: np.random.Generator) -> Field:
-    """A cube whose distance is a multiple of a step, in scene units: 8 bits over -1 to 1 have a step of 0.0078."""
+def quantised(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+    """A cube whose distance is a multiple of a step, in scene units: 8 bits over -1 to 1 have a step of 0.0078.
+
+    It is 0 in a layer about the cube's surface. The truth is where a ray enters this layer, half a step outside.
+    """
 
     def value(points: Tensor) -> Tensor:
-        exact = field(points)
+        exact = cube.field(points)
         return exact + (severity * torch.round(exact / severity) - exact).detach()
 
-    return Shape(value)
+    layer = Shape(lambda points: cube.field(points) - severity / 2)
+    return Distorted(Shape(value), ReferenceTruth(layer, lipschitz=1.0, thinnest=THINNEST))
 
 
-def truncated(field: Field, severity: float, draw: np.random.Generator) -> Field:
+def truncated(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
     """A cube whose distance is cut off at a magnitude, in scene units, as DeepSDF's is at 0.1."""
-    return Shape(lambda points: field(points).clamp(-severity, severity))
+    return Distorted(Shape(lambda points: cube.field(points).clamp(-severity, severity)))
 
 
-def saturated(field: Field, severity: float, draw: np.random.Generator) -> Field:
+def saturated(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
     """A cube as tanh(distance / width), a width in scene units: steep at the surface, 1 away from it."""
-    return Shape(lambda points: torch.tanh(field(points) / severity))
+    return Distorted(Shape(lambda points: torch.tanh(cube.field(points) / severity)))
 
 
 DISTORTIONS: dict[str, Distortion] = {

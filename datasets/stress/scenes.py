@@ -7,9 +7,8 @@ renderer gets the same exams.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from math import atan, cos, degrees, radians, sin
+from math import asin, atan, cos, degrees, pi, radians, sin
 from operator import or_
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,29 +16,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from datasets.stress import distortions
-from datasets.stress.solids import FirstHit, ReferenceTruth, Solid, box, half_space, rod, sphere_solid
+from datasets.stress.distortions import CUBE
+from datasets.stress.solids import ReferenceTruth, Solid, Truth, box, half_space, rod, sphere_solid
 from datasets.views import ViewSampler
-from renderers.camera import Camera, Rays
+from renderers.camera import Camera
 from renderers.field import Field, Kind
 from renderers.fields.analytic import Shape
 
 DISTANCE = 2.5  # of the camera from the origin, scene units
 ALL_AROUND = (0.0, 360.0)
 CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
-CUBE = 0.5  # half its side length
 CUBE_VIEW = 44.0  # degrees: it fills the picture
 GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, divided by the angle's sine
+GRAZING_SHIFT, GRAZING_ROLL = 0.1, 10.0  # of its camera: along the plane, in scene units; about its axis, in degrees
 SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the picture is wide
-
-
-@runtime_checkable
-class Truth(Protocol):
-    """A field whose first hits are known."""
-
-    @property
-    def field(self) -> Field: ...
-
-    def trace(self, rays: Rays) -> FirstHit: ...
 
 
 @dataclass(frozen=True)
@@ -49,9 +39,10 @@ class Exam:
     Args:
         field: that the renderer gets; its stated kind may be wrong on purpose.
         camera: of the rendering.
-        truth: of the scene; where the field is distorted, of the undistorted one.
+        truth: of the field: where a disturbance moves its surface, the moved one.
         solid: gives the solid of parameters, where gradients towards them are tested; else None.
         parameters: at which these gradients are taken.
+        undisturbed: the field before a disturbance that moved its surface; else None.
     """
 
     field: Field
@@ -59,6 +50,7 @@ class Exam:
     truth: Truth
     solid: Callable[[Tensor], Solid] | None = None
     parameters: Float[Tensor, " n"] | None = None
+    undisturbed: Field | None = None
 
 
 Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, random generator, and W of W x W pixels
@@ -129,7 +121,10 @@ def csg_difference(severity: float, draw: np.random.Generator, resolution: int) 
 
 
 def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A plane seen at an angle, in degrees, the same part of it at each. Its parameters: an offset and two tilts."""
+    """A plane seen at an angle, in degrees, the same share of it at each. Its parameters: an offset and two tilts.
+
+    The camera is moved along the plane, so that rays enter the unit sphere elsewhere, and turned about its axis.
+    """
 
     def solid(parameters: Tensor) -> Solid:
         offset, right, forward = parameters
@@ -137,13 +132,23 @@ def grazing_plane(severity: float, draw: np.random.Generator, resolution: int) -
 
     field_of_view = 2 * degrees(atan(GRAZING_SHARE * sin(radians(severity))))
     camera = _camera(draw, resolution, elevation=(severity, severity), field_of_view=field_of_view)
+    right, forward = draw.uniform(-GRAZING_SHIFT, GRAZING_SHIFT, 2)
+    camera = camera.with_object_moved(torch.tensor([right, 0.0, forward, 0.0, 0.0, 0.0], dtype=torch.float32))
+    camera = _turned(camera, roll=draw.uniform(-GRAZING_ROLL, GRAZING_ROLL))
     none = torch.zeros(3, dtype=torch.float64)
     return Exam(solid(none).field, camera, solid(none), solid, none)
 
 
 def near_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A sphere from a camera at a distance from its surface; below 0.5 the camera is within the unit sphere."""
-    return _seen(sphere_solid(0.5), draw, resolution, distance=0.5 + severity, field_of_view=20.0)
+    """A sphere from a camera at a distance from its surface; below 0.5 the camera is within the unit sphere.
+
+    The camera looks past the middle by a random angle, at which the sphere still fills the picture.
+    """
+    camera = _camera(draw, resolution, distance=0.5 + severity, field_of_view=20.0)
+    outline = degrees(asin(0.5 / (0.5 + severity)))
+    aside, way = draw.uniform(0.0, min(max(outline - 20.0, 0.0), 30.0)), draw.uniform(0.0, 2 * pi)
+    sphere = sphere_solid(0.5)
+    return Exam(sphere.field, _turned(camera, down=aside * cos(way), right=aside * sin(way)), sphere)
 
 
 def far_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -167,19 +172,25 @@ def narrow_view(severity: float, draw: np.random.Generator, resolution: int) -> 
 
 
 def empty_scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A field without a surface, whose least value, on a sheet across the view, is the severity."""
-    sheet = half_space((0.0, 0.0, 1.0), 0.0)
+    """A field without a surface, whose least value, on a sheet across the view, is the severity.
+
+    The sheet's place and the view differ between repeats, and with them the steps that come near the sheet.
+    """
+    sheet = half_space((0.0, 0.0, 1.0), draw.uniform(-0.2, 0.2))
     field = Shape(lambda points: sheet.field(points).abs() + severity, Kind.BOUND)
     camera = _camera(draw, resolution, azimuth=(-30, 30), elevation=(-30, 30))
     return Exam(field, camera, sphere_solid(0.0))
 
 
 def _distorted(distortion: distortions.Distortion) -> Scene:
-    """The cube with a distorted field, compared with the undistorted cube."""
+    """The cube with a distorted field, compared with the surface of that field."""
 
     def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-        exam = _cube(draw, resolution)
-        return Exam(distortion(exam.field, severity, draw), exam.camera, exam.truth)
+        cube = box((CUBE,) * 3)
+        camera = _cube(draw, resolution).camera
+        made = distortion(cube, severity, draw)
+        undisturbed = None if made.surface is None else cube.field
+        return Exam(made.field, camera, made.surface or cube, undisturbed=undisturbed)
 
     return scene
 
@@ -235,6 +246,12 @@ def _camera(
 ) -> Camera:
     sampler = ViewSampler(distance, field_of_view, azimuth, elevation, resolution)
     return sampler.camera(draw.uniform(*azimuth), draw.uniform(*elevation))
+
+
+def _turned(camera: Camera, *, down: float = 0.0, right: float = 0.0, roll: float = 0.0) -> Camera:
+    """The camera turned about its centre by angles in degrees, small or about one axis."""
+    turn = [0.0, 0.0, 0.0, radians(down), radians(right), radians(roll)]
+    return camera.moved(torch.tensor(turn, dtype=torch.float32))
 
 
 def _about_z(angle: float) -> Float[Tensor, "3 3"]:

@@ -5,6 +5,7 @@ A solid gives the spans of a ray that lie within it; union and difference are th
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +28,16 @@ class FirstHit:
     distance: Float[Tensor, " n"]
     hit: Bool[Tensor, " n"]
     inside: Bool[Tensor, " n"]  # the ray begins inside the solid, so that it has no first hit
+
+
+@runtime_checkable
+class Truth(Protocol):
+    """A field whose first hits are known."""
+
+    @property
+    def field(self) -> Field: ...
+
+    def trace(self, rays: Rays) -> FirstHit: ...
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 from bench.config import CONF, build
 from bench.records.files import digest
 from datasets.dataset import SPLIT_STRIDE, Split, seed_of
-from datasets.families import BUILDERS, FAMILIES, HALF_GRID, Family
+from datasets.families import BUILDERS, FAMILIES, HALF_GRID, Family, bounded
+from renderers.field import Kind, autograd_gradients
 
 NAMES = sorted(
     path.stem for path in (CONF / "dataset").glob("*.yaml") if OmegaConf.load(path)._target_.endswith("Family")
@@ -95,6 +96,43 @@ def test_shapes_stay_clear_of_the_sampled_cube(family):
     widest = {name: high for name, (_, high) in family.ranges.items()}
     for parameters in (widest, *(family.draw(Split.TRAIN, index) for index in range(20))):
         assert not inside(family, parameters, faces).any()
+
+
+def corners(family: Family, n: int) -> list[dict[str, float]]:
+    """Parameters at random ends of their ranges; the first has all at their largest values."""
+    draw = np.random.default_rng(0)
+    ends = [np.ones(len(family.ranges), dtype=int), *draw.integers(0, 2, (n - 1, len(family.ranges)))]
+    return [{name: family.ranges[name][end] for name, end in zip(family.ranges, row, strict=True)} for row in ends]
+
+
+def test_a_formula_is_nowhere_steeper_than_its_bound(family):
+    generator = torch.Generator().manual_seed(0)
+    shapes = [*corners(family, 20), *(family.draw(Split.TRAIN, index) for index in range(20))]
+    for parameters in shapes:
+        raw = BUILDERS[family.name](SimpleNamespace(**parameters))
+        field = bounded(raw)
+        points = torch.empty(20_000, 3, dtype=torch.float64).uniform_(-1.2, 1.2, generator=generator)
+        slopes = autograd_gradients(field, points).norm(dim=-1)
+        assert slopes.max() <= field.lipschitz + 1e-6 == 1 + 1e-6
+        assert field.kind is not Kind.LEVEL
+        assert torch.equal(raw(points) < 0, field(points) < 0)
+
+
+def test_a_steep_shear_makes_a_formula_a_level_set_until_it_is_divided(family):
+    steepest = {name: high for name, (_, high) in family.ranges.items()}
+    raw = BUILDERS[family.name](SimpleNamespace(**steepest))
+    assert (raw.kind is Kind.LEVEL) == (raw.lipschitz > 1) == (family.name in ("car", "plane"))
+    assert bounded(raw).kind is not Kind.LEVEL
+
+
+def test_the_shipped_formula_of_a_car_with_much_rake_is_a_bound():
+    car = build(OmegaConf.load(CONF / "dataset" / "car.yaml"), "dataset")
+    raked = replace(car, ranges=car.ranges | {"rake": [0.69, 0.7]}, resolution=48)
+    field = raked.formula(Split.TEST, 0)
+    points = torch.empty(50_000, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+    slopes = autograd_gradients(field, points).norm(dim=-1)
+    assert 0.9 < slopes.max() <= 1 + 1e-6
+    assert field.kind is Kind.BOUND
 
 
 def test_parts_share_no_seed():

@@ -1,11 +1,13 @@
 """README files show the numbers of `results/paper`, and no others."""
 
+import csv
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from bench.records import format
 from bench.report.write.paper import write_readme
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,6 +44,24 @@ def test_readme_shows_the_numbers_of_table_1(line):
     heading = theirs["Strategy"]
     for name, cell in zip(SHOWN, shown, strict=True):
         assert cell == theirs[shown[0]][heading.index(name)], (shown[0], name)
+
+
+def test_readme_shows_the_numbers_of_the_stability_atlas():
+    committed = csv.DictReader((PAPER / "stability.csv").read_text().splitlines())
+    lines = {(line["axis"], line["row"]): line for line in committed}
+    table = [row for row in rows((ROOT / "README.md").read_text()) if row[-1].startswith(("inside", "outside"))]
+    assert [row[0].split(",")[0] for row in table].count("gap") == 2
+    for axis, name, theory, measured, place in table:
+        line = lines[axis.split(",")[0].replace(" ", "_"), name]
+        predicted, found, low, high = (
+            float(line[key]) for key in ("predicted", "breakdown", "breakdown_low", "breakdown_high")
+        )
+        assert axis.endswith(line["unit"])
+        assert theory == format.number(predicted)
+        assert measured == f"{format.number(found)} ({format.number(low)} to {format.number(high)})"
+        inside = min(low, high) <= predicted <= max(low, high)
+        share = 100 * (predicted / found - 1)
+        assert place == ("inside" if inside else f"outside, {abs(share):.0f} % {'above' if share > 0 else 'below'}")
 
 
 PUBLISHED = ("Published queries", "Published time")

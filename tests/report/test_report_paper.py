@@ -280,7 +280,9 @@ def bands(factor: float = 1.0, camera: bool = True) -> dict:
         metrics |= {f"{band}.pixels": 100 * place, f"{band}.excluded": place}
         for of in ("code", "camera")[: 1 + camera]:
             numbers = {
-                "cosine": 1 - 0.01 * place,
+                "cosine": 1.0,
+                "pooled_cosine": 1 - 0.01 * place,
+                "pooled_scale": 1.25 * factor,
                 "scale": factor * place,
                 "median_error": 1e-4 * place,
                 "p99_error": 0.1,
@@ -314,6 +316,9 @@ def test_gradients_have_a_row_for_each_renderer_and_band(judged):
         and "naive: oom (8 GB)" in text
         and "gradients.png" in text
     )
+    assert "Code pooled cosine | Code pooled scale | Code cosine" in text
+    assert "A pooled number compares the gradients of all pixels of a band at once" in text
+    assert rows.loc[("dist", "grazing"), "code_pooled_cosine"] == 0.97
     assert r"\begin{tabular}" in (judged / "paper" / "gradients.tex").read_text()
 
 
@@ -326,10 +331,12 @@ def test_gradients_figure_plots_the_numbers_of_its_csv(judged):
     made = gradients.make(chosen(judged, "gradients"))
     axes = made.figure.axes
     own = made.data[made.data["row"] == "dvr"].set_index("band").loc[["frontal", "oblique", "grazing"]]
-    assert drawn(axes[0], "dvr") == list(own["code_scale"]) == [2.0, 4.0, 6.0]
-    assert drawn(axes[3], "dvr") == list(own["code_median_error"])
-    assert drawn(axes[2], "dvr") == [1.0]
-    assert axes[3].get_yscale() == axes[4].get_yscale() == "log"
+    assert drawn(axes[0], "dvr") == list(own["code_pooled_cosine"]) == [0.99, 0.98, 0.97]
+    assert drawn(axes[3], "dvr") == list(own["code_scale"]) == [2.0, 4.0, 6.0]
+    assert drawn(axes[6], "dvr") == list(own["code_median_error"])
+    assert (drawn(axes[2], "dvr"), drawn(axes[5], "dvr")) == ([0.75], [1.0])
+    assert axes[6].get_yscale() == axes[7].get_yscale() == "log"
+    assert not axes[8].get_visible()
     assert "naive (oom)" in [line.get_label() for line in axes[0].lines]
     assert_labelled(made.figure, x_labels=False)
 

@@ -7,7 +7,8 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.atlas import STABILITY, atlas
-from bench.report.data.experiments import choose
+from bench.report.data.experiments import choose, named_by_rows, shared_loss
+from bench.report.data.records import row_of
 from bench.report.pages import stability, stability_curves, stability_failures
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
@@ -15,8 +16,24 @@ from tests.report.test_report_paper import coarse_pictures, told, write_run  # n
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
-def broke(results, axis, label, level, *, status="ok", measure="rendering", predicted=None, criteria=None, **metrics):
-    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials."""
+def broke(
+    results,
+    axis,
+    label,
+    level,
+    *,
+    status="ok",
+    measure="rendering",
+    predicted=None,
+    criteria=None,
+    loss=None,
+    repeats=None,
+    **metrics,
+):
+    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials.
+
+    With `repeats` of 1 there is no interval; `loss` is the label of its loss of the mask.
+    """
     within = {"breakdown": None if not 0 <= level <= 1 else 0.01**level}
     ends = {"level": level, "level_low": level - 0.05, "level_high": level + 0.05}
     within |= {
@@ -25,9 +42,13 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", pred
     }
     counts = {"trials": 10, "grid_trials": 40, "mild_trials": 5, "severe_trials": 5}
     counts |= {"mild_successes": 5 * (level > 0), "severe_successes": 5 * (level > 1), "evaluations_per_ray": 4.0}
+    if repeats == 1:
+        within |= {"breakdown_low": None, "breakdown_high": None}
+        ends |= {"level_low": None, "level_high": None}
+        counts |= {"mild_trials": 1, "severe_trials": 1, "mild_successes": int(level > 0), "severe_successes": 0}
     known = {**within, **ends, **counts, "failed_lost": 3, "failed_false": 1, **metrics}
     known |= {} if predicted is None else {"predicted": predicted}
-    stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP}
+    stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
     search = {"levels": 11, "repeats": 4}
     folder = write_run(
         *(results, "stability", label),
@@ -39,6 +60,7 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", pred
         settings={
             "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
             "stress": stress,
+            "silhouette": {"_label_": loss} if loss else {},
         },
     )
     if status == "ok":
@@ -63,6 +85,66 @@ def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
     assert f"{worst} Failed trials: 3 missed, 1 spurious." in table.notes
     assert "n = 10 trials in all, of 1 axes and 1 renderers" in table.caption
     assert "25 % of a full grid's" in told(table)
+
+
+def test_a_prediction_outside_the_interval_is_told_with_its_difference(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5, predicted=0.07)
+    broke(tmp_path, "wires", "DVR", 0.5, predicted=0.1)
+    broke(tmp_path, "gap", "DIST", 0.5, predicted=0.2)
+    broke(tmp_path, "gap", "DVR", -0.1, predicted=0.2)
+    notes = made(tmp_path, stability.make).notes
+    measured = "0.100 (0.126 to 0.0794)"
+    inside = (
+        f"Predicted, wires: DIST 0.0700 (outside, 30 % below), measured {measured}; DVR 0.100, measured {measured}."
+    )
+    assert inside in notes
+    beyond = "Predicted, gap (theory does not hold for any row): DIST 0.200 (outside, 100 % above), measured"
+    assert any(note.startswith(beyond) and "DVR 0.200 (outside), measured at once" in note for note in notes)
+
+
+def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
+    broke(tmp_path, "camera_inside", "DIST", 0.5, repeats=1, predicted=0.1)
+    broke(tmp_path, "camera_inside", "DVR", -0.1, repeats=1, predicted=0.1)
+    result = made(tmp_path, stability.make)
+    assert result.table.loc[0, ["DIST", "DVR"]].tolist() == ["0.100 (one trial)", "at once (1 of 1 failed)"]
+    predicted = next(note for note in result.notes if note.startswith("Predicted"))
+    assert "DIST 0.100, measured 0.100 (one trial)" in predicted  # between neighbouring levels
+    assert result.data[["breakdown_low", "breakdown_high", "level_low", "level_high"]].isna().all(axis=None)
+    curves = made(tmp_path, stability_curves.make)
+    assert curves.data["share"].notna().all() and curves.data[["low", "high"]].isna().all(axis=None)
+    bars = [line for line in curves.figure.axes[0].lines if line.get_linewidth() == 2]
+    assert not bars
+    broke(tmp_path, "wires", "DIST", 0.5)
+    repeated = made(tmp_path, stability_curves.make)
+    assert len([line for axis in repeated.figure.axes for line in axis.lines if line.get_linewidth() == 2]) == 1
+
+
+def test_how_far_surfaces_moved_is_told_and_not_ranked(tmp_path):
+    for label, moved in (("DIST", 0.5), ("DVR", 0.001)):
+        broke(tmp_path, "quantised", label, 0.5, surface_moved=moved)
+    told_of = "Distance by which the surface moved at the breakdowns, in scene units: quantised 0.00100 to 0.500."
+    assert told_of in made(tmp_path, stability.make).notes
+    assert made(tmp_path, stability.make_cost).data["rank"].tolist() == [1.5, 1.5]
+
+
+def test_a_loss_that_all_rows_share_is_in_the_caption_and_not_in_their_names(tmp_path):
+    for label in ("DIST", "DVR"):
+        broke(tmp_path, "wires", label, 0.5, loss="DIST's mask loss")
+    result = made(tmp_path, stability.make)
+    assert list(result.table.columns) == ["Axis", "Unit", "DIST", "DVR"]
+    assert "every row with DIST's mask loss." in result.caption
+    assert [record["name"] for record in result.experiment.named()] == ["DIST", "DVR"]
+
+
+def test_losses_that_differ_are_in_the_names_of_rows():
+    def record(loss):
+        return {"config": {"silhouette": {"_label_": loss} if loss else {}}, "renderer": "dist"}
+
+    assert shared_loss([record("a"), record("a")]) == "a"
+    assert shared_loss([record("a"), record("b")]) == shared_loss([record("a"), record(None)]) == ""
+    assert shared_loss([record(None)]) == ""
+    assert [row_of(one).name for one in named_by_rows([record("a"), record("b")])] == ["dist, a", "dist, b"]
+    assert [row_of(one).name for one in named_by_rows([record("a"), record("a")])] == ["dist", "dist"]
 
 
 def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):

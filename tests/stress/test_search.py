@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.stress.search import Search, SearchSettings
+from bench.stress.search import Bisection, Search, SearchSettings
 
 DESK = SearchSettings(levels=33, repeats=5)
 
@@ -55,6 +55,35 @@ def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
     successes, trials = search.counts(end)
     assert trials >= DESK.repeats
     assert successes == (trials if succeeds else 0)
+
+
+def bisected(succeeds, levels: int = 33) -> Bisection:
+    search = Bisection(SearchSettings(levels, 5))
+    while (level := search.next()) is not None:
+        assert search.counts(level) == (0, 0)  # a level is tried once
+        search.note(level, bool(succeeds(float(search.levels[level]))))
+    return search
+
+
+@pytest.mark.parametrize("levels", [3, 9, 17, 33])
+@pytest.mark.parametrize("middle", [0.01, 0.31, 0.5, 0.77, 0.999])
+def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interval(middle, levels):
+    search = bisected(lambda level: level < middle, levels)
+    found = search.result()
+    assert abs(found.level - middle) <= 0.5 / (levels - 1) + 1e-12
+    assert (found.low, found.high, found.width) == (None, None, None)
+    assert len(search.outcomes) <= search.most < levels + 1 == search.grid + 1
+
+
+@pytest.mark.parametrize(("succeeds", "level"), [(True, 1 + 0.5 / 32), (False, -0.5 / 32)])
+def test_without_repeats_an_end_is_tried_once(succeeds, level):
+    search = bisected(lambda at: succeeds)
+    assert search.result().level == pytest.approx(level)
+    assert search.outcomes == {0: succeeds, 32: succeeds}
+
+
+def test_without_repeats_a_failure_at_the_mild_end_decides():
+    assert bisected(lambda level: level > 0.5).result().level < 0
 
 
 def test_settings_are_checked():

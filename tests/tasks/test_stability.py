@@ -36,9 +36,11 @@ def run(folder: Path, stress: str, renderer, *, resolution: int = 24) -> dict:
 
 
 def within(stress: str, metrics: dict, severity: float) -> bool:
-    """Whether a severity lies in the interval of a breakdown."""
+    """Whether a severity lies in the interval of a breakdown; without one, within half a step between levels."""
     sweep = stress_named(stress).sweep
     level = np.log(severity / sweep.mild) / np.log(sweep.severe / sweep.mild)
+    if metrics["level_low"] is None:
+        return abs(level - metrics["level"]) <= 0.5 / (SEARCH.levels - 1)
     return metrics["level_low"] <= level <= metrics["level_high"]
 
 
@@ -62,6 +64,16 @@ def test_the_breakdown_is_that_of_the_closed_form(tmp_path, case):
     assert within(case[0], metrics, severity)
     assert metrics["predicted"] == pytest.approx(severity)
     assert metrics["trials"] <= metrics["grid_trials"] / 2
+
+
+def test_one_trial_per_level_gives_no_interval(tmp_path):
+    metrics = run(tmp_path, "camera_inside", load("renderer", "idr"))
+    names = ("breakdown_low", "breakdown_high", "level_low", "level_high", "width")
+    assert [metrics[name] for name in names] == [None] * 5
+    assert 0 < metrics["level"] < 1
+    assert (metrics["mild_trials"], metrics["severe_trials"], metrics["grid_trials"]) == (1, 1, 17)
+    levels = [json.loads(line)["level"] for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert len(levels) == len(set(levels)) == metrics["trials"]
 
 
 def test_the_grazing_plane_breaks_where_eq_8_runs_out_of_steps(tmp_path):
@@ -169,6 +181,14 @@ def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
 
 class Mine(IDR):
     """A user's renderer without settings of its own."""
+
+
+def test_how_far_a_disturbance_moves_the_surface_is_a_number_of_its_own(tmp_path):
+    metrics = run(tmp_path / "moved", "quantised", load("renderer", "idr"))
+    lines = [json.loads(line) for line in (tmp_path / "moved" / "curve.jsonl").read_text().splitlines()]
+    nearest = min(lines, key=lambda line: abs(line["level"] - metrics["level"]))
+    assert metrics["surface_moved"] == pytest.approx(nearest["severity"] / 2, rel=0.01)
+    assert "surface_moved" not in run(tmp_path / "unmoved", "ripples", load("renderer", "idr"))
 
 
 def test_a_users_renderer_is_tested_like_all(tmp_path):

@@ -74,13 +74,29 @@ class Cell:
             return math.log(severity / mild) / math.log(severe / mild)
         return (severity - mild) / (severe - mild)
 
+    @property
+    def one_trial(self) -> bool:
+        """Whether each level was tried once, since repeats of a trial cannot differ: there is no interval."""
+        return self.stress("repeats") == 1
+
     def covers(self, severity: float) -> bool:
-        """Whether a severity lies in the breakdown's interval, or beyond the same end of the sweep as the breakdown."""
-        low, high = self.number("level_low"), self.number("level_high")
+        """Whether a severity lies in the breakdown's interval, or beyond the same end of the sweep as the breakdown.
+
+        With one trial per level it must lie between the last success and the first failure.
+        """
+        low, high = self._within()
         if low is None or high is None:
             return False
         level = self.place(severity)
         return low <= level <= high or (self.at_once and level < 0) or (self.never and level > 1)
+
+    def _within(self) -> tuple[float | None, float | None]:
+        """The ends of the breakdown's interval; with one trial per level, the levels about it."""
+        levels = setting(self.record, "config", "task", "search", "levels")
+        if self.one_trial and self.level is not None and isinstance(levels, int):
+            half = 0.5 / (levels - 1)
+            return self.level - half, self.level + half
+        return self.number("level_low"), self.number("level_high")
 
     @property
     def falls(self) -> bool:
@@ -105,6 +121,8 @@ class Cell:
         if not self.falls:
             return f"success rises with severity (mild: {self._count('mild')}; severe: {self._count('severe')})"
         low, high = self.number("breakdown_low"), self.number("breakdown_high")
+        if self.one_trial and not (self.at_once or self.never):
+            return f"{self.short()} (one trial)"
         if self.at_once:
             reach = f", up to {format.number(high)}" if high is not None else ""
             return f"at once ({self._count('mild')}{reach})"
@@ -119,10 +137,12 @@ class Cell:
         return int(self.number(f"{end}_successes") or 0), int(self.number(f"{end}_trials") or 0)
 
     def _count(self, end: str) -> str:
-        """The number of failed trials at an end of the sweep, with the interval of their share."""
+        """The number of failed trials at an end of the sweep, with the interval of their share where there are repeats."""
         successes, n = self._trials(end)
         if not n:
             return "not tried"
+        if self.one_trial:
+            return f"{n - successes} of {n} failed"
         rate = clopper_pearson(1 - successes / n, n)
         return f"{n - successes} of {n} failed, {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
 

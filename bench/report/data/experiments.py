@@ -6,7 +6,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from bench.records.record import NEUTRAL_KEYS, requested, started
+from bench.records.record import NEUTRAL_KEYS, requested, row_name, started
 from bench.report.data.records import Record, Row, family, grouped, index, row_of, setting
 
 seed = itemgetter("seed")
@@ -140,7 +140,7 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ex
     rows: dict[Hashable, Record] = {}
     for record in same:
         rows[_key(record, selection)] = record  # keeps the place of the first record, with the content of the newest
-    return Experiment(selection, results_dir, list(rows.values()), len(found) - len(same), records)
+    return Experiment(selection, results_dir, named_by_rows(list(rows.values())), len(found) - len(same), records)
 
 
 def together(*experiments: Experiment | None) -> Experiment:
@@ -148,6 +148,19 @@ def together(*experiments: Experiment | None) -> Experiment:
     known = [experiment for experiment in experiments if experiment is not None]
     records = sorted((record for experiment in known for record in experiment.records), key=started)
     return replace(known[0], records=records, left_out=sum(experiment.left_out for experiment in known))
+
+
+def shared_loss(records: list[Record]) -> str:
+    """The label of the mask loss that all records have; empty where they differ, or have their renderers' own."""
+    labels = {setting(record["config"], "silhouette", "_label_") or "" for record in records}
+    return str(labels.pop()) if len(labels) == 1 else ""
+
+
+def named_by_rows(records: list[Record]) -> list[Record]:
+    """The records with the names of their rows under `row`, without a mask loss that all share: captions name it."""
+    if not shared_loss(records):
+        return records
+    return [record | {"row": row_name(record["config"] | {"silhouette": {}}, record["renderer"])} for record in records]
 
 
 def _like_newest(records: list[Record], part: Callable[[Record], Any]) -> list[Record]:

@@ -36,7 +36,8 @@ class Row:
 
     Args:
         preset: the file of conf/method, or else of conf/renderer.
-        name: the run's label, or else the renderer's label, or else the renderer's file.
+        name: the run's label, or else the renderer's label, or else the renderer's file; with its loss of the mask,
+            where an experiment's rows differ in that.
     """
 
     preset: str
@@ -46,7 +47,7 @@ class Row:
 def row_of(record: Record) -> Row:
     """The row of a record. Older records have no presets: they are identified by their labels."""
     config = record["config"]
-    name = str(row_name(config, record["renderer"]))
+    name = str(record.get("row") or row_name(config, record["renderer"]))
     if "method" in record:
         return Row(record["method"] or record["renderer"], name)
     return Row(FORMER.get(name, name), name)

@@ -18,24 +18,29 @@ from bench.report.write.table import IDENTITY, Column, shown, text, through, to_
 PLACE = 200
 READS = (Selection("gradients", ("gradients",)),)
 BANDS = ("frontal", "oblique", "grazing", "silhouette")
-ERRORS = ("cosine", "scale", "median_error", "p99_error")
+ERRORS = ("pooled_cosine", "pooled_scale", "cosine", "scale", "median_error", "p99_error")
 COUNTS = ("pixels", "excluded")
 NUMBERS = (*COUNTS, *(f"{of}_{e}" for of in ("code", "camera") for e in ERRORS), "image_cosine", "image_scale")
-UNSHOWN = ("code_pooled_cosine", "camera_pooled_cosine")  # in the CSV only: the table would be too wide
 NOTES = (
+    "A pooled number compares the gradients of all pixels of a band at once, as one long vector: a factor that differs "
+    "between pixels lowers the pooled cosine. A pixel's own cosine cannot show this: it is 1 for any positive multiple "
+    "of the true gradient.",
     "Errors are relative to the length of the true gradient. Pixels are frontal, oblique or grazing by the angle "
     "between ray and normal; the silhouette is evaluated as one image. A renderer without ray gradients has no numbers "
     "for the camera.",
 )
 TITLES = ("gradient for the code", "gradient for the camera", "silhouette")  # of the figure's columns
-# Panels of the figure: metric, label of the axis, and the value of an exact gradient.
+# Panels of the figure: metric, label of the axis, and the value of an exact gradient; None where there is none.
 PANELS = (
+    ("code_pooled_cosine", "pooled cosine (exact: 1)", 1.0),
+    ("camera_pooled_cosine", "pooled cosine (exact: 1)", 1.0),
+    ("image_cosine", "cosine (exact: 1)", 1.0),
     ("code_scale", "scale (ratio, exact: 1)", 1.0),
     ("camera_scale", "scale (ratio, exact: 1)", 1.0),
     ("image_scale", "scale (ratio, exact: 1)", 1.0),
     ("code_median_error", "median relative error (ratio)", None),
     ("camera_median_error", "median relative error (ratio)", None),
-    ("image_cosine", "cosine (exact: 1)", 1.0),
+    None,
 )
 
 
@@ -43,12 +48,13 @@ def make(experiment: Experiment) -> Result:
     """Makes the page, with a line for each renderer and band, including failed runs."""
     lines = [(record, band) for record in experiment.named() for band in BANDS]
     data = to_data(COLUMNS, lines)
-    zeros = sum((data[metric] == 0).sum() for metric, _, right in PANELS if right is None)
+    zeros = sum((data[panel[0]] == 0).sum() for panel in PANELS if panel and panel[2] is None)
     unseen = f"{zeros} errors of exactly zero lie below the figure's logarithmic axes." if zeros else ""
     return Result(
         experiment,
         "Errors of the gradients.",
-        "Cosine and scale of a renderer's gradient against the true one: both are 1 where it is exact.",
+        "Cosine and scale of a renderer's gradient against the true one, pooled over the pixels of a band and per "
+        "pixel: all are 1 where it is exact.",
         remarks=(*NOTES, unseen, *definitions(experiment.records, {name: _heading(name) for name in NUMBERS})),
         data=data,
         table=to_table(COLUMNS, lines),
@@ -58,10 +64,14 @@ def make(experiment: Experiment) -> Result:
 
 @style.styled
 def draw(data: pd.DataFrame) -> Figure:
-    """Draws scale above and median error below, by band, a marker per renderer; the silhouette in a third column."""
-    figure, axes = chart.sheet(4.4, 2, 3, width_ratios=(3, 3, 2))
+    """Draws pooled cosine, scale and median error, by band, a marker per renderer; the silhouette in a third column."""
+    figure, axes = chart.sheet(6.2, 3, 3, width_ratios=(3, 3, 2))
     names = list(dict.fromkeys(data["name"]))
-    for axis, (metric, label, right) in zip(axes.flat, PANELS, strict=True):
+    for axis, panel in zip(axes.flat, PANELS, strict=True):
+        if panel is None:
+            axis.set_visible(False)
+            continue
+        metric, label, right = panel
         bands = BANDS[3:] if metric.startswith("image") else BANDS[:3]
         for place, name in enumerate(names):
             _points(axis, data[data["name"] == name].set_index("band"), metric, bands, (place + 0.5) / len(names) - 0.5)
@@ -118,6 +128,5 @@ COLUMNS = (  # of a record and a band
     *through(lambda line: line[0], *IDENTITY),
     text("band", "Band", lambda line: line[1]),
     *(_column(name, _heading(name)) for name in NUMBERS),
-    *map(_column, UNSHOWN),
     shown("Status", lambda line: line[0]["status"]),
 )

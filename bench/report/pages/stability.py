@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data.atlas import FAILED, STABILITY, Atlas, atlas, title
+from bench.report.data.atlas import FAILED, STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
@@ -28,13 +28,17 @@ NOTES = (
     "severity. Renderings have {resolution}×{resolution} pixels.",
     "“At once”: breaks at the mildest severity; “none”: does not break at the severest; both with the number of failed "
     "trials there and the interval of their share (Clopper and Pearson). – is a renderer without that setting.",
+    "“One trial”: repeats could not differ there, so that each severity was tried once and there is no interval; the "
+    "breakdown lies between two neighbouring severities.",
+    "Where a disturbance moves the surface, renderers are judged by the moved surface.",
     "Success: {hits:g} of the true hits within the pixel's footprint and false hits of at most {false_hits:g} of them; "
     "a gradient whose cosine is at least {cosine:g} and whose relative length is within {scale:g} of 1; a fit within "
     "{surface_error:g} scene units of the surface.",
 )
 COST_NOTES = (
-    "Axes: the {axes} that evaluate renderings and that every renderer supports. Rank 1 is the best; equal breakdowns "
-    "share their mean rank; a run that did not end ok, or is missing, has the worst.",
+    "Axes: the {axes} that evaluate renderings and that every renderer supports. Where a disturbance moves the "
+    "surface, its effect on the method is ranked, not that on the surface. Rank 1 is the best; equal breakdowns share "
+    "their mean rank; a run that did not end ok, or is missing, has the worst.",
     "At once: number of axes on which it breaks at the mildest severity; none: on which it does not break at the "
     "severest.",
 )
@@ -80,7 +84,7 @@ def make(experiment: Experiment) -> Result:
         "The severity at which half of the trials succeed.",
         n=f"{int(trials)} trials in all, of {len(grid.axes)} axes and {len(grid.rows)} renderers",
         interval="95 % credible intervals, the milder end first",
-        remarks=[*(note.format(**about) for note in NOTES), *(_worst(grid, row) for row in grid.rows), *_theory(grid)],
+        remarks=[*(note.format(**about) for note in NOTES), *_all_about(grid)],
         data=to_data([*COLUMNS, *numbers, FAILURES], lines),
         table=to_table([shown("Axis", title), shown("Unit", grid.unit), *cells], grid.axes),
         figure=draw(grid),
@@ -135,6 +139,11 @@ def draw(grid: Atlas) -> Figure:
     return figure
 
 
+def _all_about(grid: Atlas) -> list[str]:
+    """Notes on each row, on theory, and on moved surfaces."""
+    return [*(_worst(grid, row) for row in grid.rows), *_theory(grid), _moved(grid)]
+
+
 def _worst(grid: Atlas, row: Row) -> str:
     """A note on a row's mildest breakdowns, runs that did not end ok first, and on the kinds of its failed trials."""
     cells = [(axis, grid.cells[axis, row]) for axis in grid.axes if (axis, row) in grid.cells]
@@ -152,15 +161,36 @@ def _theory(grid: Atlas) -> list[str]:
     """A note per axis with a theoretical prediction: the predicted and the measured breakdown of each row."""
     lines = []
     for axis in grid.axes:
-        rows = [
-            f"{row.name} {format.number(predicted)}{'' if cell.covers(predicted) else ' (outside)'}, "
-            f"measured {cell.full()}"
-            for row, cell in grid.on(axis)
-            if cell.known and (predicted := cell.number("predicted")) is not None
-        ]
+        known = [(row.name, cell, p) for row, cell in grid.on(axis) if cell.known and (p := cell.number("predicted"))]
+        rows = [f"{name} {format.number(p)}{_beside(cell, p)}, measured {cell.full()}" for name, cell, p in known]
+        beyond = " (theory does not hold for any row)" if not any(cell.covers(p) for _, cell, p in known) else ""
         if rows:
-            lines.append(f"Predicted, {title(axis)}: {'; '.join(rows)}.")
+            lines.append(f"Predicted, {title(axis)}{beyond}: {'; '.join(rows)}.")
     return lines
+
+
+def _beside(cell: Cell, predicted: float) -> str:
+    """How a predicted severity differs from the measured one, where it lies outside its interval."""
+    measured = cell.number("breakdown")
+    if cell.covers(predicted):
+        return ""
+    if not measured:
+        return " (outside)"
+    share = 100 * (predicted / measured - 1)
+    return f" (outside, {abs(share):.0f} % {'above' if share > 0 else 'below'})"
+
+
+def _moved(grid: Atlas) -> str:
+    """A note on how far the disturbances moved the surface; empty where none did."""
+    parts = []
+    for axis in grid.axes:
+        moved = [far for _, cell in grid.on(axis) if (far := cell.number("surface_moved")) is not None]
+        if moved:
+            ends = [format.number(end) for end in dict.fromkeys((min(moved), max(moved)))]
+            parts.append(f"{title(axis)} {' to '.join(ends)}")
+    return (
+        f"Distance by which the surface moved at the breakdowns, in scene units: {'; '.join(parts)}." if parts else ""
+    )
 
 
 @style.styled

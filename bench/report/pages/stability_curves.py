@@ -11,7 +11,7 @@ from bench.pictures import style
 from bench.report.data import curves
 from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import Record, Row, grouped
+from bench.report.data.records import Row, grouped
 from bench.report.data.statistics import clopper_pearson
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -25,7 +25,7 @@ COLUMNS = (text("axis"), text("row"), *(Column(name) for name in SHARES))
 NOTES = (
     "Curves are logistic, with the most probable breakdown and width. Dots are shares of the trials at a severity; the "
     "CSV has their number and intervals (Clopper and Pearson). Renderers are shifted a little upwards, so that none "
-    "hides another.",
+    "hides another. An axis with one trial a level, where repeats could not differ, has no intervals.",
     "A dashed line is the predicted breakdown of the renderer of its colour, a dotted one that of a second formula, as "
     "published: DIST, Eqs. 8 and 10.",
 )
@@ -35,7 +35,7 @@ Shares = dict[tuple[str, Row], pd.DataFrame]
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a panel per axis and a line per renderer."""
     grid = atlas(experiment)
-    shares = {key: _shares(experiment, cell.record) for key, cell in grid.cells.items() if cell.known}
+    shares = {key: _shares(experiment, cell) for key, cell in grid.cells.items() if cell.known}
     lines = [
         {"axis": axis, "row": row.name, **share}
         for (axis, row), table in shares.items()
@@ -105,14 +105,18 @@ def _curve(panel: Axes, row: Row, cell: Cell, table: pd.DataFrame, above: float)
             panel.axvline(predicted, color=colour, ls=line, lw=0.6)
 
 
-def _shares(experiment: Experiment, record: Record) -> pd.DataFrame:
-    """Successes, trials, their share and its interval for each level that was tried, mild to severe."""
-    lines = curves.lines(experiment.folder(record)) or []
+def _shares(experiment: Experiment, cell: Cell) -> pd.DataFrame:
+    """Successes, trials, their share and its interval for each level that was tried, mild to severe.
+
+    With one trial per level there is no interval.
+    """
+    lines = curves.lines(experiment.folder(cell.record)) or []
     trials = [t for t in lines if all(isinstance(t.get(name), int | float) for name in ("level", "severity"))]
     rows = []
     for level, tried in sorted(grouped(trials, lambda trial: float(trial["level"])).items()):
         severity, successes = float(tried[0]["severity"]), sum(bool(trial.get("success")) for trial in tried)
         if math.isfinite(severity):
             rate = clopper_pearson(successes / len(tried), len(tried))
-            rows.append([level, severity, successes, len(tried), rate.value, rate.low, rate.high])
+            ends = [math.nan, math.nan] if cell.one_trial else [rate.low, rate.high]
+            rows.append([level, severity, successes, len(tried), rate.value, *ends])
     return pd.DataFrame(rows, columns=SHARES)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from operator import itemgetter
 from typing import Any
 
-from bench.report.data.experiments import Experiment
+from bench.report.data.experiments import Experiment, shared_loss
 from bench.report.data.records import Record, setting, solid, view
 from bench.report.data.statistics import Interval
 
@@ -82,9 +82,9 @@ def _levels(experiment: Experiment) -> tuple[int, int, int]:
 
 
 def _setup(experiment: Experiment) -> str:
-    """The parts of the setup that are known: the scenes, the resolution and prior that all runs have, the machine."""
+    """The parts of the setup that are known: scenes, the resolution, prior and loss that all runs have, the machine."""
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in experiment.records))
-    known = [scene for scene in scenes if scene] or [experiment.records[0]["dataset"]]
+    shown = [scene for scene in scenes if scene] or [experiment.records[0]["dataset"]]
     sizes = {setting(record["config"], "view", "resolution") for record in experiment.records}
     resolution = sizes.pop() if len(sizes) == 1 else None
     config = experiment.requested()
@@ -92,12 +92,14 @@ def _setup(experiment: Experiment) -> str:
     layers, width = setting(network, "layers"), setting(network, "width")
     machines = [_machine(*machine) for machine in experiment.machines()]
     parts = {
-        "scenes": f"{'Scene' if len(known) == 1 else f'{len(known)} scenes:'} {_listed(known)}",
+        "scenes": f"{'Scene' if len(shown) == 1 else f'{len(shown)} scenes:'} {_listed(shown)}",
         "pixels": f"{resolution}×{resolution} pixels" if resolution else "",
         "network": f"decoder of {layers} layers of {width}" if layers and width else "",
         "machine": f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines),
     }
-    return "; ".join(parts[name] for name in experiment.selection.setup if parts[name])
+    loss = shared_loss(experiment.records)
+    known = [parts[name] for name in experiment.selection.setup if parts[name]]
+    return "; ".join(known + ([f"every row with {loss}"] if loss else []))
 
 
 def _outcome(experiment: Experiment) -> str:
