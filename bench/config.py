@@ -1,32 +1,18 @@
-"""The typed top level of a run's configuration, the one place where a YAML node becomes an object, and hints on names.
-
-A file of the group `renderer` may have two keys that are no arguments: `_rows_` maps an experiment to the place of the
-renderer's row in its table, and `_label_` names the row. A file without `_rows_` has a row in every such experiment,
-after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`. The files are those of conf/renderer and of
-the user's `--config-dir`.
-
-A file of `conf/method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
-that dimension, of the Sobol point whose number is `draw`.
-"""
+"""The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
-import importlib.util
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
-from difflib import get_close_matches
 from enum import StrEnum
-from functools import cache
-from math import inf
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
-import numpy as np
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from bench.hints import nearest, renamed
+from bench.rows import LABEL, ROWS, register_resolvers
 from datasets.dataset import Split
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -42,67 +28,8 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
 RESERVED = ("_target_", "_package_", LABEL, ROWS)  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
-DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from; more than spaces need
-MANY = 20  # names, beyond which a message leaves variants out
-KEY = re.compile(r"\w+(\.\w+)+")  # a dotted key and nothing else
-STRATEGIES = {  # of the group `strategy`, whose files are files of `renderer` now
-    "aggressive": "dist_aggressive",
-    "capped": "dist_capped",
-    "coarse_to_fine": "dist_coarse_to_fine",
-    "coarse_to_fine_100": "dist_coarse_to_fine_100",
-    "dist": "dist",
-    "dvr": "dvr_64",
-    "dvr_128": "dvr",
-    "dvr_official_slope": "dvr_official_slope",
-    "dynamic": "dist_dynamic",
-    "idr": "idr",
-    "naive": "naive_serial",
-    "official_clamp": "dist_official_clamp",
-    "parallel": "naive_practical_parallel",
-    "practical_gradient": "naive_practical",
-    "slope_bound": "dist_slope_bound",
-    "step_back": "dist_step_back",
-    "step_floor": "dist_step_floor",
-    "unrolled_parallel": "naive_parallel",
-}
-SETTINGS = (  # of the group `setting`, likewise; these keep their names
-    *("dist", "dist_alpha_1", "dist_alpha_1_2", "dist_alpha_2", "dist_epsilon_5e3", "dist_epsilon_5e4", "dist_k_3"),
-    *("dist_one_level", "dist_steps_10", "dist_steps_20", "idr", "idr_epsilon_5e3", "idr_steps_20", "naive"),
-    "naive_steps_20",
-)
-K_OR_N = "renderer.n_gradient_samples (K, of dist and naive) or renderer.n_ray_samples (n, of dvr)"
-SIZES = "sizes.smoke, sizes.desk or sizes.paper, which +experiment=NAME has"
-RENAMED = {  # what users typed before, a choice as GROUP/NAME or a key, and what to type now
-    **{f"strategy/{name}": f"renderer={renderer}" for name, renderer in STRATEGIES.items()},
-    "strategy": "renderer=NAME",
-    **{f"setting/{name}": f"renderer={name}" for name in SETTINGS},
-    "setting/dvr": "renderer=dvr_early_stop",
-    **{f"setting/dvr_{n}": f"renderer=dvr_fixed_{n}" for n in (16, 32, 64, 128)},
-    "setting/dist_half": "+method=dist_half",
-    "setting": "renderer=NAME",
-    "trial/completion": "+experiment=speed_completion",
-    "trial/rendering": "+experiment=speed_rendering",
-    "trial": "+experiment=speed_completion or +experiment=speed_rendering",
-    **{f"condition/focal_{name}": f"task.focal={int(name) / 100:g}" for name in ("050", "075", "105")},
-    **{f"condition/start_{name}": f"task.start_scale={int(name) / 100:g}" for name in ("000", "050", "200")},
-    "condition": "task.focal=1 task.start_scale=1",
-    "common": "+experiment=fitted",
-    "experiment/speed_accuracy": "+experiment=speed_completion or +experiment=speed_rendering",
-    "experiment/fig10": "+experiment=fig10_focal or +experiment=fig10_start",
-    "renderer.samples": K_OR_N,
-    "task.samples": "renderer.n_gradient_samples",
-    **{f"task.{name}": f"task.optimiser.{name}" for name in ("iterations", "learning_rate", "schedule")},
-    **{f"task.code_{name}": f"task.code.{name}" for name in ("weight", "average")},
-    "ladder.rungs": "models.candidates",
-    "ladder": "models",
-    **{f"ladder.{name}": f"models.{name}" for name in ("fit", "growth", "views")},
-    "task.stress.among": "task.stress.setting alone",
-    **{f"scale.{name}": SIZES for name in ("table2", "table3", "fig6", "fig10", "speed_accuracy")},
-    **{f"scale.{name}": SIZES for name in ("stability.stresses", "capacity.resolution", "capacity.scenes")},
-}
 
 
 class Device(StrEnum):
@@ -188,10 +115,7 @@ class Config:
 def register() -> None:
     """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
     ConfigStore.instance().store(name="schema", node=Config)
-    OmegaConf.register_new_resolver("rows", _rows, replace=True)
-    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
-    OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
-    OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
+    register_resolvers()
 
 
 def check_names(config: DictConfig) -> None:
@@ -275,32 +199,6 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     return build(OmegaConf.merge(_with_defaults(path), arguments, package), group)  # type: ignore[arg-type]
 
 
-def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[str, Any]:
-    """A resolved `renderer` node without `_rows_`, and without a `_label_` inherited from a file that it builds on.
-
-    Args:
-        renderer: the node.
-        choice: the name of its file.
-        runtime: `hydra.runtime`, which has the folders of configurations.
-    """
-    path = _renderers(runtime).get(choice)
-    file = OmegaConf.create() if path is None else _loaded(path)
-    inherits = "defaults" in file and LABEL not in file
-    dropped = {ROWS, LABEL} if inherits else {ROWS}
-    return {key: value for key, value in renderer.items() if key not in dropped}
-
-
-def renderers_of(experiment: str, runtime: DictConfig) -> list[str]:
-    """The renderers that have a row in an experiment, in the order of their places, then by name."""
-    places = {}
-    for name, path in _renderers(runtime).items():
-        file = _loaded(path)
-        place = file.get(ROWS, {experiment: inf}).get(experiment)
-        if place is not None and not OmegaConf.is_missing(file, "_target_"):  # custom: its class is on the command line
-            places[name] = place
-    return sorted(places, key=lambda name: (places[name], name))
-
-
 def _with_defaults(path: Path) -> DictConfig:
     """What a YAML holds, over the files of its own group that its `defaults` name, in their order, as Hydra has it."""
     node = cast(DictConfig, OmegaConf.load(path))
@@ -358,85 +256,3 @@ def _path(cls: type) -> str:
 
 def _type_name(wanted: Any) -> str:
     return getattr(wanted, "__name__", None) if isinstance(wanted, type) else str(wanted).replace("typing.", "")
-
-
-def _rows(experiment: str, *, _root_: DictConfig) -> str:
-    runtime = _root_.hydra.runtime
-    if runtime.choices.get("method") is not None:  # a method sets its renderer
-        return runtime.choices["renderer"]
-    return ",".join(renderers_of(experiment, runtime))
-
-
-def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
-    """The value of draw `_root_.draw` in a range, even in its logarithm; a whole number for whole ends, else 3 digits.
-
-    Raises:
-        ValueError: without a draw, beyond the last one, or for a range or dimension that there is not.
-    """
-    draw = _root_.draw
-    if draw is None or not 0 <= draw < DRAWS:
-        raise ValueError(f"a method of method/space needs draw=0 to draw={DRAWS - 1}, found {draw}")
-    if not (0 < least < most and 0 <= dimension < DIMENSIONS):
-        raise ValueError(
-            f"${{drawn:{dimension},{least},{most}}} must have a dimension from 0 to {DIMENSIONS - 1} and ends above 0"
-        )
-    value = least * (most / least) ** float(sobol_points()[draw, dimension])
-    return round(value) if isinstance(least, int) and isinstance(most, int) else float(f"{value:.3g}")
-
-
-@cache
-def sobol_points() -> np.ndarray:
-    """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
-    from scipy.stats import qmc  # only here: it takes a second
-
-    return qmc.Sobol(DIMENSIONS, scramble=True, rng=0).random(DRAWS)
-
-
-def _renderers(runtime: DictConfig) -> dict[str, Path]:
-    """The files of the group `renderer` by name; of two with the same name, the one that Hydra takes."""
-    paths: dict[str, Path] = {}
-    for folder in _folders(runtime):
-        for path in sorted((folder / "renderer").glob("*.yaml")):
-            paths.setdefault(path.stem, path)
-    return paths
-
-
-def _loaded(path: Path) -> DictConfig:
-    """The content of a file, without the files that it builds on."""
-    node = OmegaConf.load(path)
-    if not isinstance(node, DictConfig):
-        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
-    return node
-
-
-def _folders(runtime: DictConfig) -> Iterator[Path]:
-    """The folders of configurations, in the order in which Hydra searches them."""
-    for source in runtime.config_sources:
-        if source.schema == "file":
-            yield Path(source.path)
-        elif source.schema == "pkg" and (found := importlib.util.find_spec(source.path.replace("/", "."))):
-            yield from map(Path, found.submodule_search_locations or [])
-
-
-def renamed(name: str, known: list[str] | None = None) -> str:
-    """A hint at the end of an error message: the new name of a choice GROUP/NAME or of a key; empty for others.
-
-    With the dotted keys that are `known`, also empty where the new key, or the one that holds it, is not among them.
-    """
-    outer = [name, name.split("/")[0], *(name.rsplit(".", count)[0] for count in range(1, name.count(".") + 1))]
-    new = next((RENAMED[known] for known in outer if known in RENAMED), None)
-    holders = [key for key in known or [] if "." in key]
-    if new and known and KEY.fullmatch(new) and not any(f"{new}.".startswith(f"{key}.") for key in holders):
-        return ""
-    return f": it was renamed, write {new}" if new else ""
-
-
-def nearest(word: str, known: list[str]) -> str:
-    """A hint at the end of an error message: the nearest known names, or all of them."""
-    last = [name for name in known if "." not in word and name.rsplit(".", 1)[-1] == word]
-    close = last or [name for name in get_close_matches(word, known, n=3, cutoff=0.5) if name != word]
-    if close:
-        return f": did you mean {' or '.join(close)}?"
-    roots = [name for name in known if not any(name.startswith(f"{other}_") for other in known)]
-    shown = roots if len(known) > MANY else known
-    return f": it has {', '.join(sorted(shown))}" + (", and variants of these" if len(shown) < len(known) else "")

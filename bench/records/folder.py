@@ -15,9 +15,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import OURS, Rerun, own_row
+from bench.config import OURS, Rerun
 from bench.records.files import digest, file_lock, to_json
 from bench.records.record import NEUTRAL_KEYS, RunStatus, read_record
+from bench.rows import own_row
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from bench.config import nearest
+from bench.hints import nearest
 from bench.setup.auto import AUTO
 from renderers.checks import check_at_least, check_choice, check_share
 

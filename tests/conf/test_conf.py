@@ -10,7 +10,8 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, RENAMED, SETTINGS, STRATEGIES, build, check_names, load, register, renamed
+from bench.config import CONF, build, check_names, load, register
+from bench.hints import RENAMED, SETTINGS, STRATEGIES, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive

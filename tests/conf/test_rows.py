@@ -7,7 +7,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import build
+from bench.config import CONF, build
 from bench.records.files import to_json, write_text
 from bench.records.read import read_records
 from bench.records.record import Record, row_name
@@ -161,3 +161,18 @@ def test_records_and_plans_without_a_method_are_read(tmp_path):
     old = {key: value for key, value in record.__dict__.items() if key != "method"}
     assert Record.of(old).method == ""
     assert OmegaConf.create(record.config).renderer._label_ == "DIST"
+
+
+def test_the_tuning_has_all_spaces_and_the_tuned_rows_that_there_are(swept, tmp_path):
+    for folder, text in (("", "label: Mine\n"), ("space", "label: Mine\n"), ("tuned", "label: Mine, tuned\n")):
+        path = tmp_path / "own/method" / folder / "mine_mask.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"# @package _global_\n{text}")
+    plan, _ = swept("+experiment=tuning", "draw=0", "split=test", folder=tmp_path / "own")
+    spaces = {path.stem for path in (CONF / "method/space").glob("*.yaml")}
+    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in (*spaces, "mine_mask")}
+    plan, _ = swept("+experiment=tuned", "task.points=20", folder=tmp_path / "own")
+    methods = [cell.method for cell in plan.cells]
+    assert {*methods} >= {"dist_mask", "dist_mask_paper", "mine_mask", "tuned/mine_mask"}
+    assert methods.index("tuned/mine_mask") == methods.index("mine_mask") + 1
+    assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_mask"}

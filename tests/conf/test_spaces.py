@@ -9,7 +9,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from bench.config import CONF, DIMENSIONS, DRAWS, build, register, sobol_points
+from bench.config import CONF, build, register
+from bench.rows import DIMENSIONS, DRAWS, sobol_points
 
 SPACES = sorted(path.stem for path in (CONF / "method" / "space").glob("*.yaml"))
 

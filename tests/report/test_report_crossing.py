@@ -62,7 +62,7 @@ def test_all_runs_are_one_experiment_with_a_cell_per_setting(tmp_path):
     assert runs.median("sofa", "100", "idr", "CrossEntropy") == pytest.approx(1.5 * 3 * 1.5)
     assert runs.median("table", "100", "idr", "Hinge") is None
     values = runs.over_points("idr", "Hinge")
-    assert len(values) == 4 and values[("sofa", 0), 0] == pytest.approx(1.5 * math.sqrt(2))
+    assert len(values) == 4 and values[("sofa", 0), 0, 0] == pytest.approx(1.5 * math.sqrt(2))
 
 
 def test_the_part_of_a_gap_that_is_the_loss(tmp_path):

@@ -137,7 +137,7 @@ class Cell:
         return int(self.number(f"{end}_successes") or 0), int(self.number(f"{end}_trials") or 0)
 
     def _count(self, end: str) -> str:
-        """The number of failed trials at an end of the sweep, with the interval of their share where there are repeats."""
+        """The number of failed trials at an end of the sweep; where there are repeats, the interval of their share."""
         successes, n = self._trials(end)
         if not n:
             return "not tried"

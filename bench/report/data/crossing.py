@@ -20,7 +20,7 @@ from bench.report.data.records import (
     setting,
     value_evaluations,
 )
-from bench.report.data.statistics import median
+from bench.report.data.statistics import Groups, flat, median
 
 CROSSING = Selection("crossing", ("completion",), ("dataset", "task", "silhouette"), ("points",))
 OWN = {  # the loss of each renderer's paper; the naive one has that of DIST
@@ -117,6 +117,11 @@ class Crossed:
         parts = {"renderer": renderer + 0 * means, "loss": loss + 0 * means, "both": means - renderer - loss}
         total = float((means**2).sum())
         return ({name: float((part**2).sum()) / total for name, part in parts.items()} if total else {}), len(common)
+
+
+def shape_medians(groups: Groups) -> list[float]:
+    """The median of each shape's errors."""
+    return [float(median(flat([group]))) for group in groups]
 
 
 def geometric_mean(values: np.ndarray) -> Any:

@@ -11,7 +11,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.completions import ERROR, heading
-from bench.report.data.crossing import CROSSING, Crossed, geometric_mean
+from bench.report.data.crossing import CROSSING, Crossed, geometric_mean, shape_medians
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import by_shape
 from bench.report.write import chart
@@ -150,7 +150,8 @@ def make_front(experiment: Experiment) -> Result:
         experiment,
         "Error over cost, under one loss at a time.",
         "Geometric mean of the errors of all shapes and numbers of points over the median number of a run's values.",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=[line["interval"] for line in lines if line["interval"] is not NOTHING],
         remarks=(
             ERROR,
             "On the front: under the same loss no other renderer has a smaller error for fewer values.",
@@ -173,13 +174,12 @@ def _placed(runs: Crossed, renderer: str, loss: str) -> dict[str, Any]:
 def draw_front(runs: Crossed, lines: list[dict[str, Any]]) -> Figure:
     """Draws a panel per loss, with a point per renderer; filled points are on the front."""
     figure, (axes,) = chart.sheet(2.9, 1, len(runs.losses), sharey=True, sharex=True)
+    edge = 2 * max((line["error"] for line in lines if math.isfinite(line["error"])), default=1.0)
     for axis, loss in zip(axes, runs.losses, strict=True):
         for line in (line for line in lines if line["loss"] == runs.labels[loss]):
-            x, y = style.finite([line["evaluations"]]), style.finite([line["error"]])
-            ends = style.finite([line["interval"].low, line["interval"].high])
-            hollow = {} if line["front"] else {"mfc": "none"}
-            axis.vlines(x, *ends, color=style.look(line["preset"]).colour, lw=0.8)
-            chart.points(axis, line["preset"], x, y, ms=5, label=line["renderer"], **hollow)
+            how = {"ls": "none", "ms": 5, "label": line["renderer"]} | ({} if line["front"] else {"mfc": "none"})
+            found = [line["interval"].below(edge)] if math.isfinite(line["error"]) else []
+            chart.estimates(axis, line["preset"], [line["evaluations"]][: len(found)], found, bars=True, **how)
         axis.set(title=runs.labels[loss], xlabel="field values per run")
     axes[0].set_ylabel("Chamfer × 1000 (scene units²)")
     style.log_axis(axes[0], "x", [line["evaluations"] for line in lines])
@@ -206,7 +206,8 @@ def make_gaps(experiment: Experiment) -> Result:
         experiment,
         "Which part of a gap between renderers is their loss of the mask.",
         "Ratio of two renderers' errors, each under its own paper's loss and both under one.",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=[line[f"{key}_of"] for line in lines for key in under if f"{key}_of" in line],
         remarks=(_explained(runs), *_verdicts(lines, runs.losses), *GAP_NOTES, ERROR),
         data=to_data(columns, lines),
         table=to_table(columns, lines),
@@ -232,7 +233,8 @@ def make_losses(experiment: Experiment) -> Result:
         experiment,
         "What the loss of the mask changes, with each renderer.",
         "Ratio of the errors under two losses, with the same renderer.",
-        interval="95 % bootstrap intervals over shapes and seeds",
+        interval="95 % bootstrap intervals over {shapes and seeds}",
+        estimates=[line[f"{renderer}_of"] for line in lines for renderer in runs.renderers if f"{renderer}_of" in line],
         remarks=(_explained(runs), GAP_NOTES[0], ERROR),
         data=to_data(columns, lines),
         table=to_table(columns, lines),
@@ -258,10 +260,9 @@ def _gaps(runs: Crossed, name: str, settings: dict[str, Pair]) -> dict[str, Any]
         line[key] = None
         if mine:
             ratio = statistics.paired_bootstrap(mine, other, geometric_mean, seed=SEED)
-            medians = [(statistics.median(a), statistics.median(b)) for a, b in zip(mine, other, strict=True)]
-            better = sum((a < b) + 0.5 * (a == b) for a, b in medians)
-            line |= {key: ratio.value, f"{key}_low": ratio.low, f"{key}_high": ratio.high, f"{key}_better": better}
-            line["shapes"] = len(mine)
+            better = sum((a < b) + 0.5 * (a == b) for a, b in zip(*map(shape_medians, (mine, other)), strict=True))
+            line |= {key: ratio.value, f"{key}_low": ratio.low, f"{key}_high": ratio.high}
+            line |= {f"{key}_of": ratio, f"{key}_better": better, "shapes": len(mine)}
     return line
 
 
@@ -269,8 +270,7 @@ def _words(line: dict[str, Any], key: str) -> str:
     """A ratio, its interval, and on how many shapes the first is better."""
     if line.get(key) is None:
         return format.MISSING
-    ratio = statistics.Interval(line[key], line[f"{key}_low"], line[f"{key}_high"])
-    return f"{ratio}; {line[f'{key}_better']:g} of {line['shapes']}"
+    return f"{line[f'{key}_of']}; {line[f'{key}_better']:g} of {line['shapes']}"
 
 
 def _share(own: float | None, under: list[float | None]) -> float | None:

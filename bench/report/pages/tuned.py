@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.report.data import statistics
 from bench.report.data.completions import ERROR, Completions, heading, shapes_per_cell
-from bench.report.data.crossing import geometric_mean
+from bench.report.data.crossing import geometric_mean, shape_medians
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, median_of_known, value_evaluations
 from bench.report.write import chart
@@ -38,6 +38,7 @@ RUNS = (
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per family and row: medians, and the ratio to the method as it stands."""
     runs = Completions(experiment)
+    lines = [_line(runs, name, row) for name in runs.families for row in runs.rows_of(name)]
     columns = [
         *(text("family", "Family"), text("row", "Method")),
         *(Column(points, heading(points)) for points in runs.points),
@@ -47,10 +48,11 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Methods as they stand, tuned, and at their papers' settings.",
         "Median error of shapes over the number of given depth points.",
-        interval="95 % bootstrap intervals of the ratios over shapes and seeds",
+        interval="95 % bootstrap intervals of the ratios over {shapes and seeds}",
+        estimates=[found for line in lines if (found := line["ratio_of"]) is not None],
         remarks=(ERROR, shapes_per_cell(runs), *NOTES),
         data=to_data(RUNS, experiment.records),
-        table=to_table(columns, [_line(runs, name, row) for name in runs.families for row in runs.rows_of(name)]),
+        table=to_table(columns, lines),
         figure=draw(experiment, runs),
     )
 
@@ -58,19 +60,19 @@ def make(experiment: Experiment) -> Result:
 def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:
     medians = {points: runs.median(name, row, points) for points in runs.points}
     failed = "{} of {}".format(*runs.failures(name, row))
-    return {"family": name, "row": row.name, "ratio": _ratio(runs, name, row), "failed": failed, **medians}
+    ratio, words = _ratio(runs, name, row)
+    return {"family": name, "row": row.name, "ratio": words, "ratio_of": ratio, "failed": failed, **medians}
 
 
-def _ratio(runs: Completions, name: str, row: Row) -> str:
+def _ratio(runs: Completions, name: str, row: Row) -> tuple[statistics.Interval | None, str]:
     """The row's errors over those of its method as it stands, and on how many shapes it is better; empty for itself."""
     default = next((other for other in runs.rows if other.preset == default_of(row.preset)), row)
     mine, other = runs.pair(name, row, default)
     if default == row or not mine:
-        return ""
-    medians = [(statistics.median(a), statistics.median(b)) for a, b in zip(mine, other, strict=True)]
-    better = sum((a < b) + 0.5 * (a == b) for a, b in medians)
+        return None, ""
+    better = sum((a < b) + 0.5 * (a == b) for a, b in zip(*map(shape_medians, (mine, other)), strict=True))
     ratio = statistics.paired_bootstrap(mine, other, geometric_mean, seed=SEED)
-    return f"{ratio}; {better:g} of {len(mine)}"
+    return ratio, f"{ratio}; {better:g} of {len(mine)}"
 
 
 @style.styled

@@ -82,7 +82,8 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "What tuning is worth.",
         PLOTTED,
-        interval="95 % bootstrap intervals over test shapes",
+        interval="95 % bootstrap intervals over test {shapes and seeds}",
+        estimates=[found for curve in curves.values() for found in curve.values()],
         remarks=(ERROR, *(note.format(**sizes) for note in NOTES)) if methods else ("No draw has all of its runs.",),
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, lines),
@@ -109,12 +110,12 @@ def draw(methods: list[Tuned], curves: dict[str, Curve]) -> Figure:
     axis = axes[0, 0]
     for method in methods:
         curve = curves[method.label]
-        low, middle, high = (style.finite(getattr(x, end) for x in curve.values()) for end in ("low", "value", "high"))
-        chart.line(axis, method.method, list(curve), middle, band=(low, high), label=method.label)
+        chart.estimates(axis, method.method, list(curve), [*curve.values()], label=method.label)
     axis.set(
         xlabel="drawn settings, of which the best on validation shapes is taken", ylabel="Chamfer × 1000 (scene units²)"
     )
-    everything = [end for curve in curves.values() for x in curve.values() for end in (x.low, x.value, x.high)]
+    found = [x for curve in curves.values() for x in curve.values()]
+    everything = [end for x in found for end in (x.low, x.value, x.high, *(() if x.known else x.points))]
     style.log_axis(axis, "y", everything)
     ticks = sorted({k for curve in curves.values() for k in curve})
     axis.set_xscale("log", base=2)

@@ -1,0 +1,129 @@
+"""The rows of experiments: which renderers and methods a sweep is over, and the settings that a method may draw.
+
+A file of the group `renderer` may have two keys that are no arguments: `_rows_` maps an experiment to the place of the
+renderer's row in its table, and `_label_` names the row. A file without `_rows_` has a row in every such experiment,
+after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`. The files are those of conf/renderer and of
+the user's `--config-dir`.
+
+A file of `conf/method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
+that dimension, of the Sobol point whose number is `draw`. An experiment sweeps over `+method: ${methods:space}`.
+"""
+
+import importlib.util
+from collections.abc import Iterator
+from functools import cache
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
+DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from; more than spaces need
+
+
+def register_resolvers() -> None:
+    """Makes known to OmegaConf what values of the configuration may ask for."""
+    OmegaConf.register_new_resolver("rows", _rows, replace=True)
+    OmegaConf.register_new_resolver("methods", _methods, replace=True)
+    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
+    OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
+    OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
+
+
+def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[str, Any]:
+    """A resolved `renderer` node without `_rows_`, and without a `_label_` inherited from a file that it builds on.
+
+    Args:
+        renderer: the node.
+        choice: the name of its file.
+        runtime: `hydra.runtime`, which has the folders of configurations.
+    """
+    path = _renderers(runtime).get(choice)
+    file = OmegaConf.create() if path is None else _loaded(path)
+    inherits = "defaults" in file and LABEL not in file
+    dropped = {ROWS, LABEL} if inherits else {ROWS}
+    return {key: value for key, value in renderer.items() if key not in dropped}
+
+
+def renderers_of(experiment: str, runtime: DictConfig) -> list[str]:
+    """The renderers that have a row in an experiment, in the order of their places, then by name."""
+    places = {}
+    for name, path in _renderers(runtime).items():
+        file = _loaded(path)
+        place = file.get(ROWS, {experiment: inf}).get(experiment)
+        if place is not None and not OmegaConf.is_missing(file, "_target_"):  # custom: its class is on the command line
+            places[name] = place
+    return sorted(places, key=lambda name: (places[name], name))
+
+
+def _rows(experiment: str, *, _root_: DictConfig) -> str:
+    runtime = _root_.hydra.runtime
+    if runtime.choices.get("method") is not None:  # a method sets its renderer
+        return runtime.choices["renderer"]
+    return ",".join(renderers_of(experiment, runtime))
+
+
+def _methods(kind: str, *, _root_: DictConfig) -> str:
+    """The methods with a search space, to be swept over: of the kind `space` the spaces, of `tuned` the methods.
+
+    Of `tuned`, the tuned setting stands behind each method for which it has been written.
+    """
+    folders = [folder / "method" for folder in _folders(_root_.hydra.runtime)]
+    names = sorted({path.stem for folder in folders for path in (folder / "space").glob("*.yaml")})
+    if kind == "space":
+        return ",".join(f"space/{name}" for name in names)
+    written = [name for name in names if any((folder / "tuned" / f"{name}.yaml").is_file() for folder in folders)]
+    return ",".join(part for name in names for part in (name, f"tuned/{name}") if part == name or name in written)
+
+
+def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
+    """The value of draw `_root_.draw` in a range, even in its logarithm; a whole number for whole ends, else 3 digits.
+
+    Raises:
+        ValueError: without a draw, beyond the last one, or for a range or dimension that there is not.
+    """
+    draw = _root_.draw
+    if draw is None or not 0 <= draw < DRAWS:
+        raise ValueError(f"a method of method/space needs draw=0 to draw={DRAWS - 1}, found {draw}")
+    if not (0 < least < most and 0 <= dimension < DIMENSIONS):
+        raise ValueError(
+            f"${{drawn:{dimension},{least},{most}}} must have a dimension from 0 to {DIMENSIONS - 1} and ends above 0"
+        )
+    value = least * (most / least) ** float(sobol_points()[draw, dimension])
+    return round(value) if isinstance(least, int) and isinstance(most, int) else float(f"{value:.3g}")
+
+
+@cache
+def sobol_points() -> np.ndarray:
+    """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
+    from scipy.stats import qmc  # only here: it takes a second
+
+    return qmc.Sobol(DIMENSIONS, scramble=True, rng=0).random(DRAWS)
+
+
+def _renderers(runtime: DictConfig) -> dict[str, Path]:
+    """The files of the group `renderer` by name; of two with the same name, the one that Hydra takes."""
+    paths: dict[str, Path] = {}
+    for folder in _folders(runtime):
+        for path in sorted((folder / "renderer").glob("*.yaml")):
+            paths.setdefault(path.stem, path)
+    return paths
+
+
+def _loaded(path: Path) -> DictConfig:
+    """The content of a file, without the files that it builds on."""
+    node = OmegaConf.load(path)
+    if not isinstance(node, DictConfig):
+        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
+    return node
+
+
+def _folders(runtime: DictConfig) -> Iterator[Path]:
+    """The folders of configurations, in the order in which Hydra searches them."""
+    for source in runtime.config_sources:
+        if source.schema == "file":
+            yield Path(source.path)
+        elif source.schema == "pkg" and (found := importlib.util.find_spec(source.path.replace("/", "."))):
+            yield from map(Path, found.submodule_search_locations or [])
