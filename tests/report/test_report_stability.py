@@ -122,6 +122,7 @@ def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
 def test_how_far_surfaces_moved_is_told_and_not_ranked(tmp_path):
     for label, moved in (("DIST", 0.5), ("DVR", 0.001)):
         broke(tmp_path, "quantised", label, 0.5, surface_moved=moved)
+        broke(tmp_path, "wires", label, 0.5)  # a second axis, since one alone gives no rank
     told_of = "Distance by which the surface moved at the breakdowns, in scene units: quantised 0.00100 to 0.500."
     assert told_of in made(tmp_path, stability.make).notes
     assert made(tmp_path, stability.make_cost).data["rank"].tolist() == [1.5, 1.5]

@@ -27,6 +27,7 @@ class Selection:
         cell: settings of the task in which runs of one row differ.
         former: name of the experiment in older records.
         setup: parts of the setup that captions name, where they are known.
+        splits: whether runs of one task on several splits are read together.
     """
 
     experiment: str
@@ -35,6 +36,7 @@ class Selection:
     cell: tuple[str, ...] = ()
     former: str = ""
     setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
+    splits: bool = False
 
 
 @dataclass(frozen=True)
@@ -180,9 +182,9 @@ def _key(record: Record, selection: Selection) -> Hashable:
 
 
 def _seen(record: Record, selection: Selection) -> tuple[Any, Any]:
-    """The split, unless it varies, and the camera, without its resolution, which is a setting of a row."""
+    """The split, unless several are read together, and the camera without its resolution, a setting of a row."""
     view = record["config"].get("view") or {}
-    split = None if "split" in selection.varies else record["config"].get("split")
+    split = None if selection.splits else record["config"].get("split")
     return split, {key: value for key, value in view.items() if key != "resolution"}
 
 

@@ -10,7 +10,7 @@ from scipy import stats
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, RunKey, by_shape, error, run_key
 
-TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"))
+TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"), splits=True)
 SPACE = "space/"  # the folder of conf/method with the search spaces
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws

@@ -38,7 +38,7 @@ from bench.report.write.table import (
 
 PLACE = 20
 PLACE_INTERVALS = 30
-PLACE_WINS = 35
+PLACE_WINS = 31
 READS = (TABLE2,)
 REFERENCE = "dist_mask"  # the preset with which the other rows are compared
 SEED = 0  # of the bootstrap
