@@ -20,7 +20,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
-DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from; more than spaces need
+DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
+SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
 
 
 def register_resolvers() -> None:
@@ -100,7 +101,7 @@ def sobol_points() -> np.ndarray:
     """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
     from scipy.stats import qmc  # only here: it takes a second
 
-    return qmc.Sobol(DIMENSIONS, scramble=True, rng=0).random(DRAWS)
+    return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS)
 
 
 def _renderers(runtime: DictConfig) -> dict[str, Path]:

@@ -1,7 +1,7 @@
 """`python -m bench.tune`: writes each method's best drawn setting as a file of method/tuned.
 
 It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
-on the validation shapes; the test shapes take no part in the choice.
+on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from bench.records.files import write_text
 from bench.records.format import number
 from bench.records.read import read_records
 from bench.report.data.experiments import Experiment, choose
-from bench.report.data.tuning import TUNING, Tuned, tuned
+from bench.report.data.tuning import SPACE, TUNING, Tuning, tunings, unfinished
 
 HEAD = """# @package _global_
 # Draw {draw} of {draws} of method/space/{method}: geometric mean of Chamfer x 1000 on {runs} validation runs
@@ -32,12 +32,18 @@ def write(results_dir: Path, folder: Path) -> list[str]:
     """Writes a file per method to the folder, and gives a line for each.
 
     Raises:
-        ValueError: where there are no runs of the tuning, or a method has no draw with all shapes.
+        ValueError: where runs of the tuning are missing, or have not ended.
     """
     experiment = choose(read_records(results_dir)[0], TUNING, results_dir)
-    found = tuned(experiment) if experiment is not None else []
-    if experiment is None or not found:
-        raise ValueError(f"{results_dir} has no complete runs: type python -m bench -m +experiment=tuning")
+    if experiment is None:
+        raise ValueError(f"{results_dir} has no runs of the tuning: type python -m bench -m +experiment=tuning")
+    if waiting := unfinished(experiment):
+        raise ValueError(
+            f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
+        )
+    found = tunings(experiment)
+    if not found:
+        raise ValueError("no draw has a run on every validation and test shape for every method: sweep over them all")
     folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for method in found:
@@ -48,17 +54,18 @@ def write(results_dir: Path, folder: Path) -> list[str]:
     return lines
 
 
-def _text(method: Tuned, experiment: Experiment) -> str:
+def _text(method: Tuning, experiment: Experiment) -> str:
     """The content of a method's file."""
-    records = [record for record in experiment.records if record["method"].endswith(method.method)]
+    records = [record for record in experiment.records if record["method"] == SPACE + method.method]
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
+    scores = method.validation.mean(axis=1)
     head = HEAD.format(
         draw=method.draws[method.best],
-        draws=len(method.settings),
+        draws=len(method.draws),
         method=method.method,
         runs=method.validation.shape[1],
-        best=number(np.exp(method.scores.min())),
-        middle=number(np.exp(np.median(method.scores))),
+        best=number(np.exp(scores[method.best])),
+        middle=number(np.exp(np.median(scores))),
         commit=" and ".join(sorted(commits)),
     )
     node = OmegaConf.create({"label": f"{method.label}, tuned"})

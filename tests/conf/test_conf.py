@@ -26,7 +26,8 @@ IDR_ARGUMENTS = {
     "mask_weight": 100.0,
     "sphere_radius": 1.0,
 }
-YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
+NESTED = sorted(("method", f"{path.parent.name}/{path.stem}") for path in CONF.glob("method/*/*.yaml"))
+YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml")) + NESTED
 GROUPS = [(group, name) for group, name in YAMLS if group != "experiment"]
 EXPERIMENTS = [name for group, name in YAMLS if group == "experiment" and not name.startswith("_")]
 SINGLE = {"completion_paper", "fitted"}  # of one run, and without a table or figure of their own
@@ -34,14 +35,16 @@ SINGLE = {"completion_paper", "fitted"}  # of one run, and without a table or fi
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
 COMPARING = {"table1": 12, "fig4": 6, "fig5": 7, "stability": 12, "gradients": 4, "speed_accuracy": 20}  # renderers
+COMPARING["crossing"] = 4
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
-CHOSEN = {"renderer", "dataset", "stress", "method"}  # groups that experiments sweep over
+CHOSEN = {"renderer", "dataset", "stress", "method", "silhouette"}  # groups that experiments sweep over
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 # What a choice needs on the command line.
 NEEDS = {
     "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
     "stability": ("stress=wires",),
+    **{name: ("draw=0",) for _, name in NESTED if name.startswith("space/")},
 }
 
 
@@ -60,7 +63,9 @@ def swept(name: str) -> dict[str, str]:
 
 
 def values_of(key: str, values: str) -> list[str]:
-    """The values of a swept key, in its own words or by a glob over its group."""
+    """The values of a swept key, in its own words, by a range or by a glob over its group."""
+    if found := re.fullmatch(r"range\((\d+),(\d+)\)", values):
+        return [str(value) for value in range(*map(int, found.groups()))]
     if not values.startswith("glob(*"):
         return values.split(",")
     return sorted(n for group, n in YAMLS if group == key.removeprefix("+") and f"exclude={n}" not in values)
@@ -88,7 +93,8 @@ def build_part(config: DictConfig, part: str):
 def test_no_yaml_lies_where_it_is_not_looked_for():
     assert {path.relative_to(CONF) for path in CONF.rglob("*.yaml")} == {
         path.relative_to(CONF)
-        for path in (*CONF.glob("*.yaml"), *CONF.glob("*/*.yaml"), *CONF.glob("hydra/launcher/*.yaml"))
+        for folder in (".", "*", "hydra/launcher", "method/space", "method/tuned")
+        for path in CONF.glob(f"{folder}/*.yaml")
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
     chosen = {"task", "renderer", "dataset", "prior", "scale", "silhouette", "stress", "tracker"}
@@ -137,6 +143,7 @@ def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
 def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
     rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
     method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
+    method += [f"draw={rows['draw']}"] if "draw" in rows else []
     key, _, value = swept.removeprefix("+").partition("=")
     config = compose_config(*method, *([swept] if key in CHOSEN else []), f"+experiment={name}")
     if key not in CHOSEN:  # a value of a key that is there, which is cheaper to set than to compose
@@ -149,8 +156,10 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
         assert config.dataset.name == value
     elif key == "stress":
         assert build_part(config, "task").stress.scene == OmegaConf.load(CONF / f"stress/{value}.yaml").scene
+    elif key == "silhouette":
+        assert config.task.silhouette == OmegaConf.load(CONF / f"silhouette/{value}.yaml")
     elif key in ("renderer", "method"):
-        alone = compose_config(swept)
+        alone = compose_config(swept, *NEEDS.get(value, ()))
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")
         if key == "method":

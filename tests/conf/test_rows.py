@@ -68,12 +68,15 @@ def rows(plan: sweep.Plan) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("experiment", "ours"), [("table1", 12), ("stability", 12), ("speed_completion", 20), ("speed_rendering", 20)]
+    ("experiment", "ours"),
+    [("table1", 12), ("stability", 12), ("speed_completion", 20), ("speed_rendering", 20), ("crossing", 4)],
 )
 def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_renderers(
     swept, tmp_path, package, experiment, ours
 ):
     few = {"stability": ["stress=thin_plate"], "table1": []}.get(experiment, ["dataset=sofa", "index=0"])
+    few += ["silhouette=hinge", "task.points=20"] if experiment == "crossing" else []
+    one_loss = ", DIST's mask loss" if experiment in ("stability", "speed_completion", "crossing") else ""
     plan, _ = swept(f"+experiment={experiment}", *few, f"packages=[{package}]", folder=tmp_path / "conf")
     first = ["mine_first"] if experiment == "table1" else []
     found = rows(plan)
@@ -82,9 +85,9 @@ def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_rend
     assert len(found) == len(plan.cells) == len(first) + ours + 2
     assert "custom" not in found and "mine_nowhere" not in found
     cells = {cell.renderer: cell for cell in plan.cells}
-    assert row_name(cells["mine"].config, "mine") == "mine"
-    assert row_name(cells["mine_on_dist"].config, "mine_on_dist") == "mine_on_dist"  # not the label of dist
-    assert row_name(cells["dist"].config, "dist") == "DIST, our default"
+    assert row_name(cells["mine"].config, "mine") == "mine" + one_loss
+    assert row_name(cells["mine_on_dist"].config, "mine_on_dist") == "mine_on_dist" + one_loss  # not dist's label
+    assert row_name(cells["dist"].config, "dist") == "DIST, our default" + one_loss
     under_another = cells["dist"].config | {"silhouette": {"_label_": "IDR's mask loss"}}
     assert row_name(under_another, "dist") == "DIST, our default, IDR's mask loss"
     made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])

@@ -45,6 +45,12 @@ def test_the_points_fill_the_cube_evenly():
         assert sorted((16 * points[:16, dimension]).astype(int)) == list(range(16))
 
 
+def test_no_two_settings_are_drawn_alike():
+    used = max(len(ranges(space)) for space in SPACES)
+    alike = np.abs(np.corrcoef(sobol_points()[:16, :used].T) - np.eye(used))
+    assert alike.max() < 0.1  # else the effect of the one would be taken for that of the other
+
+
 @pytest.mark.parametrize("space", SPACES)
 def test_a_space_has_its_own_dimension_for_each_setting_and_contains_the_default(space, composed):
     known = ranges(space)
@@ -52,7 +58,8 @@ def test_a_space_has_its_own_dimension_for_each_setting_and_contains_the_default
     assert "task.optimiser.learning_rate" in known and "task.silhouette_weight" in known
     default = composed(f"+method={space}")
     for key, (_, least, most) in known.items():
-        assert least <= OmegaConf.select(default, key) <= most, key
+        place = log(OmegaConf.select(default, key) / least) / log(most / least)
+        assert 0.35 <= place <= 0.65, key  # as many draws below as above it
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -65,15 +72,15 @@ def test_a_draw_is_its_sobol_point_even_in_the_logarithm(space, draw, composed):
         rounded = 0.5 / value if isinstance(value, int) else 0.005  # the most by which rounding changes a logarithm
         assert share == pytest.approx(sobol_points()[draw, dimension], abs=1.02 * rounded / log(most / least))
     build(config.renderer, "renderer")
-    assert f"draw {draw}" in config.label
+    assert config.label == composed(f"+method={space}").label
 
 
-def test_the_same_draw_is_the_same_share_of_each_range(composed):
-    shares = []
-    for space in SPACES:
-        config = composed(f"+method=space/{space}", "draw=3")
-        shares.append(config.task.optimiser.learning_rate)
-    assert len(set(shares)) == 1
+def test_settings_that_all_methods_have_get_the_same_values_in_a_draw(composed):
+    shared = set.intersection(*(set(ranges(space)) for space in SPACES))
+    assert shared == {"task.silhouette_weight", "task.code.weight", "task.optimiser.learning_rate"}
+    for key in shared:
+        assert len({ranges(space)[key] for space in SPACES}) == 1
+        assert len({OmegaConf.select(composed(f"+method=space/{space}", "draw=3"), key) for space in SPACES}) == 1
 
 
 @pytest.mark.parametrize("draw", ["null", "64", "-1"])
@@ -92,6 +99,6 @@ def test_a_range_that_is_none_is_refused(bad):
 
 def test_a_whole_range_gives_whole_numbers():
     register()
-    values = [OmegaConf.create({"draw": draw, "x": "${drawn:3,15,60}"}).x for draw in range(16)]
-    assert all(isinstance(value, int) and 15 <= value <= 60 for value in values) and len({*values}) > 8
-    assert np.ptp(values) > 30
+    values = [OmegaConf.create({"draw": draw, "x": "${drawn:3,25,100}"}).x for draw in range(16)]
+    assert all(isinstance(value, int) and 25 <= value <= 100 for value in values) and len({*values}) > 8
+    assert np.ptp(values) > 50

@@ -2,13 +2,13 @@
 
 import math
 
-import numpy as np
 import pytest
 
 from bench.records.read import read_records
+from bench.report.data.completions import EVERY
 from bench.report.data.crossing import CROSSING, Crossed
 from bench.report.data.experiments import choose
-from bench.report.pages import crossing
+from bench.report.pages import crossing, crossing_gaps
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
 RENDERERS = {"dist": ("renderers.DIST", "DIST"), "idr": ("renderers.IDR", "IDR")}
@@ -55,52 +55,56 @@ def line(result, **wanted):
 
 
 def test_all_runs_are_one_experiment_with_a_cell_per_setting(tmp_path):
-    runs = Crossed(crossed(tmp_path, shapes=2))
+    found = Crossed(crossed(tmp_path, shapes=2))
+    runs, rows = found.runs, found.rows
     assert (runs.families, runs.points) == (["sofa", "plane"], ["100", "20"])
-    assert (runs.renderers, runs.losses) == (["dist", "idr"], ["Hinge", "CrossEntropy"])
-    assert runs.own == {"dist": "Hinge", "idr": "CrossEntropy"}
-    assert runs.median("sofa", "100", "idr", "CrossEntropy") == pytest.approx(1.5 * 3 * 1.5)
-    assert runs.median("table", "100", "idr", "Hinge") is None
-    values = runs.over_points("idr", "Hinge")
+    assert (found.renderers, found.losses) == (["dist", "idr"], ["Hinge", "CrossEntropy"])
+    assert found.own == {"dist": "Hinge", "idr": "CrossEntropy"}
+    assert runs.median("sofa", rows["idr", "CrossEntropy"], "100") == pytest.approx(1.5 * 3 * 1.5)
+    assert runs.median("table", rows["idr", "Hinge"], "100") is None
+    values = runs.over_points(EVERY, rows["idr", "Hinge"])
     assert len(values) == 4 and values[("sofa", 0), 0, 0] == pytest.approx(1.5 * math.sqrt(2))
 
 
-def test_the_part_of_a_gap_that_is_the_loss(tmp_path):
-    result = crossing.make_gaps(crossed(tmp_path))
-    gap = line(result, family=crossing.EVERY)
+def test_a_gap_under_own_losses_is_the_renderers_times_the_losses(tmp_path):
+    result = crossing_gaps.make(crossed(tmp_path))
+    gap = line(result, family=EVERY)
     assert gap["compared"] == "IDR over DIST" and gap["shapes"] == 16
-    assert gap["own"] == pytest.approx(4.5)  # the methods' gap: the renderer's 1.5 times the loss's 3
+    assert gap["own"] == pytest.approx(4.5)  # the methods' gap
+    assert gap["renderer"] == pytest.approx(1.5) and gap["loss"] == pytest.approx(3)
     assert gap["Hinge"] == pytest.approx(1.5) and gap["CrossEntropy"] == pytest.approx(1.5)
-    assert gap["share"] == pytest.approx(1 - math.log(1.5) / math.log(4.5))
     assert gap["own_better"] == 0
     assert gap["own_low"] == pytest.approx(4.5) and gap["own_high"] == pytest.approx(4.5)  # the same on every shape
-    assert "IDR over DIST: 4.50 times the error under own losses, 1.50 times under one loss" in told(result)
-    assert "the loss is 73 % of the gap, over 16 shapes" in told(result)
-    assert "explains 88 %, the renderer 12 %, and what only both together explain is 0 %" in told(result)
+    said = "under its own loss: 4.50 [4.50, 4.50] times the error; of it the renderer 1.50 [1.50, 1.50], the loss 3.00"
+    assert said in told(result)
 
 
-def test_an_interaction_is_neither_the_renderers_nor_the_losses(tmp_path):
-    shares, count = Crossed(crossed(tmp_path, both=1 / 9)).shares()
-    # Means of logarithms: dist 0, log 3; idr log 1.5, log 1.5 - log 3: the two losses cancel.
-    assert count == 16 and shares["loss"] == pytest.approx(0, abs=1e-12)
-    renderer, both = (math.log(1.5) - math.log(3)) / 2, math.log(3) / 2
-    assert shares["renderer"] == pytest.approx(renderer**2 / (renderer**2 + both**2))
-    assert sum(shares.values()) == pytest.approx(1)
+def test_the_two_parts_make_the_gap_also_where_they_interact(tmp_path):
+    gap = line(crossing_gaps.make(crossed(tmp_path, both=1 / 9)), family="sofa")
+    assert gap["own"] == pytest.approx(0.5)
+    assert gap["renderer"] == pytest.approx(0.5) and gap["loss"] == pytest.approx(1)  # 1.5 and 1/6; 3 and 1/3
 
 
-def test_a_failure_is_infinite_and_leaves_its_shape_out_of_the_analysis(tmp_path):
-    runs = Crossed(experiment := crossed(tmp_path, families=("sofa",), failed={("sofa", 3, "idr", "Hinge")}))
-    assert runs.shares()[1] == 7
-    gap = line(crossing.make_gaps(experiment), family="sofa")
-    assert gap["Hinge"] == np.inf and gap["share"] is None
+def test_a_failure_has_the_largest_error_of_any_setting_on_its_shape(tmp_path):
+    experiment = crossed(tmp_path, families=("sofa",), failed={("sofa", 3, "idr", "Hinge")})
+    gap = line(crossing_gaps.make(experiment), family="sofa")
+    assert gap["Hinge"] == pytest.approx((1.5**7 * 4.5) ** (1 / 8)) and gap["shapes"] == 8
     table = crossing.make(experiment).table
-    assert table[(table["Renderer"] == "IDR") & (table["Loss of the mask"] == LOSSES["Hinge"])]["Failed"].item() == (
-        "2 of 16"
-    )
+    row = table[(table["Renderer"] == "IDR") & (table["Loss of the mask"] == LOSSES["Hinge"])]
+    assert row["Failed"].item() == "2 of 16"
+    both = crossed(tmp_path / "both", families=("sofa",), failed={("sofa", 3, "idr", x) for x in LOSSES})
+    gap = line(crossing_gaps.make(both), family="sofa")  # where both fail neither draws the ratio towards 1
+    assert gap["CrossEntropy"] == pytest.approx((1.5**7 * 1) ** (1 / 8))
+
+
+def test_an_infinite_error_is_not_on_the_front(tmp_path):
+    everywhere = {("sofa", index, "dist", loss) for index in range(8) for loss in LOSSES}
+    table = crossing.make_front(crossed(tmp_path, families=("sofa",), failed=everywhere)).table
+    assert set(table["Renderer"]) == {"IDR"} and set(table["On the front"]) == {"yes"}
 
 
 def test_losses_are_compared_with_each_renderer(tmp_path):
-    found = line(crossing.make_losses(crossed(tmp_path, both=2.0)), family="plane")
+    found = line(crossing_gaps.make_losses(crossed(tmp_path, both=2.0)), family="plane")
     assert found["compared"] == "IDR's mask loss over DIST's mask loss"
     assert (found["dist"], found["idr"]) == (pytest.approx(3), pytest.approx(6))
     assert (found["dist_better"], found["shapes"]) == (0, 8)
@@ -111,9 +115,9 @@ def test_a_renderer_without_a_known_loss_has_no_own_gap(tmp_path):
     for record in experiment.records:
         if record["renderer"] == "idr":
             record["config"]["renderer"]["_target_"] = "mine.Renderer"
-    gap = line(crossing.make_gaps(experiment), family="sofa")
+    gap = line(crossing_gaps.make(experiment), family="sofa")
     assert gap["Hinge"] == pytest.approx(1.5)
-    assert gap["share"] is None and "own" not in gap.dropna()
+    assert not {"own", "renderer", "loss"} & {*gap.dropna().index}
 
 
 def test_the_figure_has_a_panel_per_family_and_number_of_points(tmp_path):

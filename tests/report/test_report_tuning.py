@@ -9,34 +9,36 @@ from omegaconf import OmegaConf
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.data.tuning import TUNING, tuned
+from bench.report.data.tuning import TUNING, tunings
 from bench.report.pages import tuned as tuned_page
 from bench.report.pages import tuning
 from bench.tune.__main__ import main, write
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
+OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean over the first six is 1
 RATES = (0.04, 0.01, 0.03, 0.02)
 
 
-def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=()):
-    """Four draws of a method; the error of a shape is that of its draw."""
+def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0):
+    """Four draws of a method; the error of a shape is that of its draw times the shape's own."""
     for split, errors in (("validation", VALIDATION), ("test", TEST)):
         for draw, value in enumerate(errors):
-            for index in range(shapes):
-                ok = (split, draw, index) not in failed
-                if (split, draw, index) in left_out:
-                    continue
+            for index in (i for i in range(shapes) if (split, draw, i) not in left_out):
+                status = {**dict.fromkeys(failed, "empty"), **dict.fromkeys(killed, "killed")}.get((split, draw, index))
                 write_run(
                     results,
                     "tuning",
-                    f"DIST with mask, draw {draw}",
+                    "DIST with mask",
                     **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": f"space/{method}"},
-                    **{"status": "ok" if ok else "empty", "metrics": {"chamfer_l2": value / 1000} if ok else {}},
+                    status=status or "ok",
+                    metrics={} if status else {"chamfer_l2": scale * value * OWN[index] / 1000},
+                    evaluations={"value": 100 * (draw + 1)},
                     settings={
                         **{"split": split, "draw": draw, "index": index, "dataset": {"name": "sofa"}},
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
+                        "view": {"resolution": 64, "distance": 2 + draw},
                     },
                 )
 
@@ -47,27 +49,32 @@ def read(results):
 
 def test_the_best_is_chosen_on_validation_shapes(tmp_path):
     drawn(tmp_path)
-    (method,) = tuned(read(tmp_path))
+    (method,) = tunings(read(tmp_path))
     assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
     assert method.best == 1  # the last draw is better on the test shapes
-    assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
+    drawn_settings = {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11, "view.distance": 3}
+    assert method.settings[1] == drawn_settings  # whatever part of the configuration they are of
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_the_expected_error_is_the_mean_over_all_choices_of_draws(tmp_path, k):
     drawn(tmp_path)
-    (method,) = tuned(read(tmp_path))
+    (method,) = tunings(read(tmp_path))
     chosen = [min(some, key=lambda draw: VALIDATION[draw]) for some in combinations(range(4), k)]
     expected = math.exp(np.mean([math.log(TEST[draw]) for draw in chosen]))
     assert len(method.expected(k)) == 6
-    assert np.concatenate(method.expected(k)) == pytest.approx(expected)
+    assert np.concatenate(method.expected(k)) == pytest.approx(np.multiply(expected, OWN[:6]))
 
 
 def test_the_page_has_a_column_per_budget_and_an_effect_per_setting(tmp_path):
     drawn(tmp_path)
     result = tuning.make(read(tmp_path))
-    assert list(result.table.columns) == ["Method", "Best of 1", "Best of 2", "Best of 4", "Failed"]
-    assert result.table["Best of 4"].item().startswith("2.00 [2.00, 2.00]")
+    budgets = ["Best of 1", "Best of 2", "Best of 4"]
+    assert list(result.table.columns) == ["Method", *budgets, "Evaluations of the best", "Failed"]
+    assert result.table["Best of 4"].item().startswith("2.00 [")
+    assert result.table["Evaluations of the best"].item() == "200"
+    assert "n = 48 runs (12 shapes, 1 seed)" in result.caption  # six of each split
+    assert "have not ended" not in told(result)
     assert "Validation runs: 6 per draw; test runs: 6 per draw" in told(result)
     effects = tuning.make_settings(read(tmp_path)).data.set_index("setting")
     assert effects.loc["task.optimiser.learning_rate", "rho"] == pytest.approx(1)  # a smaller rate was better
@@ -75,19 +82,33 @@ def test_the_page_has_a_column_per_budget_and_an_effect_per_setting(tmp_path):
     assert effects.loc["renderer.steps", "chosen"] == 11
 
 
-def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
-    drawn(tmp_path, failed={("test", 1, 0), ("validation", 3, 2)})
-    (method,) = tuned(read(tmp_path))
-    assert method.test[1].tolist() == pytest.approx([math.log(9), *[math.log(2)] * 5])
-    assert method.validation[3, 2] == pytest.approx(math.log(4))
-    assert method.failures == [0, 1, 0, 1]
+def test_a_failure_counts_as_the_worst_error_of_its_shape_and_its_draw_ranks_behind(tmp_path):
+    drawn(tmp_path, failed={("test", 1, 0), ("validation", 1, 2)})
+    (method,) = tunings(read(tmp_path))
+    assert method.test[1].tolist() == pytest.approx(np.log([9, *np.multiply(2, OWN[1:6])]))
+    assert method.validation[1, 2] == pytest.approx(math.log(4 * 0.5))
+    assert method.failures.tolist() == [0, 1, 0, 0] and method.order.tolist() == [3, 2, 0, 1]
     assert tuning.make(read(tmp_path)).table["Failed"].item() == "2 of 48"
 
 
-def test_a_draw_without_all_of_its_runs_is_left_out(tmp_path):
-    drawn(tmp_path, left_out={("validation", 1, 5)})
-    (method,) = tuned(read(tmp_path))
+def test_runs_that_have_not_ended_are_missing_and_not_failed(tmp_path, capsys):
+    drawn(tmp_path, killed={("validation", 1, 5)})
+    (method,) = tunings(read(tmp_path))
     assert method.draws == [0, 2, 3] and method.draws[method.best] == 3
+    assert "1 planned runs have not ended" in told(tuning.make(read(tmp_path)))
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 1
+    assert "1 runs of the tuning have not ended" in capsys.readouterr().err
+    assert not (tmp_path / "tuned").exists()
+
+
+def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path):
+    drawn(tmp_path, left_out={("test", 2, 0)})
+    drawn(tmp_path, method="idr_mask", shapes=7, scale=10)
+    first, second = tunings(read(tmp_path))
+    assert first.draws == second.draws == [0, 1, 3]
+    assert first.test.shape == second.test.shape == (3, 6)
+    assert second.test == pytest.approx(first.test + math.log(10))
+    assert [(method.method, method.runs) for method in (first, second)] == [("dist_mask", 36), ("idr_mask", 36)]
 
 
 def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
@@ -99,16 +120,17 @@ def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
     assert text.startswith("# @package _global_\n# Draw 1 of 4 of method/space/dist_mask: geometric mean")
     assert "6 validation runs\n# 1.00, of the median draw 2.45" in text
     node = OmegaConf.load(path)
+    assert node.view == {"distance": 3}
     assert node.defaults == ["/method/dist_mask", "_self_"]
     assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
-    assert set(node) == {"defaults", "label", "task", "renderer"}
+    assert set(node) == {"defaults", "label", "task", "renderer", "view"}
 
 
 def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     assert main(["--results", str(tmp_path)]) == 1
     assert "type python -m bench -m +experiment=tuning" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="has no complete runs"):
+    with pytest.raises(ValueError, match="has no runs of the tuning"):
         write(tmp_path, tmp_path)
 
 

@@ -95,18 +95,18 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert "half a pixel is" in shown
 
 
-@pytest.mark.parametrize(("measure", "needs"), [("free", "grid_12"), ("stored", "network_1x64")])
+@pytest.mark.parametrize(("measure", "needs"), [("free", "grid_12"), ("stored", "network_1x320")])
 def test_a_real_fit_whose_choice_depends_on_the_measure(compose_config, tmp_path, measure, needs):
     """Both candidates are under half a pixel, which is wide here: a grid of 1,728 samples, of which few are fitted."""
-    ladder, few = "models.candidates=[grid_12,network_1x64]", ("task.checks.views=3", "task.checks.drawn=2")
+    ladder, few = "models.candidates=[grid_12,network_1x320]", ("task.checks.views=3", "task.checks.drawn=2")
     fits = ("models.fit.iterations=8", "models.fit.warm_iterations=150", "view.resolution=8")
     record = run(
         *(tmp_path, compose_config, "task=capacity", "dataset=sphere", ladder, f"models.size={measure}", *few, *fits)
     )
     metrics = record.metrics
     assert (record.status, metrics["recommended_field"], metrics["recommended_by"]) == ("ok", needs, measure)
-    assert metrics["grid_12.stored"] == 1728 == metrics["grid_12.bytes"] / 4 > metrics["network_1x64.stored"]
-    assert metrics["grid_12.free"] < metrics["network_1x64.free"] == metrics["network_1x64.stored"]
+    assert metrics["grid_12.stored"] == 1728 == metrics["grid_12.bytes"] / 4 > metrics["network_1x320.stored"]
+    assert metrics["grid_12.free"] < metrics["network_1x320.free"] == metrics["network_1x320.stored"]
     assert metrics["grid_12.sparse_bytes"] < metrics["grid_12.bytes"]
 
 

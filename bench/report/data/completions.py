@@ -1,4 +1,4 @@
-"""The runs of Table 2: their errors by family, row and number of points, and pairs of rows."""
+"""Runs that complete shapes: their errors by family, row and number of points, and pairs of rows."""
 
 import math
 from collections import Counter
@@ -7,10 +7,15 @@ import numpy as np
 
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Row, RunKey, by_shape, error, family, row_of, run_key, setting
-from bench.report.data.statistics import median
+from bench.report.data.statistics import geometric_mean, median
 
 TABLE2 = Selection("table2", ("completion", "deepsdf"), ("dataset", "task"), ("points",))
 POINTS = ("dense", "50%", "10%", "100", "50", "20")
+EVERY = "all families"
+FAILURE = (
+    "In geometric means a run that did not end ok has the largest finite error of any row on the same shape, seed and "
+    "number of points."
+)
 Cell = tuple[str, Row, str]  # family, row, points
 ERROR = (
     "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000. "
@@ -44,26 +49,39 @@ class Completions:
         """The median over shapes and seeds of a family, row and points; None where nothing was planned."""
         return float(median(list(self.errors[cell].values()))) if cell in self.errors else None
 
-    def over_points(self, name: str, row: Row) -> dict[RunKey, float]:
+    def over_points(self, name: str, row: Row, *, finite: bool = False) -> dict[RunKey, float]:
         """The geometric mean over all numbers of points for each shape and seed of a row; infinite where one failed.
 
-        A shape and seed that was not planned for every number of points of the family is left out.
+        Of one family, or of `EVERY`. With `finite` a failure counts as the largest finite error of any row on the same
+        shape, seed and number of points, so that geometric means over shapes can be compared. A shape and seed that was
+        not planned for every number of points of its family is left out.
         """
+        if name == EVERY:
+            parts = [self.over_points(each, row, finite=finite) for each in self.families]
+            return {run: value for part in parts for run, value in part.items()}
         wanted = [p for p in self.points if any((name, other, p) in self.errors for other in self.rows)]
         cells = [self.errors.get((name, row, p), {}) for p in wanted]
+        if finite:
+            cells = [self._scored(name, points, cell) for points, cell in zip(wanted, cells, strict=True)]
         runs = [run for run in cells[0] if all(run in cell for cell in cells)] if cells else []
-        return {run: float(np.exp(np.mean(np.log([cell[run] for cell in cells])))) for run in runs}
+        return {run: float(geometric_mean([cell[run] for cell in cells])) for run in runs}
 
-    def pair(self, name: str, row: Row, other: Row) -> list[list[np.ndarray]]:
-        """The values of `over_points` for two rows of a family, for the runs that both have, as an array per shape."""
-        mine, others = self.over_points(name, row), self.over_points(name, other)
+    def _scored(self, name: str, points: str, cell: dict[RunKey, float]) -> dict[RunKey, float]:
+        """The errors of a cell, in which a failure has the largest finite error of any row; infinite where all fail."""
+        alike = [self.errors.get((name, row, points), {}) for row in self.rows]
+        worst = {run: [e for errors in alike if math.isfinite(e := errors.get(run, math.inf))] for run in cell}
+        return {run: e if math.isfinite(e) else max(worst[run], default=e) for run, e in cell.items()}
+
+    def pair(self, name: str, row: Row, other: Row, *, finite: bool = False) -> list[list[np.ndarray]]:
+        """The values of `over_points` for two rows, for the runs that both have, as an array per shape."""
+        mine, others = (self.over_points(name, each, finite=finite) for each in (row, other))
         common = [run for run in mine if run in others]
         return [by_shape({run: errors[run] for run in common}) for errors in (mine, others)]
 
-    def all_errors(self, row: Row, name: str = "") -> dict[RunKey, float]:
-        """The errors of a row by shape, view, seed, family and points; of one family, or of all."""
+    def all_errors(self, name: str, row: Row) -> dict[RunKey, float]:
+        """The errors of a row by shape, view, seed, family and points; of one family, or of `EVERY`."""
         found = {(*cell, run): error for cell, errors in self.errors.items() for run, error in errors.items()}
-        mine = {key: error for key, error in found.items() if key[1] == row and name in ("", key[0])}
+        mine = {key: error for key, error in found.items() if key[1] == row and name in (EVERY, key[0])}
         return {(*run, of, points): error for (of, _, points, run), error in mine.items()}
 
     def failures(self, name: str, row: Row) -> tuple[int, int]:

@@ -136,8 +136,8 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ex
     if selection.varies:
         by_task = [[r for r in same if r["task"] == task] for task in selection.tasks]
         same = [r for runs in by_task for r in _like_newest(runs, lambda record: _seen(record, selection))]
-        newest = {(row_of(r), r["task"]): r for r in sorted(same, key=requested)}
-        same = [r for r in same if _variant(r, selection) == _variant(newest[row_of(r), r["task"]], selection)]
+        newest = {_row(r): r for r in sorted(same, key=requested)}
+        same = [r for r in same if _variant(r, selection) == _variant(newest[_row(r)], selection)]
         same.sort(key=started)
     rows: dict[Hashable, Record] = {}
     for record in same:
@@ -173,9 +173,14 @@ def _like_newest(records: list[Record], part: Callable[[Record], Any]) -> list[R
     return [record for record in records if part(record) == newest]
 
 
+def _row(record: Record) -> Hashable:
+    """What has one setting: a row, in a task, and of a search space a draw."""
+    return row_of(record), record["task"], record["config"].get("draw")
+
+
 def _key(record: Record, selection: Selection) -> Hashable:
     """The key that identifies a run within its experiment."""
-    key = (row_of(record), seed(record), index(record), str(sorted(_renderer(record).items())), record["task"])
+    key = (*_row(record), seed(record), index(record), str(sorted(_renderer(record).items())))
     key += (record["config"].get("split"),)
     cell = (str(setting(record["config"], "task", name)) for name in selection.cell)
     return (*key, family(record), *cell) if selection.varies else key

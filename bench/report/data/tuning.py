@@ -1,4 +1,7 @@
-"""The runs of the tuning: errors of methods' drawn settings on validation and test shapes, and the best of them."""
+"""The runs of the tuning: errors of methods' drawn settings on validation and test shapes, and the best of them.
+
+All methods are read on the same draws, shapes and seeds: those of which every method has a run that ended.
+"""
 
 import math
 from dataclasses import dataclass
@@ -7,30 +10,45 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from bench.records.record import NEUTRAL_KEYS, NOT_RUN
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, Record, RunKey, by_shape, error, run_key
+from bench.report.data.records import (
+    SCALE,
+    Record,
+    RunKey,
+    by_shape,
+    error,
+    grouped,
+    median_of_known,
+    run_key,
+    value_evaluations,
+)
 
 TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"), splits=True)
 SPACE = "space/"  # the folder of conf/method with the search spaces
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
-UNTUNED = ("label", "draw")  # keys that differ between draws and are no settings
-Errors = dict[int, dict[RunKey, float]]  # by draw, then by shape and seed
+OTHER = ("label", "draw", "index", "seed", "split")  # keys of the configuration that are no drawn settings
+UNFINISHED = (NOT_RUN, "killed")  # statuses of runs that say nothing of their draw
+Place = tuple[str, int, RunKey]  # split, draw, shape and seed
+Table = dict[Place, Record]
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """The draws of one method, in their order.
+class Tuning:
+    """The draws of one method.
 
     Args:
         method: the file of conf/method whose settings were drawn.
         label: its name for readers.
         draws: the numbers of the draws.
         settings: the drawn settings of each draw, by dotted key.
-        validation, test: the logarithms [draws, shapes and seeds] of errors. A failure has the largest finite error of
-            any draw of any method on its shape.
-        runs: the shapes and seeds of the columns of `test`.
-        failures: of each draw, on both kinds of shapes.
+        validation, test: the logarithms [draws, runs] of errors. A run that failed has the largest finite error of any
+            draw of any method on its shape and seed.
+        failures: the number of validation runs of each draw that failed.
+        failed, runs: how many runs failed, on both kinds of shapes, of how many.
+        test_runs: the shapes and seeds of the columns of `test`.
+        evaluations: the median number of field values of a run of each draw; None where none ended ok.
     """
 
     method: str
@@ -39,95 +57,119 @@ class Tuned:
     settings: list[dict[str, Any]]
     validation: np.ndarray
     test: np.ndarray
-    runs: list[RunKey]
-    failures: list[int]
+    failures: np.ndarray
+    failed: int
+    runs: int
+    test_runs: list[RunKey]
+    evaluations: list[float | None]
 
     @property
-    def scores(self) -> np.ndarray:
-        """The mean logarithmic error [draws] on the validation shapes, by which draws are chosen."""
-        return self.validation.mean(axis=1)
+    def order(self) -> np.ndarray:
+        """The draws from the best to the worst: by their failures, then by the mean logarithmic validation error."""
+        return np.lexsort((self.validation.mean(axis=1), self.failures))
 
     @property
     def best(self) -> int:
-        """The draw with the smallest geometric mean of errors on the validation shapes; of equal ones the first."""
-        return int(np.argmin(self.scores))
+        """The place of the best draw."""
+        return int(self.order[0])
 
     @property
     def budgets(self) -> list[int]:
         """The numbers of draws up to all of them."""
-        return [k for k in BUDGETS if k <= len(self.settings)]
+        return [k for k in BUDGETS if k <= len(self.draws)]
 
     def expected(self, k: int) -> list[np.ndarray]:
         """The expected test error if the best of k draws is taken, an array per shape with an entry per seed.
 
-        The expectation is over all choices of k of the draws, each equally likely (Dodge et al. 2019, "Show Your Work",
-        without replacement), and of the logarithm of the error.
+        The expectation is of the logarithm of the error, over all choices of k of the draws, each equally likely (Tang
+        et al. 2020, "Showing Your Work Doesn't Always Work", Eq. 3: without replacement).
         """
-        n = len(self.settings)
+        n = len(self.draws)
         weights = np.array([math.comb(n - place - 1, k - 1) for place in range(n)]) / math.comb(n, k)
-        errors = np.exp(weights @ self.test[np.argsort(self.scores, kind="stable")])
-        return by_shape(dict(zip(self.runs, errors.tolist(), strict=True)))
+        errors = np.exp(weights @ self.test[self.order])
+        return by_shape(dict(zip(self.test_runs, errors.tolist(), strict=True)))
 
     def effects(self) -> list[dict[str, Any]]:
         """A line per setting: its range, its chosen value, and its rank correlation with the validation error."""
-        lines = []
+        lines, scores = [], self.validation.mean(axis=1)
         for name in self.settings[0]:
             values = [settings[name] for settings in self.settings]
-            rho = stats.spearmanr(values, self.scores).statistic if len({*values}) > 1 and len(values) > 2 else math.nan
+            rho = stats.spearmanr(values, scores).statistic if len({*values}) > 1 and len(values) > 2 else math.nan
             ends = {"least": min(values), "most": max(values), "chosen": values[self.best]}
             lines.append({"setting": name, **ends, "rho": None if math.isnan(rho) else float(rho), "n": len(values)})
         return lines
 
 
-def tuned(experiment: Experiment) -> list[Tuned]:
-    """The methods of an experiment, with those draws that have every shape of both splits."""
-    errors: dict[str, dict[str, Errors]] = {}
-    records: dict[str, dict[int, Record]] = {}
-    failures: dict[tuple[str, int], int] = {}
-    for record in experiment.records:
-        method, draw, split = record["method"], record["config"]["draw"], record["config"]["split"]
-        found = errors.setdefault(method, {}).setdefault(split, {}).setdefault(draw, {})
-        found[run_key(record)] = SCALE * error(record, "chamfer_l2")
-        records.setdefault(method, {})[draw] = record
-        failures[method, draw] = failures.get((method, draw), 0) + (record["status"] != "ok")
-    worst = {split: _worst([of[split] for of in errors.values() if split in of]) for split in (VALIDATION, TEST)}
-    methods = []
-    for method, by_split in errors.items():
-        runs = {split: list(worst[split]) for split in worst}
-        draws = [draw for draw in sorted(records[method]) if all(_complete(by_split, s, draw, runs[s]) for s in runs)]
-        if draws:
-            logs = {split: _logs(by_split[split], draws, worst[split]) for split in worst}
-            label = str(records[method][draws[0]]["config"].get("label") or method).rpartition(", draw")[0] or method
-            settings = _settings([records[method][draw] for draw in draws])
-            failed = [failures[method, draw] for draw in draws]
-            name = method.removeprefix(SPACE)
-            methods.append(Tuned(name, label, draws, settings, logs[VALIDATION], logs[TEST], runs[TEST], failed))
-    return methods
+def unfinished(experiment: Experiment) -> int:
+    """The number of runs that were planned and have not ended."""
+    return sum(record["status"] in UNFINISHED for record in experiment.records)
 
 
-def _complete(by_split: dict[str, Errors], split: str, draw: int, runs: list[RunKey]) -> bool:
-    return bool(runs) and {*runs} <= {*by_split.get(split, {}).get(draw, {})}
+def tunings(experiment: Experiment) -> list[Tuning]:
+    """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none."""
+    ended = [record for record in experiment.records if record["status"] not in UNFINISHED]
+    by_method = grouped(ended, lambda record: record["method"])
+    tables = [{(_split(r), _draw(r), run_key(r)): r for r in records} for records in by_method.values()]
+    common = {*tables[0]}.intersection(*tables[1:]) if tables else set()
+    runs = {split: sorted({run for of, _, run in common if of == split}) for split in (VALIDATION, TEST)}
+    draws = sorted({draw for _, draw, _ in common})
+    draws = [draw for draw in draws if all((s, draw, run) in common for s in runs for run in runs[s])]
+    if not draws or not all(runs.values()):
+        return []
+    worst = {split: _worst(tables, split, draws, runs[split]) for split in runs}
+    return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
 
 
-def _worst(tables: list[Errors]) -> dict[RunKey, float]:
+def _tuning(method: str, table: Table, draws: list[int], worst: dict[str, dict[RunKey, float]]) -> Tuning:
+    used = {split: [[table[split, draw, run] for run in of] for draw in draws] for split, of in worst.items()}
+    logs = {
+        split: np.log(
+            [[min(_error(r), most) for r, most in zip(line, worst[split].values(), strict=True)] for line in of]
+        )
+        for split, of in used.items()
+    }
+    failed = {split: np.array([sum(r["status"] != "ok" for r in line) for line in of]) for split, of in used.items()}
+    spent = [used[VALIDATION][i] + used[TEST][i] for i in range(len(draws))]
+    first = spent[0][0]["config"]
+    return Tuning(
+        method=method.removeprefix(SPACE),
+        label=str(first.get("label") or method.removeprefix(SPACE)),
+        draws=draws,
+        settings=_settings([line[0] for line in used[VALIDATION]]),
+        validation=logs[VALIDATION],
+        test=logs[TEST],
+        failures=failed[VALIDATION],
+        failed=int(failed[VALIDATION].sum() + failed[TEST].sum()),
+        runs=sum(map(len, spent)),
+        test_runs=list(worst[TEST]),
+        evaluations=[median_of_known(value_evaluations(r) for r in line if r["status"] == "ok") for line in spent],
+    )
+
+
+def _split(record: Record) -> str:
+    return record["config"]["split"]
+
+
+def _draw(record: Record) -> int:
+    return record["config"]["draw"]
+
+
+def _error(record: Record) -> float:
+    return SCALE * error(record, "chamfer_l2")
+
+
+def _worst(tables: list[Table], split: str, draws: list[int], runs: list[RunKey]) -> dict[RunKey, float]:
     """The largest finite error on each shape and seed; 1 where there is none."""
-    found: dict[RunKey, list[float]] = {}
-    for run, value in ((run, e) for table in tables for errors in table.values() for run, e in errors.items()):
-        found.setdefault(run, []).append(value)
-    return {run: max((value for value in values if math.isfinite(value)), default=1.0) for run, values in found.items()}
-
-
-def _logs(errors: Errors, draws: list[int], worst: dict[RunKey, float]) -> np.ndarray:
-    return np.log([[min(errors[draw][run], largest) for run, largest in worst.items()] for draw in draws])
+    found = {run: [_error(table[split, draw, run]) for table in tables for draw in draws] for run in runs}
+    return {run: max((value for value in of if math.isfinite(value)), default=1.0) for run, of in found.items()}
 
 
 def _settings(records: list[Record]) -> list[dict[str, Any]]:
-    """The numbers in which the configurations of a method's draws differ, by dotted key."""
+    """The values in which the configurations of a method's draws differ, by dotted key."""
     flat = [dict(_flat(record["config"])) for record in records]
-    same = {"index", "seed", "split", *UNTUNED}
-    names = [name for name in flat[0] if len({str(each.get(name)) for each in flat}) > 1 and name not in same]
-    kept = [name for name in names if name.partition(".")[0] in ("task", "renderer")]
-    return [{name: each[name] for name in kept} for each in flat]
+    varies = [name for name in flat[0] if len({str(each.get(name)) for each in flat}) > 1]
+    names = [name for name in varies if name.partition(".")[0] not in {*OTHER, *NEUTRAL_KEYS}]
+    return [{name: each[name] for name in names} for each in flat]
 
 
 def _flat(node: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

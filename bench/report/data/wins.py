@@ -1,4 +1,4 @@
-"""Wins: for each pair of rows, on how many of the runs that both have the one is better than the other."""
+"""Rows against each other: on how many of the runs that both have the one is better, and the ratio of their errors."""
 
 import math
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ from bench.report.data import statistics
 from bench.report.data.records import Row, RunKey, by_shape
 from bench.report.data.statistics import Interval
 
+SEED = 0  # of the bootstrap
 NOTE = (
     "A cell is the number of pairs that the row to its left wins against the row above it, of how many, and below six "
     "shapes their number (n), else the probability that it wins, in per cent, with the interval of Clopper and Pearson "
@@ -56,9 +57,29 @@ def duel(first: Row, second: Row, errors: Mapping[Row, Mapping[RunKey, float]]) 
     mine, others = (by_shape({key: errors[row][key] for key in common}) for row in (first, second))
     if not common:
         return Duel(first, second, 0.0, 0, Interval(math.nan, math.nan, math.nan))
-    a, b = statistics.flat(mine), statistics.flat(others)
-    won = float(((a < b) + 0.5 * (a == b)).sum())
+    won = statistics.lower(statistics.flat(mine), statistics.flat(others))
     return Duel(first, second, won, len(common), statistics.wins(mine, others))
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The ratio of two rows' errors, and on how many of the shapes that both have the first is better, ties half."""
+
+    ratio: Interval
+    better: float
+    shapes: int
+
+    def __str__(self) -> str:
+        """The ratio with its interval, and the shapes."""
+        return f"{self.ratio}; {self.better:g} of {self.shapes}"
+
+
+def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
+    """The gap between two rows on the same shapes, by the geometric means of their errors; None without a shape."""
+    if not first:
+        return None
+    ratio = statistics.paired_bootstrap(first, second, statistics.geometric_mean, seed=SEED)
+    return Gap(ratio, statistics.lower(*map(statistics.shape_medians, (first, second))), len(first))
 
 
 def duels(errors: Mapping[Row, Mapping[RunKey, float]]) -> list[Duel]:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records.record import NOT_RUN
 from bench.report.data import statistics, wins
-from bench.report.data.completions import ERROR, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
+from bench.report.data.completions import ERROR, EVERY, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import LABEL, NOTE, oracles
 from bench.report.data.records import Row, RunKey, by_shape, grouped, iterations_of, row_of
@@ -156,7 +156,7 @@ def _panel(axis: Axes, runs: Completions, name: str) -> list[float]:
 def _points(runs: Completions, name: str, row: Row, points: str) -> statistics.Interval:
     """The medians of the shapes of a cell, to be drawn below six shapes."""
     shapes = by_shape(runs.errors.get((name, row, points), {}))
-    drawn = style.finite(map(_middle, shapes)) if len(shapes) < statistics.FEWEST_SHAPES else []
+    drawn = style.finite(statistics.shape_medians(shapes)) if len(shapes) < statistics.FEWEST_SHAPES else []
     return statistics.Interval(math.nan, math.nan, math.nan, tuple(drawn))
 
 
@@ -254,20 +254,14 @@ def _statistics(runs: Completions, cell: Cell, mean: statistics.Interval) -> dic
     }
 
 
-def _middle(group: Any) -> float:
-    """The median of a shape's runs."""
-    return float(statistics.median(statistics.flat([group])))
-
-
 def _tests(runs: Completions, reference: Row) -> list[str]:
     """A note for each row: whether it is better than the reference over the shapes of all families, Holm's p-value."""
     found: dict[str, float] = {}
     for row in runs.rows:
-        pairs = [runs.pair(name, row, reference) for name in runs.families]
-        first, second = ([group for pair in pairs for group in pair[side]] for side in (0, 1))
+        first, second = runs.pair(EVERY, row, reference)
         if row != reference and len(first) > 1:
-            won = sum(_middle(a) < _middle(b) for a, b in zip(first, second, strict=True))
-            better = f"{'better' if 2 * won > len(first) else 'no better'} ({won} of {len(first)} shapes)"
+            won = statistics.lower(*map(statistics.shape_medians, (first, second)))
+            better = f"{'better' if 2 * won > len(first) else 'no better'} ({won:g} of {len(first)} shapes)"
             found[f"{row.name} is {better} than {reference.name}"] = statistics.compare(first, second)
     adjusted = statistics.holm([*found.values()]) if found else []
     return [f"{test}: p = {p:.2g}" for test, p in zip(found, adjusted, strict=True)]
@@ -277,10 +271,10 @@ def make_wins(experiment: Experiment) -> Result:
     """Makes the page with the wins of each row against each other, all families together; the CSV has each family."""
     runs = Completions(experiment)
     of_family = {
-        name: wins.duels({row: runs.all_errors(row, name) for row in runs.rows}) for name in ("", *runs.families)
+        name: wins.duels({row: runs.all_errors(name, row) for row in runs.rows}) for name in (EVERY, *runs.families)
     }
-    pooled = of_family[""]
-    lines = [{"family": name or "all", **one.line} for name, found in of_family.items() for one in found if one.pairs]
+    pooled = of_family[EVERY]
+    lines = [{"family": name, **one.line} for name, found in of_family.items() for one in found if one.pairs]
     return Result(
         experiment,
         "Shape completion from one depth image, row against row.",

@@ -7,10 +7,8 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
-from bench.report.data.completions import ERROR
-from bench.report.data.crossing import geometric_mean
 from bench.report.data.experiments import Experiment
-from bench.report.data.tuning import TUNING, Tuned, tuned
+from bench.report.data.tuning import TUNING, Tuning, tunings, unfinished
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -36,9 +34,12 @@ NOTES = (
     "Every method has the same number of Sobol draws from its own search space (conf/method/space), even in the "
     "logarithm of each setting, and is judged on the same shapes; the draw with the smallest geometric mean of errors "
     "on the validation shapes is taken. The expectation is over all choices of so many of the draws.",
-    "A run that did not end ok has the largest finite error of any draw of any method on its shape. Validation runs: "
-    "{validation} per draw; test runs: {test} per draw.",
-    "The interval is over test shapes; another set of draws would add to it.",
+    "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000. "
+    "A run that did not end ok has the largest finite error of any draw of any method on its shape; of two draws that "
+    "with fewer failures is better. Validation runs: {validation} per draw; test runs: {test} per draw.",
+    "The interval is over test shapes, for these draws and this choice: other draws and other validation shapes would "
+    "add to it.",
+    "{waiting} planned runs have not ended: draws and shapes that some method lacks are left out.",
 )
 EFFECT_NOTES = (
     "ρ is Spearman's rank correlation between the setting and the geometric mean of errors on the validation shapes, "
@@ -68,43 +69,46 @@ Curve = dict[int, statistics.Interval]  # by the number of draws
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per method: the expected test error at each budget."""
-    methods = tuned(experiment)
+    methods = tunings(experiment)
     curves = {method.label: _curve(method) for method in methods}
     budgets = sorted({k for curve in curves.values() for k in curve})
     columns = [
         text("method", "Method"),
         *(Column(str(k), f"Best of {k}", words=lambda line, k=k: _words(line["curve"], k)) for k in budgets),
+        Column("evaluations", "Evaluations of the best", show=format.count),
         text("failed", "Failed"),
     ]
-    lines = [{"method": method.label, "curve": curves[method.label], "failed": _failed(method)} for method in methods]
-    sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].runs)} if methods else {}
+    lines = [
+        {"method": method.label, "curve": curves[method.label], "failed": f"{method.failed} of {method.runs}"}
+        | {"evaluations": method.evaluations[method.best]}
+        for method in methods
+    ]
+    waiting = unfinished(experiment)
+    sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].test_runs)} if methods else {}
+    notes = [note.format(waiting=waiting, **sizes) for note in (NOTES if waiting else NOTES[:-1])] if methods else []
     return Result(
         experiment,
         "What tuning is worth.",
         PLOTTED,
         interval="95 % bootstrap intervals over test {shapes and seeds}",
         estimates=[found for curve in curves.values() for found in curve.values()],
-        remarks=(ERROR, *(note.format(**sizes) for note in NOTES)) if methods else ("No draw has all of its runs.",),
+        remarks=notes or ("No draw has a run that ended on every shape, of every method.",),
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, lines),
         figure=draw(methods, curves),
     )
 
 
-def _curve(method: Tuned) -> Curve:
-    return {k: statistics.bootstrap(method.expected(k), geometric_mean, seed=SEED) for k in method.budgets}
+def _curve(method: Tuning) -> Curve:
+    return {k: statistics.bootstrap(method.expected(k), statistics.geometric_mean, seed=SEED) for k in method.budgets}
 
 
 def _words(curve: Curve, k: int) -> str:
     return str(curve[k]) if k in curve else format.MISSING
 
 
-def _failed(method: Tuned) -> str:
-    return f"{sum(method.failures)} of {len(method.draws) * (method.validation.shape[1] + len(method.runs))}"
-
-
 @style.styled
-def draw(methods: list[Tuned], curves: dict[str, Curve]) -> Figure:
+def draw(methods: list[Tuning], curves: dict[str, Curve]) -> Figure:
     """Draws a line per method: the expected test error over the number of draws."""
     figure, axes = chart.sheet(3.2, width=4.6)
     axis = axes[0, 0]
@@ -127,7 +131,7 @@ def draw(methods: list[Tuned], curves: dict[str, Curve]) -> Figure:
 def make_settings(experiment: Experiment) -> Result:
     """Makes the page of the settings, with a line per method and setting: its range, choice and effect."""
     lines: list[dict[str, Any]] = [
-        {"method": method.label} | effect for method in tuned(experiment) for effect in method.effects()
+        {"method": method.label} | effect for method in tunings(experiment) for effect in method.effects()
     ]
     return Result(
         experiment,

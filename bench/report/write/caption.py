@@ -78,7 +78,8 @@ def _sample(experiment: Experiment) -> str:
 def _levels(experiment: Experiment) -> tuple[int, int, int]:
     """The numbers of shapes, of views of a shape, and of seeds."""
     records = experiment.records
-    return tuple(len({part(record) for record in records}) for part in (solid, view, itemgetter("seed")))
+    shapes = {(solid(record), record["config"].get("split")) for record in records}
+    return len(shapes), *(len({part(record) for record in records}) for part in (view, itemgetter("seed")))
 
 
 def _setup(experiment: Experiment) -> str:
