@@ -38,7 +38,6 @@ def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), kill
                         **{"split": split, "draw": draw, "index": index, "dataset": {"name": "sofa"}},
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
-                        "view": {"resolution": 64, "distance": 2 + draw},
                     },
                 )
 
@@ -52,8 +51,7 @@ def test_the_best_is_chosen_on_validation_shapes(tmp_path):
     (method,) = tunings(read(tmp_path))
     assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
     assert method.best == 1  # the last draw is better on the test shapes
-    drawn_settings = {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11, "view.distance": 3}
-    assert method.settings[1] == drawn_settings  # whatever part of the configuration they are of
+    assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
@@ -120,10 +118,9 @@ def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
     assert text.startswith("# @package _global_\n# Draw 1 of 4 of method/space/dist_mask: geometric mean")
     assert "6 validation runs\n# 1.00, of the median draw 2.45" in text
     node = OmegaConf.load(path)
-    assert node.view == {"distance": 3}
     assert node.defaults == ["/method/dist_mask", "_self_"]
     assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
-    assert set(node) == {"defaults", "label", "task", "renderer", "view"}
+    assert set(node) == {"defaults", "label", "task", "renderer"}
 
 
 def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):

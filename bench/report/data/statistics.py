@@ -107,9 +107,9 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, level: float =
 
     A draw takes shapes with replacement, of each drawn shape views with replacement, and of each drawn view seeds with
     replacement (Davison and Hinkley 1997, Sec. 3.8). The percentiles are widened for few shapes (Hesterberg 2015, "What
-    teachers should know about the bootstrap": expanded percentile interval). The interval covers 93 % or more with six
-    shapes or more; where seeds vary as much as shapes it is too wide (covers 99 %), as their spread enters at each
-    stage.
+    teachers should know about the bootstrap": expanded percentile interval). The interval covers 95 % or more with six
+    shapes or more, of interquartile means and medians of errors; where seeds vary as much as shapes it is too wide
+    (covers 99 %), as their spread enters at each stage.
 
     Args:
         statistic: reduces the last axis. It gets the runs of all shapes together: a shape with more runs weighs more.
@@ -119,6 +119,46 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, level: float =
     """
     (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
     return _interval(value, drawn, points[0], level)
+
+
+def geometric(groups: Groups, *, level: float = 0.95) -> Interval:
+    """The geometric mean over shapes of those of their runs, with Student's interval of the mean logarithm over shapes.
+
+    The bootstrap's interval of it covers 93.5 % with six shapes, this one 95 %.
+
+    Returns:
+        nan ends below `FEWEST_SHAPES`, and where a value is 0 or infinite.
+    """
+    return _of_logarithms(np.array([np.mean(_logs(group)) for group in groups]), level)
+
+
+def geometric_ratio(first: Groups, second: Groups, *, level: float = 0.95) -> Interval:
+    """The ratio of two geometric means over the same shapes, with Student's interval of the shapes' ratios.
+
+    See `geometric`.
+
+    Raises:
+        ValueError: the two do not have the same shapes with the same numbers of views and seeds.
+    """
+    if _sizes(first) != _sizes(second):
+        raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
+    pairs = zip(first, second, strict=True)
+    return _of_logarithms(np.array([np.mean(_logs(a)) - np.mean(_logs(b)) for a, b in pairs]), level)
+
+
+def _logs(group: Any) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.log(_checked(flat([group])))
+
+
+def _of_logarithms(logs: np.ndarray, level: float) -> Interval:
+    """The exponential of the mean of the shapes' logarithms, with its interval."""
+    n, points = len(logs), tuple(np.exp(logs).tolist())
+    middle = float(np.mean(logs))
+    if n < FEWEST_SHAPES or not np.isfinite(logs).all():
+        return Interval(math.exp(middle) if middle < math.inf else middle, math.nan, math.nan, points)
+    half = float(stats.t.ppf((1 + level) / 2, n - 1) * np.std(logs, ddof=1) / math.sqrt(n))
+    return Interval(*(math.exp(middle + side * half) for side in (0, -1, 1)), points)
 
 
 def paired_bootstrap(

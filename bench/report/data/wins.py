@@ -12,7 +12,6 @@ from bench.report.data import statistics
 from bench.report.data.records import Row, RunKey, by_shape
 from bench.report.data.statistics import Interval
 
-SEED = 0  # of the bootstrap
 NOTE = (
     "A cell is the number of pairs that the row to its left wins against the row above it, of how many, and below six "
     "shapes their number (n), else the probability that it wins, in per cent, with the interval of Clopper and Pearson "
@@ -78,8 +77,11 @@ def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
     """The gap between two rows on the same shapes, by the geometric means of their errors; None without a shape."""
     if not first:
         return None
-    ratio = statistics.paired_bootstrap(first, second, statistics.geometric_mean, seed=SEED)
-    return Gap(ratio, statistics.lower(*map(statistics.shape_medians, (first, second))), len(first))
+    return Gap(
+        statistics.geometric_ratio(first, second),
+        statistics.lower(*map(statistics.shape_medians, (first, second))),
+        len(first),
+    )
 
 
 def duels(errors: Mapping[Row, Mapping[RunKey, float]]) -> list[Duel]:

@@ -21,7 +21,6 @@ from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured,
 PLACE = 32
 PLACE_FRONT = 35
 READS = (CROSSING,)
-SEED = 0  # of the bootstrap
 NOTES = (
     "Every renderer has every loss, with the numbers of conf/silhouette, the same weight of the task and the same "
     "settings otherwise. Under its own paper's loss: {own}.",
@@ -110,7 +109,7 @@ def make_front(experiment: Experiment) -> Result:
         experiment,
         "Error over cost, under one loss at a time.",
         "Geometric mean of the errors of all shapes and numbers of points over the median number of a run's values.",
-        interval="95 % bootstrap intervals over {shapes and seeds}",
+        interval="95 % intervals over shapes (Student's, of logarithms)",
         estimates=[line["error"] for line in lines],
         remarks=(
             ERROR,
@@ -130,7 +129,7 @@ def _placed(crossed: Crossed, loss: str) -> list[dict[str, Any]]:
         errors = by_shape(crossed.runs.over_points(EVERY, crossed.rows[key], finite=True))
         cost = crossed.cost(key)
         if errors and cost is not None:
-            found = statistics.bootstrap(errors, statistics.geometric_mean, seed=SEED)
+            found = statistics.geometric(errors)
             names = {"preset": key[0], "renderer": crossed.labels[key[0]], "loss": crossed.labels[loss]}
             lines.append(names | {"error": found, "evaluations": cost})
     costs, values = [line["evaluations"] for line in lines], [line["error"].value for line in lines]

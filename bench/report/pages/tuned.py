@@ -50,7 +50,7 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Methods as they stand, tuned, and at their papers' settings.",
         "Median error at each number of given depth points; in the figure, the geometric mean of all errors over cost.",
-        interval="95 % bootstrap intervals of the ratios over {shapes and seeds}",
+        interval="95 % intervals of the ratios over shapes (Student's, of logarithms)",
         estimates=[line["gap"].ratio for line in lines if line["gap"] is not None],
         remarks=(ERROR, FAILURE, shapes_per_cell(runs), *NOTES),
         data=to_data(RUNS, experiment.records),

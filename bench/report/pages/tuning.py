@@ -28,7 +28,6 @@ from bench.report.write.table import (
 PLACE = 36
 PLACE_SETTINGS = 37
 READS = (TUNING,)
-SEED = 0  # of the bootstrap
 PLOTTED = "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken."
 NOTES = (
     "Every method has the same number of Sobol draws from its own search space (conf/method/space), even in the "
@@ -90,7 +89,7 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "What tuning is worth.",
         PLOTTED,
-        interval="95 % bootstrap intervals over test {shapes and seeds}",
+        interval="95 % intervals over test shapes (Student's, of logarithms)",
         estimates=[found for curve in curves.values() for found in curve.values()],
         remarks=notes or ("No draw has a run that ended on every shape, of every method.",),
         data=to_data(RUNS, experiment.records),
@@ -100,7 +99,7 @@ def make(experiment: Experiment) -> Result:
 
 
 def _curve(method: Tuning) -> Curve:
-    return {k: statistics.bootstrap(method.expected(k), statistics.geometric_mean, seed=SEED) for k in method.budgets}
+    return {k: statistics.geometric(method.expected(k)) for k in method.budgets}
 
 
 def _words(curve: Curve, k: int) -> str:
