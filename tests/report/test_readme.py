@@ -1,6 +1,7 @@
 """README files show the numbers of `results/paper`, and no others."""
 
 import csv
+import html
 import re
 import shutil
 from pathlib import Path
@@ -33,6 +34,14 @@ def test_the_results_page_follows_its_tables(tmp_path):
     text = write_readme(tmp_path).read_text()
     assert "- [Mine](#mine)" in text and "Of one run." in text and ["x", "1.5"] in rows(text)
     assert re.search(r"<details><summary>Notes</summary>\n\n- A note\n\n</details>", text)
+
+
+def test_readme_quotes_what_results_say():
+    quoted = [
+        line.removeprefix("> ").strip() for line in (ROOT / "README.md").read_text().splitlines() if line[:2] == "> "
+    ]
+    said = " ".join(html.unescape(path.read_text()) for path in PAPER.glob("*.md"))
+    assert quoted and [text for text in quoted if text not in said] == []
 
 
 @pytest.mark.parametrize("line", range(12))

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from bench.records.read import read_records
@@ -97,7 +98,15 @@ def test_a_failure_has_the_largest_error_of_any_setting_on_its_shape(tmp_path):
     assert gap["CrossEntropy"] == pytest.approx((1.5**7 * 1) ** (1 / 8))
 
 
-def test_an_infinite_error_is_not_on_the_front(tmp_path):
+def test_a_shape_on_which_every_setting_fails_is_left_out(tmp_path):
+    everywhere = {("sofa", 3, renderer, loss) for renderer in RENDERERS for loss in LOSSES}
+    experiment = crossed(tmp_path, families=("sofa",), failed=everywhere)
+    assert line(crossing_gaps.make(experiment), family="sofa")["shapes"] == 7
+    data = crossing.make_front(experiment).data
+    assert np.isfinite(data[["error", "low", "high"]].to_numpy(float)).all()
+
+
+def test_a_renderer_without_a_run_that_ended_ok_is_not_on_the_front(tmp_path):
     everywhere = {("sofa", index, "dist", loss) for index in range(8) for loss in LOSSES}
     table = crossing.make_front(crossed(tmp_path, families=("sofa",), failed=everywhere)).table
     assert set(table["Renderer"]) == {"IDR"} and set(table["On the front"]) == {"yes"}

@@ -15,6 +15,8 @@ from bench.report.data.statistics import (
     compare,
     dominated,
     front,
+    geometric,
+    geometric_ratio,
     holm,
     hypervolume,
     hypervolume_interval,
@@ -434,3 +436,23 @@ def test_hypervolume_interval_is_that_of_the_median():
     )
     failed = [point((1,) * 6, (INF,) * 6)]
     assert hypervolume_interval(failed, reference=(100, 1), seed=3) == Interval(0, 0, 0)
+
+
+def test_the_interval_of_a_geometric_mean_is_students_over_the_shapes():
+    errors = [np.array([1.0, 4.0]), *(np.array([e]) for e in (1.0, 2.0, 4.0, 8.0, 16.0))]
+    found = geometric(errors)
+    logs = np.log([2.0, 1.0, 2.0, 4.0, 8.0, 16.0])
+    ends = stats.t.interval(0.95, 5, logs.mean(), stats.sem(logs))
+    assert found.value == pytest.approx(np.exp(logs.mean()))
+    assert (found.low, found.high) == pytest.approx(tuple(np.exp(ends)))
+    assert not geometric(errors[:5]).known
+    assert geometric([*errors, np.array([math.inf])]).value == math.inf
+
+
+def test_the_ratio_of_geometric_means_is_paired_by_shape():
+    first = [np.array([e]) for e in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
+    found = geometric_ratio([3 * e for e in first], first)
+    assert (found.value, found.low, found.high) == pytest.approx((3.0, 3.0, 3.0))
+    assert found.points == pytest.approx((3.0,) * 6)
+    with pytest.raises(ValueError, match="must have the same shapes"):
+        geometric_ratio(first, first[:5])

@@ -14,7 +14,7 @@ POINTS = ("dense", "50%", "10%", "100", "50", "20")
 EVERY = "all families"
 FAILURE = (
     "In geometric means a run that did not end ok has the largest finite error of any row on the same shape, seed and "
-    "number of points."
+    "number of points; a shape on which every row failed is left out."
 )
 Cell = tuple[str, Row, str]  # family, row, points
 ERROR = (
@@ -53,8 +53,8 @@ class Completions:
         """The geometric mean over all numbers of points for each shape and seed of a row; infinite where one failed.
 
         Of one family, or of `EVERY`. With `finite` a failure counts as the largest finite error of any row on the same
-        shape, seed and number of points, so that geometric means over shapes can be compared. A shape and seed that was
-        not planned for every number of points of its family is left out.
+        shape, seed and number of points, so that geometric means over shapes can be compared; where every row failed it
+        is left out. So is a shape and seed that was not planned for every number of points of its family.
         """
         if name == EVERY:
             parts = [self.over_points(each, row, finite=finite) for each in self.families]
@@ -64,7 +64,8 @@ class Completions:
         if finite:
             cells = [self._scored(name, points, cell) for points, cell in zip(wanted, cells, strict=True)]
         runs = [run for run in cells[0] if all(run in cell for cell in cells)] if cells else []
-        return {run: float(geometric_mean([cell[run] for cell in cells])) for run in runs}
+        means = {run: float(geometric_mean([cell[run] for cell in cells])) for run in runs}
+        return {run: mean for run, mean in means.items() if not finite or math.isfinite(mean)}
 
     def _scored(self, name: str, points: str, cell: dict[RunKey, float]) -> dict[RunKey, float]:
         """The errors of a cell, in which a failure has the largest finite error of any row; infinite where all fail."""

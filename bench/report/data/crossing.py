@@ -1,7 +1,5 @@
 """The runs of the crossing: errors of every renderer under every loss of the mask."""
 
-import math
-
 from bench.report.data.completions import Completions
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
@@ -65,8 +63,7 @@ class Crossed:
         if not {*first, *second} <= {*self.rows}:
             return None
         tables = {key: self.runs.over_points(name, self.rows[key], finite=True) for key in (*first, *second)}
-        finite = [{run for run, value in table.items() if math.isfinite(value)} for table in tables.values()]
-        common = [run for run in tables[first[0]] if all(run in known for known in finite)]
+        common = [run for run in tables[first[0]] if all(run in table for table in tables.values())]
         means = (
             {run: geometric_mean([tables[key][run] for key in keys]) for run in common} for keys in (first, second)
         )
