@@ -78,6 +78,10 @@ def test_a_gap_under_own_losses_is_the_renderers_times_the_losses(tmp_path):
     assert gap["own_low"] == pytest.approx(4.5) and gap["own_high"] == pytest.approx(4.5)  # the same on every shape
     said = "under its own loss: 4.50 [4.50, 4.50] times the error; of it the renderer 1.50 [1.50, 1.50], the loss 3.00"
     assert said in told(result)
+    one_loss = (
+        "Under one loss, of 2 ratios over all families 2 have an interval without 1: IDR over DIST under DIST's mask"
+    )
+    assert one_loss in told(result)
 
 
 def test_the_two_parts_make_the_gap_also_where_they_interact(tmp_path):

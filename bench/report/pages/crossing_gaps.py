@@ -34,14 +34,15 @@ def make(experiment: Experiment) -> Result:
     pairs = [(renderer, REFERENCE) for renderer in others if REFERENCE in crossed.renderers]
     lines = [_of_renderers(crossed, *pair, name) for pair in pairs for name in (EVERY, *crossed.runs.families)]
     compared = {OWN: "Own losses", RENDERER: "of it the renderer", LOSS: "of it the loss"}
-    compared |= {loss: crossed.labels[loss] for loss in crossed.losses}
+    losses = {loss: crossed.labels[loss] for loss in crossed.losses}
+    compared |= losses
     return Result(
         experiment,
         "Which part of a gap between renderers is their loss of the mask.",
         "Ratio of two renderers' errors, each under its own paper's loss and both under one.",
         interval="95 % intervals over shapes (Student's, of logarithms)",
         estimates=_ratios(lines, compared),
-        remarks=(*_verdicts(lines), RATIO, PARTS, *LOSSES, ERROR, FAILURE),
+        remarks=(*_verdicts(lines, losses), RATIO, PARTS, *LOSSES, ERROR, FAILURE),
         data=to_data(_columns(compared), lines),
         table=to_table(_columns(compared), lines),
     )
@@ -107,11 +108,24 @@ def _ratios(lines: list[Line], compared: dict[str, str]) -> list[Any]:
     return [line[key].ratio for line in lines for key in compared if line[key] is not None]
 
 
-def _verdicts(lines: list[Line]) -> list[str]:
-    """What the gaps over all families say, a sentence for each pair of renderers that both have a loss of their own."""
-    return [
+def _verdicts(lines: list[Line], losses: dict[str, str]) -> list[str]:
+    """What the gaps over all families say: of renderers that both have a loss of their own, and under one loss."""
+    pooled = [line for line in lines if line["family"] == EVERY]
+    own = [
         f"{line['compared']}, each under its own loss: {line[OWN].ratio} times the error; of it the renderer "
         f"{line[RENDERER].ratio}, the loss {line[LOSS].ratio}."
-        for line in lines
-        if line["family"] == EVERY and line[OWN] is not None and line[LOSS] is not None
+        for line in pooled
+        if line[OWN] is not None and line[LOSS] is not None
     ]
+    under_one = {
+        f"{line['compared']} under {label}, {line[loss].ratio}": line[loss].ratio
+        for line in pooled
+        for loss, label in losses.items()
+        if line[loss] is not None and line[loss].ratio.known
+    }
+    sure = [name for name, ratio in under_one.items() if not ratio.low <= 1 <= ratio.high]
+    named = f": {'; '.join(sure)}" if sure else ""
+    said = (
+        f"Under one loss, of {len(under_one)} ratios over all families {len(sure)} have an interval without 1{named}."
+    )
+    return [*own, said] if under_one else own
