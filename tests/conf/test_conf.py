@@ -143,9 +143,9 @@ def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
 def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
     rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
     method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
-    method += [f"draw={rows['draw']}"] if "draw" in rows else []
+    draw = [f"draw={rows['draw']}"] if "draw" in rows else []
     key, _, value = swept.removeprefix("+").partition("=")
-    config = compose_config(*method, *([swept] if key in CHOSEN else []), f"+experiment={name}")
+    config = compose_config(*method, *draw, *([swept] if key in CHOSEN else []), f"+experiment={name}")
     if key not in CHOSEN:  # a value of a key that is there, which is cheaper to set than to compose
         OmegaConf.update(config, key, yaml.safe_load(value), force_add=False)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -159,7 +159,7 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
     elif key == "silhouette":
         assert config.task.silhouette == OmegaConf.load(CONF / f"silhouette/{value}.yaml")
     elif key in ("renderer", "method"):
-        alone = compose_config(swept, *NEEDS.get(value, ()))
+        alone = compose_config(swept, *draw)
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")
         if key == "method":

@@ -95,6 +95,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert "half a pixel is" in shown
 
 
+@pytest.mark.slow  # tests/models/test_sizes.py has the same choice by given errors
 @pytest.mark.parametrize(("measure", "needs"), [("free", "grid_12"), ("stored", "network_1x320")])
 def test_a_real_fit_whose_choice_depends_on_the_measure(compose_config, tmp_path, measure, needs):
     """Both candidates are under half a pixel, which is wide here: a grid of 1,728 samples, of which few are fitted."""
@@ -107,7 +108,6 @@ def test_a_real_fit_whose_choice_depends_on_the_measure(compose_config, tmp_path
     assert (record.status, metrics["recommended_field"], metrics["recommended_by"]) == ("ok", needs, measure)
     assert metrics["grid_12.stored"] == 1728 == metrics["grid_12.bytes"] / 4 > metrics["network_1x320.stored"]
     assert metrics["grid_12.free"] < metrics["network_1x320.free"] == metrics["network_1x320.stored"]
-    assert metrics["grid_12.sparse_bytes"] < metrics["grid_12.bytes"]
 
 
 def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
