@@ -105,7 +105,7 @@ def test_ratios(size, simulations):
     assert simulated(one, simulations) >= LEAST
 
 
-@pytest.mark.parametrize("size", [*SIZES, (32, 1)], ids=str)
+@pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("tails", [math.inf, 4])  # degrees of freedom of the shapes' logarithms: normal, and heavy
 def test_geometric_means(size, tails):
     def one(generator, _):
@@ -116,7 +116,7 @@ def test_geometric_means(size, tails):
     assert simulated(one, 3000) >= LEAST
 
 
-@pytest.mark.parametrize("size", [(6, 1), (8, 2), (32, 1)], ids=str)
+@pytest.mark.parametrize("size", [(6, 1), (8, 2)], ids=str)
 def test_ratios_of_geometric_means(size):
     def one(generator, _):
         shapes, noise = generator.normal(size=(size[0], 1)), 0.5 * generator.normal(size=(2, *size))
