@@ -16,7 +16,6 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
@@ -92,16 +91,16 @@ def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> 
         raise ValueError(
             f"${{drawn:{dimension},{least},{most}}} must have a dimension from 0 to {DIMENSIONS - 1} and ends above 0"
         )
-    value = least * (most / least) ** float(sobol_points()[draw, dimension])
+    value = least * (most / least) ** sobol_points()[draw][dimension]
     return round(value) if isinstance(least, int) and isinstance(most, int) else float(f"{value:.3g}")
 
 
 @cache
-def sobol_points() -> np.ndarray:
+def sobol_points() -> list[list[float]]:
     """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
     from scipy.stats import qmc  # only here: it takes a second
 
-    return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS)
+    return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS).tolist()
 
 
 def _renderers(runtime: DictConfig) -> dict[str, Path]:

@@ -144,7 +144,7 @@ MUTANTS = (
       "tests/report/test_report_crossing.py"),
     M("bench/report/data/completions.py", "max(worst[run], default=e)", "min(worst[run], default=e)",
       "tests/report/test_report_crossing.py"),
-    M("bench/report/data/tuning.py", "np.lexsort((self.validation.mean(axis=1), self.failures))",
+    M("bench/report/data/tuning.py", "np.lexsort((self.scores, self.failures))",
       "np.argsort(self.test.mean(axis=1))", "tests/report/test_report_tuning.py"),
     M("bench/report/data/tuning.py", "math.comb(n - place - 1, k - 1)", "math.comb(n - place, k)",
       "tests/report/test_report_tuning.py"),

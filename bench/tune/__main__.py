@@ -58,14 +58,13 @@ def _text(method: Tuning, experiment: Experiment) -> str:
     """The content of a method's file."""
     records = [record for record in experiment.records if record["method"] == SPACE + method.method]
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
-    scores = method.validation.mean(axis=1)
     head = HEAD.format(
         draw=method.draws[method.best],
         draws=len(method.draws),
         method=method.method,
         runs=method.validation.shape[1],
-        best=number(np.exp(scores[method.best])),
-        middle=number(np.exp(np.median(scores))),
+        best=number(np.exp(method.scores[method.best])),
+        middle=number(np.exp(np.median(method.scores))),
         commit=" and ".join(sorted(commits)),
     )
     node = OmegaConf.create({"label": f"{method.label}, tuned"})

@@ -39,7 +39,7 @@ def ranges(space: str) -> dict[str, tuple[int, float, float]]:
 
 
 def test_the_points_fill_the_cube_evenly():
-    points = sobol_points()
+    points = np.array(sobol_points())
     assert points.shape == (DRAWS, DIMENSIONS)
     for dimension in range(DIMENSIONS):  # a point in each sixteenth, also of the first sixteen alone
         assert sorted((16 * points[:16, dimension]).astype(int)) == list(range(16))
@@ -47,7 +47,7 @@ def test_the_points_fill_the_cube_evenly():
 
 def test_no_two_settings_are_drawn_alike():
     used = max(len(ranges(space)) for space in SPACES)
-    alike = np.abs(np.corrcoef(sobol_points()[:16, :used].T) - np.eye(used))
+    alike = np.abs(np.corrcoef(np.array(sobol_points())[:16, :used].T) - np.eye(used))
     assert alike.max() < 0.1  # else the effect of the one would be taken for that of the other
 
 
@@ -70,7 +70,7 @@ def test_a_draw_is_its_sobol_point_even_in_the_logarithm(space, draw, composed):
         value = OmegaConf.select(config, key)
         share = log(value / least) / log(most / least)
         rounded = 0.5 / value if isinstance(value, int) else 0.005  # the most by which rounding changes a logarithm
-        assert share == pytest.approx(sobol_points()[draw, dimension], abs=1.02 * rounded / log(most / least))
+        assert share == pytest.approx(np.array(sobol_points())[draw, dimension], abs=1.02 * rounded / log(most / least))
     build(config.renderer, "renderer")
     assert config.label == composed(f"+method={space}").label
 

@@ -17,10 +17,10 @@ FAILURE = (
     "number of points; a shape on which every row failed is left out."
 )
 Cell = tuple[str, Row, str]  # family, row, points
-ERROR = (
-    "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000. "
-    "A run that did not end ok, or was planned and not run, counts as infinite."
+CHAMFER = (
+    "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000."
 )
+ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
 
 
 class Completions:

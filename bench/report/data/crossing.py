@@ -17,8 +17,10 @@ from bench.report.data.wins import Gap, gap
 
 CROSSING = Selection("crossing", ("completion",), ("dataset", "task", "silhouette"), ("points",))
 OWN = {  # the loss of each renderer's paper; the naive one has that of DIST
-    **{"renderers.DIST": "Hinge", "renderers.Naive": "Hinge"},
-    **{"renderers.IDR": "CrossEntropy", "renderers.DVR": "Occupancy"},
+    "renderers.DIST": "Hinge",
+    "renderers.IDR": "CrossEntropy",
+    "renderers.DVR": "Occupancy",
+    "renderers.Naive": "Hinge",
 }
 LOSSES = (
     "Losses have the numbers of conf/silhouette: DIST's weight 1, IDR's 100 and sharpness 50, as printed, and DVR's 3, "

@@ -64,9 +64,14 @@ class Tuning:
     evaluations: list[float | None]
 
     @property
+    def scores(self) -> np.ndarray:
+        """The mean logarithmic error [draws] on the validation shapes."""
+        return self.validation.mean(axis=1)
+
+    @property
     def order(self) -> np.ndarray:
         """The draws from the best to the worst: by their failures, then by the mean logarithmic validation error."""
-        return np.lexsort((self.validation.mean(axis=1), self.failures))
+        return np.lexsort((self.scores, self.failures))
 
     @property
     def best(self) -> int:
@@ -91,10 +96,10 @@ class Tuning:
 
     def effects(self) -> list[dict[str, Any]]:
         """A line per setting: its range, its chosen value, and its rank correlation with the validation error."""
-        lines, scores = [], self.validation.mean(axis=1)
+        lines = []
         for name in self.settings[0]:
             values = [settings[name] for settings in self.settings]
-            rho = stats.spearmanr(values, scores).statistic if len({*values}) > 1 and len(values) > 2 else math.nan
+            rho = stats.spearmanr(values, self.scores).statistic if len({*values}) > 1 and len(values) > 2 else math.nan
             ends = {"least": min(values), "most": max(values), "chosen": values[self.best]}
             lines.append({"setting": name, **ends, "rho": None if math.isnan(rho) else float(rho), "n": len(values)})
         return lines

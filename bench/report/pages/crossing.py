@@ -16,7 +16,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import by_shape
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
 
 PLACE = 32
 PLACE_FRONT = 35
@@ -28,9 +28,8 @@ NOTES = (
     "order of the legend.",
 )
 RUNS = (
-    *(FAMILY, configured("points", "task", "points"), configured("loss", "silhouette", "_label_"), *IDENTITY),
-    *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"),
-    *LOOP,
+    *(FAMILY, configured("points", "task", "points"), configured("loss", "silhouette", "_label_")),
+    *(*COMPLETION, *LOOP),
 )
 
 

@@ -23,14 +23,13 @@ from bench.report.write import chart
 from bench.report.write.caption import undefined
 from bench.report.write.result import Result
 from bench.report.write.table import (
+    COMPLETION,
     FAMILY,
-    IDENTITY,
     LOOP,
     Column,
     configured,
     counted,
     defined,
-    metrics,
     text,
     to_data,
     to_table,
@@ -80,8 +79,7 @@ INTERVAL_NOTES = (
 RUNS = (
     FAMILY,
     configured("points", "task", "points"),
-    *IDENTITY,
-    *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"),
+    *COMPLETION,
     Column("chamfer_l2_start", value=lambda record: record["metrics_start"].get("chamfer_l2")),
     *LOOP,
 )

@@ -1,4 +1,4 @@
-"""Each method as it stands, tuned, and at its paper's setting, side by side."""
+"""Each method at its defaults, tuned, and at its paper's setting, side by side."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from bench.report.data.statistics import geometric_mean
 from bench.report.data.wins import Gap, gap
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
 
 PLACE = 38
 READS = (Selection("tuned", ("completion",), ("dataset", "task"), ("points",)),)
@@ -20,22 +20,18 @@ FOLDER = "tuned/"  # of the presets that `python -m bench.tune` writes
 PAPERS = ("_paper", "_official")  # ends of the names of presets with a paper's setting
 NOTES = (
     "The ratio is that of geometric means over shapes, of each shape's geometric mean over all numbers of points, to "
-    "those of the same method as it stands; behind it the number of shapes on which the row is better, ties half.",
+    "those of the same method at its defaults; behind it the number of shapes on which the row is better, ties half.",
     "Tuned rows: conf/method/tuned, chosen on validation shapes by `python -m bench.tune`; their first lines say from "
     "which runs. At desk these are of sofas and planes from 20 points: other families and numbers of points are not "
     "what the rows were tuned for.",
-    "In the figure cost is the median number of a run's field values; hollow points are methods as they stand, filled "
-    "ones are tuned or at the paper's setting.",
+    "In the figure cost is the median number of a run's field values; hollow points are methods at their defaults, "
+    "filled ones are tuned or at the paper's setting.",
 )
-RUNS = (
-    *(FAMILY, configured("points", "task", "points"), *IDENTITY),
-    *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"),
-    *LOOP,
-)
+RUNS = (FAMILY, configured("points", "task", "points"), *COMPLETION, *LOOP)
 
 
 def make(experiment: Experiment) -> Result:
-    """Makes the page, with a line per family and row: medians, and the ratio to the method as it stands."""
+    """Makes the page, with a line per family and row: medians, and the ratio to the method's defaults."""
     runs = Completions(experiment)
     lines = [_line(runs, name, row) for name in runs.families for row in runs.rows_of(name)]
     columns = [
@@ -48,7 +44,7 @@ def make(experiment: Experiment) -> Result:
     ]
     return Result(
         experiment,
-        "Methods as they stand, tuned, and at their papers' settings.",
+        "Methods at their defaults, tuned, and at their papers' settings.",
         "Median error at each number of given depth points; in the figure, the geometric mean of all errors over cost.",
         interval="95 % intervals of the ratios over shapes (Student's, of logarithms)",
         estimates=[line["gap"].ratio for line in lines if line["gap"] is not None],
@@ -66,7 +62,7 @@ def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:
 
 
 def _gap(runs: Completions, name: str, row: Row) -> Gap | None:
-    """The gap to the row's method as it stands; None for that itself."""
+    """The gap to the row's method at its defaults; None for that itself."""
     default = next((other for other in runs.rows if other.preset == default_of(row.preset)), row)
     return None if default == row else gap(*runs.pair(name, row, default, finite=True))
 

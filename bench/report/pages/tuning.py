@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
+from bench.report.data.completions import CHAMFER
 from bench.report.data.experiments import Experiment
 from bench.report.data.tuning import TUNING, Tuning, tunings, unfinished
 from bench.report.write import chart
@@ -33,9 +34,8 @@ NOTES = (
     "Every method has the same number of Sobol draws from its own search space (conf/method/space), even in the "
     "logarithm of each setting, and is judged on the same shapes; the draw with the smallest geometric mean of errors "
     "on the validation shapes is taken. The expectation is over all choices of so many of the draws.",
-    "Error: Chamfer distance (chamfer_l2: the sum of the two mean squared distances, squared scene units) times 1000. "
-    "A run that did not end ok has the largest finite error of any draw of any method on its shape; of two draws that "
-    "with fewer failures is better. Validation runs: {validation} per draw; test runs: {test} per draw.",
+    f"{CHAMFER} A run that did not end ok has the largest finite error of any draw of any method on its shape; of two "
+    "draws that with fewer failures is better. Validation runs: {validation} per draw; test runs: {test} per draw.",
     "The interval is over test shapes, for these draws and this choice: other draws and other validation shapes would "
     "add to it.",
     "{waiting} planned runs have not ended: draws and shapes that some method lacks are left out.",

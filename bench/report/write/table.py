@@ -117,6 +117,7 @@ IDENTITY = (
     text("index", value=records.index),
     *(text(key) for key in ("status", "reason", "folder")),
 )
+COMPLETION = (*IDENTITY, *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"))
 FAMILY = text("family", value=records.family)
 LOOP = (
     Column("loop_seconds", value=records.loop_seconds),
