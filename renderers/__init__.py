@@ -6,6 +6,7 @@ from renderers.dvr import DVR
 from renderers.field import Field, Kind, Meter
 from renderers.idr import IDR
 from renderers.naive import Naive
+from renderers.newton import Newton
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Kind",
     "Meter",
     "Naive",
+    "Newton",
     "Rays",
     "Renderer",
     "Rendering",

@@ -1,5 +1,7 @@
 """The gradient rules. A rule attaches a gradient to distances that were found without a graph."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -87,6 +89,39 @@ def fixed_samples(
     return field(rays.at(distance.detach())) if torch.is_grad_enabled() else value
 
 
+@dataclass(frozen=True)
+class Crossing:
+    """The field where n rays may cross its surface.
+
+    Args:
+        value: of the field there; without a graph.
+        slope: of the field along the ray, in field units per scene unit; negative where the ray enters.
+        change: zero, with the derivative of `value` towards the field's parameters and the rays, where that is wanted.
+    """
+
+    value: Float[Tensor, " n"]
+    slope: Float[Tensor, " n"]
+    change: Float[Tensor, " n"]
+
+
+def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"]) -> Crossing:
+    """The value and the slope of the field at `distance` along n rays, for one evaluation and one gradient each."""
+    reached = rays.at(distance.detach())
+    at, wanted = reached.detach(), torch.is_grad_enabled()
+    with torch.enable_grad():
+        towards_field = wanted and field(at[:0]).requires_grad  # no points, so no cost
+        leaf = at.requires_grad_(True)
+        value = field(leaf)
+        (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=towards_field)
+    slope = (gradient * rays.directions.detach()).sum(-1)
+    change = torch.zeros_like(slope)
+    if reached.requires_grad:
+        change = (gradient * (reached - reached.detach())).sum(-1)
+    if towards_field:
+        change = change + value - value.detach()
+    return Crossing(value.detach(), slope, change)
+
+
 def implicit(
     field: Field, rays: Rays, distance: Float[Tensor, " n"], *, least_slope: float, keep_sign: bool = True
 ) -> Float[Tensor, " n"]:
@@ -106,19 +141,12 @@ def implicit(
     """
     if not torch.is_grad_enabled():
         return distance
-    reached = rays.at(distance.detach())
-    at = reached.detach().requires_grad_(True)
-    towards_field = field(at.detach()[:0]).requires_grad  # no points, so no cost
-    if not (towards_field or reached.requires_grad):
+    if not (rays.at(distance.detach()).requires_grad or field(rays.origins.detach()[:0]).requires_grad):
         return distance
-    value = field(at)
-    (gradient,) = torch.autograd.grad(value.sum(), at, retain_graph=True)
-    slope = (gradient * rays.directions.detach()).sum(-1)
+    at = crossing(field, rays, distance)
+    slope = at.slope
     if keep_sign:
         slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
     else:
         slope = torch.where(slope.abs() < least_slope, least_slope, slope)
-    change = (gradient * (reached - reached.detach())).sum(-1)
-    if towards_field:
-        change = change + value - value.detach()
-    return distance.detach() - change / slope
+    return distance.detach() - at.change / slope

@@ -158,14 +158,14 @@ def march_coarse_to_fine(
         march(field, level.flat(), front, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
         finer = rays.coarser(factor) if factor > 1 else rays
-        parents = _parents(level.shape, finer.shape, front.status.device)
-        front = front.split(parents, level.flat(), finer.flat(), radius=radius, careful=stepping.careful_split)
+        parent = parents(level.shape, finer.shape, front.status.device)
+        front = front.split(parent, level.flat(), finer.flat(), radius=radius, careful=stepping.careful_split)
         level = finer
     march(field, level.flat(), front, stepping, steps)
     return front
 
 
-def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, " children"]:
+def parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, " children"]:
     """For each ray of the finer image, the index of the coarse ray that covers it."""
     index = torch.arange(coarse.numel(), device=device).view(coarse)
     doubled = index.repeat_interleave(2, -2).repeat_interleave(2, -1)

@@ -1,0 +1,174 @@
+"""Newton's hits, gradients and evaluations, on what the march alone would get wrong."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from datasets.views import ViewSampler
+from renderers.camera import Camera, Rays
+from renderers.field import Kind, Meter
+from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
+from renderers.rendering import Rendering, Status
+from tests.renderers.analytic_cases import CASES, vector
+
+NEWTON, DIST = load("renderer", "newton"), load("renderer", "dist")
+SHAPES = {
+    "ball": sphere(0.6),
+    "ring": torus(0.5, 0.2),
+    "brick": box((0.5, 0.4, 0.3)),
+    "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1),
+}
+by_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+
+
+def camera(size: int = 64, dtype: torch.dtype = torch.float32) -> Camera:
+    """The unit sphere from 2.5 away."""
+    seen = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), size).camera(30.0, 25.0)
+    return seen.double() if dtype is torch.float64 else seen
+
+
+def exact(shape: Shape, size: int = 64) -> Rendering:
+    """DIST in float64 with plain steps to 1e-12: the same hits, as exact as the field."""
+    steady = replace(DIST, epsilon=1e-12, alpha=1.0, extra_step_cap=None, coarse_to_fine=False, steps=2000)
+    return steady.render(shape, camera(size, torch.float64).rays())
+
+
+def beam(*origins: tuple[float, float, float]) -> Rays:
+    """Rays along z."""
+    starts = vector(sum(origins, ())).view(-1, 3)
+    return Rays(starts, vector((0, 0, 1)).expand_as(starts))
+
+
+@by_shape
+def test_its_hits_are_exact_and_cost_no_more_values_than_those_of_dist(shape):
+    truth, found = exact(shape), {}
+    for name, renderer in (("newton", NEWTON), ("dist", DIST)):
+        meter = Meter(shape)
+        with torch.no_grad():
+            found[name] = renderer.render(meter, camera().rays()), meter.counts
+    rendering, counts = found["newton"]
+    both = truth.hit & rendering.hit
+    error = (rendering.distance - truth.distance)[both].abs()
+    hits = int(truth.hit.sum())
+    assert int((truth.hit ^ rendering.hit).sum()) <= max(1, int((truth.hit ^ found["dist"][0].hit).sum()))
+    assert error.median() < 5e-7  # of float32 at distances about 2
+    assert error.quantile(0.99) < 2e-4
+    assert hits <= counts.gradient <= 1.25 * hits
+    assert counts.value <= found["dist"][1].value + counts.gradient
+
+
+@pytest.mark.parametrize(("near", "relative"), [(1e-3, 0.04), (1e-6, 1e-4)])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_its_gradient_is_that_of_the_hit_up_to_the_newton_step(case, near, relative):
+    parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
+    rays = case.rays()
+    origins = rays.origins.requires_grad_(True)
+    rendering = replace(NEWTON, near=near).render(case.shape(parameter), Rays(origins, rays.directions))
+    assert rendering.distance.item() == pytest.approx(case.distance, abs=0.03 * near)
+    by_parameter, by_origin = torch.autograd.grad(rendering.distance.sum(), (parameter, origins))
+    assert by_parameter.item() == pytest.approx(case.parameter_rate, rel=relative)
+    torch.testing.assert_close(by_origin[0], case.origin_rate, rtol=relative, atol=relative)
+
+
+def test_it_is_asked_once_per_hit_where_the_rays_meet_the_surface_head_on():
+    wall = plane((0, 0, -1), 0.0)
+    rays = beam(*((x / 20, 0.0, -2.0) for x in range(10)))
+    offset = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    assert NEWTON.render(wall, rays).hit.all()
+    meter = Meter(plane((0, 0, -1), offset))
+    rendering = NEWTON.render(meter, rays)
+    assert meter.counts.gradient == 10
+    before = meter.counts.value
+    rendering.distance.sum().backward()
+    assert (meter.counts.value, meter.counts.gradient) == (before, 20)
+    assert offset.grad is not None
+    assert offset.grad.item() == pytest.approx(-10)
+
+
+def test_a_ray_that_passes_an_edge_by_less_than_near_hits_what_is_behind():
+    ball_and_wall = sphere(0.3, (0.0, 0.0, -0.3)) | plane((0, 0, -1), -0.4)
+    beside = [0.3 + NEWTON.near * share for share in (0.05, 0.2, 0.5, 0.9)]
+    rays = beam(*((x, 0.0, -2.0) for x in beside))
+    rendering = NEWTON.render(ball_and_wall, rays)
+    assert rendering.hit.all()
+    assert rendering.distance.tolist() == pytest.approx([2.4] * 4, abs=1e-6)
+
+
+def test_a_ray_that_passes_a_surface_by_less_than_near_does_not_hit_it():
+    rays = beam(*((0.5 + NEWTON.near * share, 0.0, -2.0) for share in (0.05, 0.2, 0.5, 0.9)))
+    rendering = NEWTON.render(sphere(0.5), rays)
+    assert (rendering.status == Status.MISS).all()
+    assert (rendering.closest > 0).all()
+
+
+def test_grazing_rays_are_found_by_the_dense_search():
+    ground, angle = plane((0, 1, 0), 0.0), torch.tensor(2.0, dtype=torch.float64).deg2rad()
+    direction = torch.stack([angle.cos(), -angle.sin(), torch.zeros_like(angle)])
+    rays = Rays((-0.9 * direction)[None], direction[None])
+    without = replace(NEWTON, steps=300).render(ground, rays)
+    meter = Meter(ground)
+    rendering = replace(NEWTON, steps=6).render(meter, rays)
+    assert rendering.hit.all() and without.hit.all()
+    assert rendering.distance.item() == pytest.approx(0.9, abs=1e-6)
+    assert meter.counts.value <= 6 + 2 * NEWTON.search_samples + NEWTON.search_steps + NEWTON.asks
+
+
+def test_what_hides_between_two_samples_is_found_beside_the_least():
+    sheet = box((0.9, 0.9, 0.004)) | plane((0, 0, -1), -0.9)
+    tilted = sheet.rotate(torch.linalg.matrix_exp(torch.tensor([[0, 0, 0.6], [0, 0, 0], [-0.6, 0, 0]]).double()))
+    rays = beam((0.01, 0.0, -0.99), (0.05, 0.1, -0.98), (-0.07, 0.1, -0.98))
+    searching = replace(NEWTON, steps=1)
+    truth = replace(DIST, epsilon=1e-10, alpha=1.0, extra_step_cap=None, steps=3000).render(tilted, rays)
+    rendering = searching.render(tilted, rays)
+    assert truth.hit.all()
+    torch.testing.assert_close(rendering.distance, truth.distance, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.5])
+def test_values_that_are_wrong_by_a_factor_lose_few_hits(factor):
+    ring = SHAPES["ring"]
+    truth = exact(ring)
+    rendering = NEWTON.render(Shape(lambda p: factor * ring(p), Kind.BOUND), camera().rays())
+    both = truth.hit & rendering.hit
+    assert (truth.hit ^ rendering.hit).sum() <= 0.01 * truth.hit.sum()
+    assert (rendering.distance - truth.distance)[both].abs().quantile(0.9) < 1e-5
+
+
+def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():
+    ball = sphere(0.5)
+    jump = Shape(lambda p: 0 * ball(p) + torch.where(ball(p) > 0, 0.2, -0.2), Kind.BOUND)
+    rays = beam((0.0, 0.0, -2.0), (0.2, 0.1, -2.0))
+    assert (NEWTON.render(jump, rays).status == Status.OUT_OF_STEPS).all()
+
+    def half(points: Tensor) -> Tensor:
+        return torch.where(points[..., 0] > 0, sphere(0.5)(points), torch.nan)
+
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    for field in (half, lambda p: torch.where(p[..., 2] > -0.6, torch.nan, sphere(radius)(p))):
+        rendering = NEWTON.render(Shape(field, Kind.BOUND), beam((0.2, 0.0, -2.0), (-0.2, 0.0, -2.0)))
+        for part in (rendering.distance, rendering.closest, rendering.residual):
+            assert part.isfinite().all()
+        assert rendering.status[1] == Status.OUT_OF_STEPS
+    rendering = NEWTON.render(Shape(half, Kind.BOUND), beam((0.2, 0.0, -2.0), (-0.2, 0.0, -2.0)))
+    assert rendering.hit.tolist() == [True, False]
+
+
+def test_a_hit_is_on_its_own_rendering_and_its_closest_value_moves_with_the_field():
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    rendering = NEWTON.render(sphere(radius), beam((0.1, 0.0, -2.0), (0.8, 0.0, -2.0)))
+    assert rendering.closest[0].item() == 0
+    assert rendering.closest[1].item() > 0.25
+    (gradient,) = torch.autograd.grad(rendering.closest.sum(), radius)
+    assert gradient.item() == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "remedy"),
+    [("steps", 0, "at least 1"), ("near", 0.0, "positive"), ("alpha", 0.5, "at least 1"), ("asks", 0, "at least 1")],
+)
+def test_settings_that_cannot_be_are_refused(setting, value, remedy):
+    with pytest.raises(ValueError, match=f"{setting} must be .*{remedy}"):
+        replace(NEWTON, **{setting: value})
