@@ -1,6 +1,6 @@
 """Newton: a march that stops short of the surface, and a Newton step on the value and slope that its gradient needs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -11,9 +11,9 @@ from renderers.bracket import Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
-from renderers.gradients import crossing, fixed_samples
+from renderers.gradients import crossing
 from renderers.packed_march import Pace, Reached, Stop, approach
-from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.rendering import Capabilities, Deferred, Rendering, Status, assemble
 from renderers.silhouette import Hinge
 
 LONGEST = 3.0  # times `near`: a longer Newton step is asked again, since the field may not be straight over its length
@@ -93,14 +93,14 @@ class Newton:
             found, bracket = self._search(field, flat, reached, left)
             guess, _ = refine(field, flat[left[found]], bracket, method="secant", steps=self.search_steps)
         second = self._solve(field, flat, left[found], guess)
-        return self._assembled(field, rays, reached, first.some(first.settled), second)
+        return self._assembled(rays, reached, first.some(first.settled), second)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """DIST, Eq. 11."""
+        """DIST, Eq. 11; see `silhouette.Hinge`."""
         hinge = Hinge(self.silhouette_epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.of(rendering.closest, mask)
+        return hinge.seen(field, rays, rendering, mask)
 
     def _solve(self, field: Field, rays: Rays, index: Int[Tensor, " m"], guess: Float[Tensor, " m"]) -> "Solved":
         """Newton steps from `guess` along m of the rays; more than one only where the step is long."""
@@ -110,12 +110,12 @@ class Newton:
             at = solved.distance.detach()[asked]
             found = crossing(field, rays[index[asked]], at)
             slope = found.slope.clamp_max(-self.least_slope)
-            step = -(found.value + found.change) / slope
+            step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)
-            short = enters & (step.detach().abs() <= longest)
+            short = enters & (step.abs() <= longest)
             settled = short | (enters & (found.value.abs() <= SETTLED * self.near))
-            step = torch.where(short, step, torch.where(enters, step.detach().clamp(-longest, longest), 0.0))
-            solved = solved.updated(asked, at + step, found.value, found.change, settled)
+            moved = at + torch.where(enters, step.clamp(-longest, longest) - found.change / slope, 0.0)
+            solved = solved.updated(asked, moved, found.value, found.change, settled)
             asked = asked[enters & ~short]
             if asked.numel() == 0:
                 break
@@ -157,8 +157,8 @@ class Newton:
         distance = start[:, None] + shares * (end - start)[:, None]
         return distance, field(rays.origins[:, None] + distance[..., None] * rays.directions[:, None])
 
-    def _assembled(self, field: Field, rays: Rays, reached: Reached, *parts: "Solved") -> Rendering:
-        """The rendering, with the gradient of hits and of the closest samples of other rays."""
+    def _assembled(self, rays: Rays, reached: Reached, *parts: "Solved") -> Rendering:
+        """The rendering, with the gradient of hits; that of other rays' closest values is left to the loss."""
         distance, status = reached.distance, torch.full_like(reached.distance, Status.MISS, dtype=torch.int8)
         distance = torch.where(reached.stopped(Stop.INSIDE, Stop.NOT_FINITE), distance, reached.leave)
         status[reached.stopped(Stop.INSIDE)] = Status.STARTED_INSIDE
@@ -170,17 +170,18 @@ class Newton:
             residual[index] = part.value
             distance = distance.index_put((index,), torch.where(settled, part.distance, part.distance.detach()))
             closest = closest.index_put((index[settled],), part.change[settled])
-        unhit = ((status != Status.HIT) & reached.least.isfinite()).nonzero().squeeze(-1)
-        least = fixed_samples(field, rays.flat()[unhit], reached.least_distance[unhit], reached.least[unhit])
-        queried = reached.least.isfinite().nonzero().squeeze(-1)
-        return assemble(
+        sampled = reached.least.isfinite()
+        queried = sampled.nonzero().squeeze(-1)
+        rendering = assemble(
             rays,
             self.sphere_radius,
             distance=distance,
             status=status,
             residual=residual,
-            closest=(queried, closest.index_put((unhit,), least)[queried]),
+            closest=(queried, closest[queried]),
         )
+        left_out = (sampled & (status != Status.HIT)).view(rays.shape)
+        return replace(rendering, deferred=Deferred(reached.least_distance.view(rays.shape), left_out))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,19 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
+class Deferred:
+    """Where a rendering sampled its `closest` values, if it leaves their gradient to `closest_values`.
+
+    Args:
+        distance: along each ray to the sample.
+        left_out: the rays whose value has no gradient yet.
+    """
+
+    distance: Float[Tensor, "*rays"]
+    left_out: Bool[Tensor, "*rays"]
+
+
+@dataclass(frozen=True)
 class Rendering:
     """One answer per ray, all of the rays' leading shape, all finite.
 
@@ -31,7 +44,8 @@ class Rendering:
         points: the points at `distance`.
         residual: the last field value on the ray, a measure of the remaining error. Not differentiable.
         closest: the field's value, with its sign, at the sample of least magnitude on the ray. Its magnitude less a
-            threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable.
+            threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable, but for rays that are deferred.
+        deferred: where `closest` has no gradient yet, since most losses need it on few rays; None where it has.
     """
 
     distance: Float[Tensor, "*rays"]
@@ -39,6 +53,7 @@ class Rendering:
     points: Float[Tensor, "*rays 3"]
     residual: Float[Tensor, "*rays"]
     closest: Float[Tensor, "*rays"]
+    deferred: Deferred | None = None
 
     @property
     def hit(self) -> Bool[Tensor, "*rays"]:
@@ -134,6 +149,17 @@ class Spaced(Renderer, Protocol):
 def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
     """The renderer as it is at an iteration of an optimisation: itself, unless it has a schedule."""
     return renderer.at_iteration(iteration) if isinstance(renderer, Scheduled) else renderer
+
+
+def closest_values(
+    field: Field, rays: Rays, rendering: Rendering, wanted: Bool[Tensor, "*rays"]
+) -> Float[Tensor, "*rays"]:
+    """`rendering.closest`, with its gradient on the `wanted` rays, for one value on each of them that was deferred."""
+    if rendering.deferred is None or not torch.is_grad_enabled():
+        return rendering.closest
+    index = (wanted & rendering.deferred.left_out).flatten().nonzero().squeeze(-1)
+    values = field(rays.flat()[index].at(rendering.deferred.distance.flatten()[index]))
+    return rendering.closest.flatten().index_put((index,), values).view(rays.shape)
 
 
 def assemble(

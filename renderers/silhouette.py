@@ -1,11 +1,11 @@
 """Silhouette losses: of each paper one, for the rendering of any renderer, so that renderers can be compared under one.
 
 `Own` is the renderer's own. The other three are made of what every renderer gives: `hit`, `distance` and `closest`.
-Their gradient is that of the renderer's `closest`: on a hit, that of `naive` follows the surface, so that its spurious
-hits are hardly pushed away.
+Their gradient is that of the renderer's `closest`, which is asked for only on rays that are wrong: on a hit, that of
+`naive` follows the surface, so that its spurious hits are hardly pushed away.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -17,7 +17,7 @@ from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, occupancy_logits
-from renderers.rendering import Observed, Renderer, Rendering
+from renderers.rendering import Observed, Renderer, Rendering, closest_values
 
 RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
 PLACES = (RANDOM, DEPTH)
@@ -78,18 +78,28 @@ class Hinge:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`; a hit on the foreground is right, whatever the renderer's own threshold."""
-        right = observed.mask & rendering.hit
-        loss = self.of(torch.where(right, 0.0, rendering.closest), observed.mask)
+        """See `SilhouetteLoss`."""
+        loss = self.seen(field, rays, rendering, observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
 
+    def seen(self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        """The loss of a rendering; a hit on the foreground is right, whatever the renderer's own threshold."""
+        right = mask & rendering.hit
+        wrong = ~right & (self.violation(rendering.closest, mask) > 0)
+        closest = closest_values(field, rays, rendering, wrong)
+        return self.of(torch.where(right, 0.0, closest), mask)
+
     def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
         """The loss of the field's values of least magnitude on each ray, with their sign."""
-        soft = (closest if self.signed else closest.abs()) - self.epsilon
-        violation = torch.where(mask, soft, -soft).clamp_min(0)
+        violation = self.violation(closest, mask)
         count = torch.full_like(mask, True) if self.average == "all" else violation > 0
         return self.weight * violation.sum() / count.sum().clamp_min(1)
+
+    def violation(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+        """By how much the soft silhouette is on the wrong side; 0 where it is on the right one."""
+        soft = (closest if self.signed else closest.abs()) - self.epsilon
+        return torch.where(mask, soft, -soft).clamp_min(0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +122,8 @@ class CrossEntropy:
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        loss = self.of(rendering, observed.mask)
+        wanted = ~(observed.mask & rendering.hit)
+        loss = self.of(replace(rendering, closest=closest_values(field, rays, rendering, wanted)), observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
 

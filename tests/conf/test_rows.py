@@ -2,8 +2,10 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
@@ -179,3 +181,16 @@ def test_the_tuning_has_all_spaces_and_the_tuned_rows_that_there_are(swept, tmp_
     assert {*methods} >= {"dist_mask", "dist_mask_paper", "mine_mask", "tuned/mine_mask"}
     assert methods.index("tuned/mine_mask") == methods.index("mine_mask") + 1
     assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_mask"}
+
+
+def test_a_sweep_composes_each_cell_once_for_the_plan_and_once_to_run_it(swept, monkeypatch):
+    composed, compose = [], ConfigLoaderImpl.load_sweep_config
+
+    def counting(*arguments: Any, **named: Any) -> DictConfig:
+        composed.append(arguments)
+        return compose(*arguments, **named)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counting)
+    _, ran = swept("seed=0,1,2", launch=True)
+    assert [config.seed for config in ran] == [0, 1, 2]
+    assert len(composed) == 2 * 3

@@ -11,7 +11,7 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
-from renderers.rendering import Rendering, Status
+from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, vector
 
 NEWTON, DIST = load("renderer", "newton"), load("renderer", "dist")
@@ -161,8 +161,30 @@ def test_a_hit_is_on_its_own_rendering_and_its_closest_value_moves_with_the_fiel
     rendering = NEWTON.render(sphere(radius), beam((0.1, 0.0, -2.0), (0.8, 0.0, -2.0)))
     assert rendering.closest[0].item() == 0
     assert rendering.closest[1].item() > 0.25
-    (gradient,) = torch.autograd.grad(rendering.closest.sum(), radius)
-    assert gradient.item() == pytest.approx(-2.0)
+    rays = beam((0.1, 0.0, -2.0), (0.8, 0.0, -2.0))
+    meter = Meter(sphere(radius))
+    for wanted, rate in (([True, False], -1.0), ([True, True], -2.0)):
+        closest = closest_values(meter, rays, rendering, torch.tensor(wanted))
+        torch.testing.assert_close(closest.detach(), rendering.closest.detach())
+        (gradient,) = torch.autograd.grad(closest.sum(), radius, retain_graph=True)
+        assert gradient.item() == pytest.approx(rate)
+    assert meter.counts.value == 1  # of the ray that misses, the second time
+
+
+def test_the_silhouette_asks_values_only_where_a_ray_is_wrong():
+    rays, radius = camera(24).rays(), torch.tensor(0.6, requires_grad=True)
+    meter = Meter(sphere(radius))
+    rendering = NEWTON.render(meter, rays)
+    for grown, asked in ((0.6, 0), (0.7, None)):
+        mask = exact(sphere(grown), 24).hit
+        before = meter.counts.value
+        loss = NEWTON.silhouette_loss(meter, rays, rendering, mask)
+        wrong = int((mask & ~rendering.hit).sum())
+        assert meter.counts.value - before == wrong
+        assert (wrong == 0) == (asked == 0)
+        if wrong:
+            (gradient,) = torch.autograd.grad(loss, radius, retain_graph=True)
+            assert gradient.item() == pytest.approx(-1.0)  # the mean over rays that violate it
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,78 @@
+"""No tensor is made without a device: with another default device, everything still stays where its inputs are."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from bench.config import CONF, load
+from renderers.adaptive_samples import follow
+from renderers.camera import Camera
+from renderers.field import Field, steepest
+from renderers.fields.grid import Grid
+from renderers.fields.mlp import Decoder
+from renderers.fields.moved import Moved
+from renderers.rendering import Observed, at_iteration
+from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
+
+CPU = torch.device("cpu")
+NAMES = [path.stem for path in sorted((CONF / "renderer").glob("*.yaml")) if path.stem != "custom"]
+SILHOUETTES = (Own(), Hinge(5e-5, True, "violating"), CrossEntropy(50.0, 100.0), Occupancy(0.02, 3.0, 1.0, DEPTH))
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[None]:
+    """A default device that holds no data: whatever is made on it by mistake cannot meet the inputs."""
+    torch.set_default_device("meta")
+    yield
+    torch.set_default_device(None)
+
+
+def camera() -> Camera:
+    """The unit sphere from 2.5 away, on the CPU."""
+    intrinsics = torch.tensor([[12.0, 0, 6], [0, 12, 6], [0, 0, 1]], device=CPU)
+    world_to_camera = torch.eye(4, device=CPU)
+    world_to_camera[2, 3] = 2.5
+    return Camera(intrinsics, world_to_camera, 12, 12)
+
+
+def fields() -> dict[str, Field]:
+    """One of each kind, on the CPU."""
+    axis = torch.linspace(-1.05, 1.05, 9, device=CPU)
+    places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    distances = torch.linalg.vector_norm(places, dim=-1) - 0.5
+    with torch.device(CPU):
+        decoder = Decoder(layers=2, width=8, code_length=2, skip=0, narrow=False)
+    torch.nn.init.constant_(decoder.last.bias, 0.05)
+    code = torch.zeros(2, device=CPU, requires_grad=True)
+    grid = Grid(distances.requires_grad_(), 1.05)
+    return {
+        "grid": grid,
+        "decoder": decoder.requires_grad_(False).at(code),
+        "moved": Moved(grid, torch.zeros(7, device=CPU, requires_grad=True)),
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
+    renderer = load("renderer", name)
+    if name == "dvr":
+        renderer = at_iteration(follow(renderer), 0)
+    rays = camera().rays()
+    rays.origins.requires_grad_()
+    for field in fields().values():
+        rendering = renderer.render(field, rays)
+        depth = torch.where(rendering.hit, rendering.distance.detach(), torch.nan)
+        observed = Observed(rendering.hit.logical_not(), depth)
+        losses = [silhouette(renderer, field, rays, rendering, observed) for silhouette in SILHOUETTES]
+        total = torch.stack([rendering.distance.sum(), *losses]).sum()
+        assert total.device == CPU
+        if total.requires_grad:
+            total.backward()
+    assert rays.origins.grad is not None
+    assert rays.origins.grad.device == CPU
+
+
+def test_the_steepest_gradient_is_measured_where_the_field_is(elsewhere):
+    found = steepest(fields()["grid"], radius=1.0, samples=64, like=torch.zeros(1, device=CPU))
+    assert 0.9 < found < 1.5
