@@ -34,6 +34,7 @@ def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
         raise BrokenContract(f"{name} must return a Rendering, not {found}: see renderers/rendering.py")
     for part in PARTS:
         _check_part(name, part, getattr(rendering, part), rays)
+    _check_deferred(name, rendering)
     if (lacked := _lacked(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
         raise _no_gradient(renderer, lacked, "the distances of its hits carry")
     return rendering
@@ -98,6 +99,18 @@ def _check_part(name: str, part: str, value: object, rays: Rays) -> None:
     if value.device != rays.origins.device:
         remedy = "create tensors with device=rays.origins.device"
         raise BrokenContract(f"{name}: {part} must be on {rays.origins.device}, not on {value.device}: {remedy}")
+
+
+def _check_deferred(name: str, rendering: Rendering) -> None:
+    """Raises BrokenContract unless what is deferred has one answer per ray, and leaves out no hit."""
+    deferred = rendering.deferred
+    if deferred is None:
+        return
+    shape, found = tuple(rendering.status.shape), (tuple(deferred.distance.shape), tuple(deferred.left_out.shape))
+    if found != (shape, shape):
+        raise BrokenContract(f"{name}: the parts of deferred must have the shape {list(shape)}, not {found}")
+    if bool((deferred.left_out & rendering.hit).any()):
+        raise BrokenContract(f"{name}: deferred must leave out no hit: give `closest` its gradient there")
 
 
 def _lacked(renderer: Renderer, field: Field, rays: Rays, output: Tensor) -> str:

@@ -25,6 +25,24 @@ class Bracket:
     near_value: Float[Tensor, " n"]
     far_value: Float[Tensor, " n"]
 
+    def secant(self) -> Float[Tensor, " n"]:
+        """Where the line through both ends meets zero."""
+        share = self.near_value / (self.near_value - self.far_value)
+        return self.near + share * (self.far - self.near)
+
+    def middle(self) -> Float[Tensor, " n"]:
+        """Half way between both ends."""
+        return (self.near + self.far) / 2
+
+    def joined(self, other: "Bracket") -> "Bracket":
+        """These brackets, and behind them the others."""
+        return Bracket(
+            torch.cat([self.near, other.near]),
+            torch.cat([self.far, other.far]),
+            torch.cat([self.near_value, other.near_value]),
+            torch.cat([self.far_value, other.far_value]),
+        )
+
 
 def first_crossing(
     distance: Float[Tensor, "n samples"], value: Float[Tensor, "n samples"]
@@ -74,14 +92,4 @@ def refine(
     return _GUESSES[method](closer), torch.where(better, closer.near_value, closer.far_value)
 
 
-def _secant(bracket: Bracket) -> Tensor:
-    # The values differ in sign, so the share lies between 0 and 1.
-    share = bracket.near_value / (bracket.near_value - bracket.far_value)
-    return bracket.near + share * (bracket.far - bracket.near)
-
-
-def _middle(bracket: Bracket) -> Tensor:
-    return (bracket.near + bracket.far) / 2
-
-
-_GUESSES: dict[str, Callable[[Bracket], Tensor]] = {"secant": _secant, "bisection": _middle}
+_GUESSES: dict[str, Callable[[Bracket], Tensor]] = {"secant": Bracket.secant, "bisection": Bracket.middle}

@@ -95,7 +95,8 @@ class Crossing:
 
     Args:
         value: of the field there; without a graph.
-        slope: of the field along the ray, in field units per scene unit; negative where the ray enters.
+        slope: of the field along the ray, in field units per scene unit; negative where the ray enters, 0 where the
+            field has no finite gradient.
         change: zero, with the derivative of `value` towards the field's parameters and the rays, where that is wanted.
     """
 
@@ -113,6 +114,7 @@ def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"]) -> Crossin
         leaf = at.requires_grad_(True)
         value = field(leaf)
         (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=towards_field)
+    gradient = gradient.nan_to_num(0.0, 0.0, 0.0)  # one point without a gradient must not spoil that of all others
     slope = (gradient * rays.directions.detach()).sum(-1)
     change = torch.zeros_like(slope)
     if reached.requires_grad:

@@ -9,15 +9,17 @@ from torch import Tensor
 
 from renderers.bracket import Bracket, first_crossing, refine
 from renderers.camera import Rays
-from renderers.checks import check_at_least, check_positive
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind
 from renderers.gradients import crossing
-from renderers.packed_march import Pace, Reached, Stop, approach
+from renderers.march import Stepping
+from renderers.packed_march import Reached, Stop, approach
 from renderers.rendering import Capabilities, Deferred, Rendering, Status, assemble
 from renderers.silhouette import Hinge
 
-LONGEST = 3.0  # times `near`: a longer Newton step is asked again, since the field may not be straight over its length
-SETTLED = 0.1  # times `near`: what is above it after the last Newton step is no hit
+LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
+SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
+BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,22 @@ class Newton:
 
     Source: ours. The march follows DIST, Sec. 3.2; the search DVR, Sec. 3.3; the gradient DVR, Eqs. 8 and 11.
     Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step: off by
-        that step times the surface's curvature, at most 3 `near` over the cosine of incidence. What comes into view or
-        leaves it has no part in the gradient of `distance`. That of `closest` is exact at a fixed sample; on a hit,
-        `closest` is 0.
-    Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
-    Deviates from the paper: there is none. What is thinner along a ray than `extra_step_cap` may be jumped over; on the
-        rays of the dense search, what is thinner than the spacing of its samples, unless it is next to the least one.
+        that step times the surface's curvature, at most 3 `march_epsilon` over the cosine of incidence. What comes into
+        view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a fixed sample, and
+        left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
+    Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
+        points by automatic differentiation, also where no gradient is wanted.
+    Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; in an
+        image also those that a coarse ray passed on its way to a surface behind, as with DIST; on the rays of the dense
+        search, what is thinner than the spacing of its samples, unless it is next to the least one. A ray that passes
+        an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step.
 
     Args:
         steps: most marching steps per ray, those of its coarse rays included; rays that are left are searched densely.
-        near: the march stops where the field's magnitude is at most this, in scene units; a Newton step does the rest.
-        alpha, extra_step_cap: see `packed_march.Pace`.
-        asks: most evaluations of value and slope per hit; a second one only where the Newton step is long.
+        march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
+            the rest.
+        alpha, extra_step_cap: see `march.Stepping`.
+        newton_steps: most evaluations of value and slope per root; a second one only where the first step is long.
         search_samples: of the dense search, between a ray's last positive value and where it leaves the sphere, and as
             many again about the least of these.
         search_steps: values per hit that narrow the interval found there.
@@ -50,10 +56,10 @@ class Newton:
     """
 
     steps: int
-    near: float
+    march_epsilon: float
     alpha: float
     extra_step_cap: float
-    asks: int
+    newton_steps: int
     search_samples: int
     search_steps: int
     least_slope: float
@@ -67,32 +73,40 @@ class Newton:
     )
 
     def __post_init__(self) -> None:
-        check_at_least("steps", self.steps, 1, "22 leave a ray in 200")
-        check_positive("near", self.near, "1e-3 is a twentieth of a pixel at 64 x 64")
+        check_at_least("steps", self.steps, 1, "22 leave one ray in 200 to the search")
+        check_positive("march_epsilon", self.march_epsilon, "1e-3 is a twentieth of a pixel at 64 x 64")
         check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, 1.7 is aggressive marching")
         check_positive("extra_step_cap", self.extra_step_cap, "0.01 keeps parts of that thickness")
-        check_at_least("asks", self.asks, 1, "3 are enough")
+        check_at_least("newton_steps", self.newton_steps, 1, "3 are enough")
         check_at_least("search_samples", self.search_samples, 2, "32 find what a pixel shows")
         check_at_least("search_steps", self.search_steps, 0, "4 are enough")
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
-        Hinge(self.silhouette_epsilon, self.silhouette_signed, self.silhouette_average)
+        check_positive("silhouette_epsilon", self.silhouette_epsilon, "DIST uses 5e-5")
+        check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches and searches without a graph; the Newton steps carry the gradient."""
         flat = rays.flat()
-        pace = Pace(self.near, self.alpha, self.extra_step_cap)
+        stepping = Stepping(
+            self.march_epsilon, self.alpha, self.extra_step_cap, None, active_only=True, careful_split=True
+        )
         with torch.no_grad():
-            reached = approach(field, rays, pace, steps=self.steps, radius=self.sphere_radius)
-            close = reached.stopped(Stop.NEAR, Stop.CROSSED).nonzero().squeeze(-1)
-            guess = _root(reached.some(close))
-        first = self._solve(field, flat, close, guess)
+            reached = approach(field, rays, stepping, steps=self.steps, radius=self.sphere_radius)
+            crossed = reached.stopped(Stop.CROSSED)
+            close = (crossed | reached.stopped(Stop.NEAR)).nonzero().squeeze(-1)
+            guess = torch.where(crossed, reached.bracket().secant(), reached.distance)[close]
+        first = self._solve(field, flat, reached, close, guess)
         with torch.no_grad():
-            left = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
-            left = torch.cat([close[~first.settled], left])
-            found, bracket = self._search(field, flat, reached, left)
-            guess, _ = refine(field, flat[left[found]], bracket, method="secant", steps=self.search_steps)
-        second = self._solve(field, flat, left[found], guess)
+            unsolved = close[~first.settled]
+            between = unsolved[crossed[unsolved]]
+            on_the_way = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
+            searched = torch.cat([unsolved[~crossed[unsolved]], on_the_way])
+            found, bracket = self._search(field, flat, reached, searched)
+            again = torch.cat([between, searched[found]])
+            bracket = reached.some(between).bracket().joined(bracket)
+            guess, _ = refine(field, flat[again], bracket, method="secant", steps=self.search_steps)
+        second = self._solve(field, flat, reached, again, guess)
         return self._assembled(rays, reached, first.some(first.settled), second)
 
     def silhouette_loss(
@@ -100,22 +114,30 @@ class Newton:
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11; see `silhouette.Hinge`."""
         hinge = Hinge(self.silhouette_epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.seen(field, rays, rendering, mask)
+        return hinge.of_rendering(field, rays, rendering, mask)
 
-    def _solve(self, field: Field, rays: Rays, index: Int[Tensor, " m"], guess: Float[Tensor, " m"]) -> "Solved":
-        """Newton steps from `guess` along m of the rays; more than one only where the step is long."""
-        solved = Solved(index, guess, torch.zeros_like(guess), torch.zeros_like(guess), torch.zeros_like(index).bool())
-        asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.near
-        for _ in range(self.asks):
-            at = solved.distance.detach()[asked]
-            found = crossing(field, rays[index[asked]], at)
+    def _solve(
+        self, field: Field, rays: Rays, reached: Reached, index: Int[Tensor, " m"], guess: Float[Tensor, " m"]
+    ) -> "Solved":
+        """Newton steps from `guess` along m of the rays; more than one only where the step is long.
+
+        A root is settled where the step is short and stays on the ray, or the value is small. It lies at the ray's
+        beginning where the step leads behind that.
+        """
+        nothing = torch.zeros_like(guess)
+        solved = Solved(index, guess, nothing, nothing, torch.zeros_like(index).bool())
+        asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.march_epsilon
+        for _ in range(self.newton_steps):
+            ray, at = index[asked], solved.distance.detach()[asked]
+            found = crossing(field, rays[ray], at)
             slope = found.slope.clamp_max(-self.least_slope)
             step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)
-            short = enters & (step.abs() <= longest)
-            settled = short | (enters & (found.value.abs() <= SETTLED * self.near))
-            moved = at + torch.where(enters, step.clamp(-longest, longest) - found.change / slope, 0.0)
-            solved = solved.updated(asked, moved, found.value, found.change, settled)
+            short = enters & (step.abs() <= longest) & (at + step <= reached.leave[ray])
+            small = found.value.abs() <= SETTLED * self.march_epsilon
+            step = torch.where(enters | small, step.clamp(-longest, longest), 0.0)
+            step = torch.maximum(step, reached.entry[ray] - at)
+            solved = solved.updated(asked, at + step - found.change / slope, found.value, found.change, short | small)
             asked = asked[enters & ~short]
             if asked.numel() == 0:
                 break
@@ -126,27 +148,27 @@ class Newton:
     ) -> tuple[Bool[Tensor, " m"], Bracket]:
         """The first change of sign among samples of m of the rays: which of them have one, and between which samples.
 
-        The rays' samples of least magnitude are kept in `reached`.
+        Writes into `reached` the rays' samples of least magnitude, and that a ray begins inside.
         """
         known = reached.some(index)
-        before = torch.maximum(known.distance - LONGEST * self.near, known.entry)
-        start = torch.where(known.free_value.isfinite(), known.free, before)
+        start = torch.where(known.free_value.isfinite(), known.free, known.entry)
         distance, value = self._samples(field, rays[index], start, known.leave)
-        ends = torch.full_like(known.table[:, :4], torch.nan)
-        _keep(ends, torch.arange(len(index), device=index.device), distance, value)
+        ends = start.new_full((len(index), 4), torch.nan)
+        _keep_crossing(ends, torch.arange(len(index), device=index.device), distance, value)
         # What is thinner than the spacing may hide beside a small value in front of the change of sign.
         free = torch.where((value <= 0).cumsum(dim=1) > 0, torch.inf, value.nan_to_num(torch.inf))
-        least, place = free.min(dim=1, keepdim=True)
-        nearest = distance.gather(1, place).squeeze(1)
-        known.see(nearest, least.squeeze(1))
-        spacing = (known.leave - start) / (self.search_samples - 1)
-        again = (least.squeeze(1) < spacing / 2).nonzero().squeeze(-1)
-        low = torch.maximum(nearest - spacing, start)[again]
-        high = torch.minimum(nearest + spacing, known.leave)[again]
-        distance, value = self._samples(field, rays[index[again]], low, high)
-        _keep(ends, again, distance, value)
+        least, place = free.min(dim=1)
+        nearest = distance.gather(1, place[:, None]).squeeze(1)
+        known.keep_least(nearest, least)
+        inside = value[:, 0] < 0
+        known.table[:, Reached.STOP] = torch.where(inside, float(Stop.INSIDE), known.table[:, Reached.STOP])
         reached.table[index] = known.table
-        found = ends[:, 0].isfinite()
+        spacing = (known.leave - start) / (self.search_samples - 1)
+        again = ((least < spacing / 2) & ~inside).nonzero().squeeze(-1)
+        low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, known.leave)
+        distance, value = self._samples(field, rays[index[again]], low[again], high[again])
+        _keep_crossing(ends, again, distance, value)
+        found = ends[:, 0].isfinite() & ~inside
         return found, Bracket(*ends[found].unbind(dim=1))
 
     def _samples(
@@ -155,19 +177,20 @@ class Newton:
         """Equally spaced distances from `start` to `end`, and the field's values there."""
         shares = torch.linspace(0, 1, self.search_samples, dtype=start.dtype, device=start.device)
         distance = start[:, None] + shares * (end - start)[:, None]
-        return distance, field(rays.origins[:, None] + distance[..., None] * rays.directions[:, None])
+        points = rays.origins[:, None] + distance[..., None] * rays.directions[:, None]
+        return distance, torch.cat([field(some) for some in points.split(max(BLOCK // self.search_samples, 1))])
 
     def _assembled(self, rays: Rays, reached: Reached, *parts: "Solved") -> Rendering:
         """The rendering, with the gradient of hits; that of other rays' closest values is left to the loss."""
-        distance, status = reached.distance, torch.full_like(reached.distance, Status.MISS, dtype=torch.int8)
-        distance = torch.where(reached.stopped(Stop.INSIDE, Stop.NOT_FINITE), distance, reached.leave)
-        status[reached.stopped(Stop.INSIDE)] = Status.STARTED_INSIDE
-        status[reached.stopped(Stop.NOT_FINITE)] = Status.OUT_OF_STEPS
+        inside, not_finite = reached.stopped(Stop.INSIDE), reached.stopped(Stop.NOT_FINITE)
+        status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
+        status[inside], status[not_finite] = Status.STARTED_INSIDE, Status.OUT_OF_STEPS
+        distance = torch.where(inside, reached.entry, torch.where(not_finite, reached.distance, reached.leave))
         residual, closest = reached.value.clone(), reached.least.clone()
         for part in parts:
             index, settled = part.index, part.settled
             status[index] = torch.where(settled, Status.HIT, Status.OUT_OF_STEPS).to(status.dtype)
-            residual[index] = part.value
+            residual[index] = part.value.nan_to_num(0.0)
             distance = distance.index_put((index,), torch.where(settled, part.distance, part.distance.detach()))
             closest = closest.index_put((index[settled],), part.change[settled])
         sampled = reached.least.isfinite()
@@ -181,7 +204,7 @@ class Newton:
             closest=(queried, closest[queried]),
         )
         left_out = (sampled & (status != Status.HIT)).view(rays.shape)
-        return replace(rendering, deferred=Deferred(reached.least_distance.view(rays.shape), left_out))
+        return replace(rendering, deferred=Deferred(reached.least_distance.clone().view(rays.shape), left_out))
 
 
 @dataclass(frozen=True)
@@ -211,15 +234,7 @@ class Solved:
         )
 
 
-def _root(reached: Reached) -> Float[Tensor, " n"]:
-    """Where rays that stopped close to the surface cross it: by the secant, where the sign has changed."""
-    share = reached.free_value / (reached.free_value - reached.value)
-    between = reached.free + share * (reached.distance - reached.free)
-    return torch.where(reached.stopped(Stop.CROSSED), between, reached.distance)
-
-
-def _keep(ends: Float[Tensor, "m 4"], index: Int[Tensor, " k"], distance: Tensor, value: Tensor) -> None:
+def _keep_crossing(ends: Float[Tensor, "m 4"], index: Int[Tensor, " k"], distance: Tensor, value: Tensor) -> None:
     """Writes the first change of sign among the samples of k rays, where they have one, as the ends of a Bracket."""
     found, bracket = first_crossing(distance, value)
-    rows = torch.stack([bracket.near, bracket.far, bracket.near_value, bracket.far_value], dim=1)
-    ends[index[found]] = rows
+    ends[index[found]] = torch.stack([bracket.near, bracket.far, bracket.near_value, bracket.far_value], dim=1)

@@ -154,7 +154,10 @@ def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
 def closest_values(
     field: Field, rays: Rays, rendering: Rendering, wanted: Bool[Tensor, "*rays"]
 ) -> Float[Tensor, "*rays"]:
-    """`rendering.closest`, with its gradient on the `wanted` rays, for one value on each of them that was deferred."""
+    """`rendering.closest`, with its gradient on the `wanted` rays, for one value on each of them that was deferred.
+
+    The value there is that of the ray itself; coarse to fine may have sampled `rendering.closest` on its coarse ray.
+    """
     if rendering.deferred is None or not torch.is_grad_enabled():
         return rendering.closest
     index = (wanted & rendering.deferred.left_out).flatten().nonzero().squeeze(-1)

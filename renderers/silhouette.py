@@ -1,8 +1,8 @@
 """Silhouette losses: of each paper one, for the rendering of any renderer, so that renderers can be compared under one.
 
 `Own` is the renderer's own. The other three are made of what every renderer gives: `hit`, `distance` and `closest`.
-Their gradient is that of the renderer's `closest`, which is asked for only on rays that are wrong: on a hit, that of
-`naive` follows the surface, so that its spurious hits are hardly pushed away.
+Their gradient is that of the renderer's `closest`, which the hinge asks for only on rays that are wrong: on a hit, that
+of `naive` follows the surface, so that its spurious hits are hardly pushed away.
 """
 
 from dataclasses import dataclass, replace
@@ -79,11 +79,13 @@ class Hinge:
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
         """See `SilhouetteLoss`."""
-        loss = self.seen(field, rays, rendering, observed.mask)
+        loss = self.of_rendering(field, rays, rendering, observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
 
-    def seen(self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+    def of_rendering(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
         """The loss of a rendering; a hit on the foreground is right, whatever the renderer's own threshold."""
         right = mask & rendering.hit
         wrong = ~right & (self.violation(rendering.closest, mask) > 0)

@@ -9,6 +9,7 @@ import time
 import torch
 
 from renderers import IDR, Capabilities, Kind
+from renderers.boundary import PARTS
 from renderers.rendering import Rendering
 
 
@@ -55,7 +56,7 @@ def _nothing(rendering: Rendering) -> None:
 
 
 def _short(rendering: Rendering) -> Rendering:
-    return Rendering(**{name: part[:-1] for name, part in vars(rendering).items()})
+    return Rendering(**{part: getattr(rendering, part)[:-1] for part in PARTS})
 
 
 def _double(rendering: Rendering) -> Rendering:

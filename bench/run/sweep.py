@@ -67,9 +67,13 @@ class Planner(Callback):
         """Plans the sweep and starts to follow it."""
         try:
             Sweep.start(make_plan(config))
-            Sweeper.validate_batch_is_legal = lambda self, batch: None
         except Exception as error:
             raise Refused(error) from error
+        self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Gives Hydra its own check back."""
+        Sweeper.validate_batch_is_legal = self.check
 
 
 def make_plan(config: DictConfig) -> Plan:

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from bench.config import CONF, build
-from renderers.camera import Camera, Rays
+from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.rendering import Renderer, Rendering, Status
+from renderers.rendering import Renderer, Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
 PARTS = ("distance", "status", "points", "residual", "closest")
@@ -260,6 +260,19 @@ def test_no_graph_is_built_where_none_is_wanted(renderer):
     for quiet in (rendering, plain):
         assert not any(getattr(quiet, part).requires_grad for part in PARTS)
     same(rendering, plain)
+
+
+def test_closest_values_follow_the_field_where_a_ray_misses(renderer):
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    rays = mixed(60)
+    rendering = renderer.render(sphere(radius), rays)
+    _, _, meets = sphere_span(rays)
+    missed = (rendering.status == Status.MISS) & meets
+    closest = closest_values(sphere(radius), rays, rendering, missed)
+    torch.testing.assert_close(closest.detach(), rendering.closest.detach())
+    (gradient,) = torch.autograd.grad(closest[missed].sum(), radius)
+    assert missed.sum() > 5
+    assert gradient.item() == pytest.approx(-int(missed.sum()))
 
 
 def test_the_right_mask_costs_less_than_its_opposite(renderer):

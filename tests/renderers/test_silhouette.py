@@ -106,7 +106,7 @@ def test_the_loss_of_a_paper_is_that_of_its_renderer_to_the_last_digit(renderer,
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive"])
+@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too_large(renderer, loss):
     mine, given = load("renderer", renderer), load("silhouette", loss)
     small, large = of_sphere(mine, given, [True] * 4 + [False]), of_sphere(mine, given, [False] * 5)
@@ -115,7 +115,7 @@ def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too
     assert small[1] < 0 < large[1]
 
 
-@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive"])
+@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
     hinge, mask = load("silhouette", "hinge"), [True] * 4 + [False]
     expected = of_sphere(load("renderer", "idr", steps=500), hinge, mask)
