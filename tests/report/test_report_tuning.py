@@ -8,6 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench.records.read import read_records
+from bench.report.data import statistics
 from bench.report.data.experiments import choose
 from bench.report.data.tuning import TUNING, tunings
 from bench.report.pages import tuned as tuned_page
@@ -107,6 +108,12 @@ def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path
     assert first.test.shape == second.test.shape == (3, 6)
     assert second.test == pytest.approx(first.test + math.log(10))
     assert [(method.method, method.runs) for method in (first, second)] == [("dist_mask", 36), ("idr_mask", 36)]
+    *worth, compared = tuning.verdicts([first, second])
+    two = statistics.geometric_ratio(first.expected(2), first.expected(1))
+    assert worth[0] == f"{first.label}: the best of 2 draws has {two} times the error of one draw."
+    assert two.value < 0.9 and len(worth) == 2
+    ten = "10.0 [10.0, 10.0]"
+    assert compared == f"{second.label} over {first.label}: {ten} times the error from one draw, {ten} of 2."
 
 
 def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):

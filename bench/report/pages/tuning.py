@@ -85,6 +85,7 @@ def make(experiment: Experiment) -> Result:
     waiting = unfinished(experiment)
     sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].test_runs)} if methods else {}
     notes = [note.format(waiting=waiting, **sizes) for note in (NOTES if waiting else NOTES[:-1])] if methods else []
+    notes = [*verdicts(methods), *notes]
     return Result(
         experiment,
         "What tuning is worth.",
@@ -96,6 +97,24 @@ def make(experiment: Experiment) -> Result:
         table=to_table(columns, lines),
         figure=draw(methods, curves),
     )
+
+
+def verdicts(methods: list[Tuning]) -> list[str]:
+    """How much each method owes to tuning, and how the others compare with the best one, in words."""
+    budgets = set.intersection(*(set(method.budgets) for method in methods)) if methods else set()
+    if len(budgets) < 2:
+        return []
+    most = max(budgets)
+    best = min(methods, key=lambda method: statistics.geometric(method.expected(most)).value)
+    said = []
+    for method in methods:
+        worth = statistics.geometric_ratio(method.expected(most), method.expected(1))
+        said.append(f"{method.label}: the best of {most} draws has {worth} times the error of one draw.")
+    for method in methods:
+        if method is not best:
+            one, tuned = (statistics.geometric_ratio(method.expected(k), best.expected(k)) for k in (1, most))
+            said.append(f"{method.label} over {best.label}: {one} times the error from one draw, {tuned} of {most}.")
+    return said
 
 
 def _curve(method: Tuning) -> Curve:
