@@ -48,17 +48,28 @@ def make(experiment: Experiment) -> Result:
         "Median error at each number of given depth points; in the figure, the geometric mean of all errors over cost.",
         interval="95 % intervals of the ratios over shapes (Student's, of logarithms)",
         estimates=[line["gap"].ratio for line in lines if line["gap"] is not None],
-        remarks=(ERROR, FAILURE, shapes_per_cell(runs), *NOTES),
+        remarks=(*verdict(lines), ERROR, FAILURE, shapes_per_cell(runs), *NOTES),
         data=to_data(RUNS, experiment.records),
         table=to_table(columns, lines),
         figure=draw(experiment, runs),
     )
 
 
+def verdict(lines: list[dict[str, Any]]) -> list[str]:
+    """Where a tuned setting is better or worse than the method's defaults by its interval, in words."""
+    tuned = [line for line in lines if line["tuned"] and line["gap"] is not None and line["gap"].ratio.known]
+    if not tuned:
+        return []
+    sure = [line for line in tuned if not line["gap"].ratio.low <= 1 <= line["gap"].ratio.high]
+    found = "; ".join(f"{line['row']} on {line['family']}, {line['gap'].ratio}" for line in sure) or "none"
+    return [f"Of {len(tuned)} ratios of tuned settings to the defaults, those with an interval without 1: {found}."]
+
+
 def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:
     medians = {points: runs.median(name, row, points) for points in runs.points}
     failed = "{} of {}".format(*runs.failures(name, row))
-    return {"family": name, "row": row.name, "gap": _gap(runs, name, row), "failed": failed, **medians}
+    tuned = row.preset.startswith(FOLDER)
+    return {"family": name, "row": row.name, "gap": _gap(runs, name, row), "failed": failed, "tuned": tuned, **medians}
 
 
 def _gap(runs: Completions, name: str, row: Row) -> Gap | None:
