@@ -143,7 +143,7 @@ def thinnest(field: Field, rendering: Rendering, *, radius: float) -> float:
     hits = rendering.points.detach()[rendering.hit]
     if not len(hits):
         return inf
-    chosen = torch.linspace(0, len(hits) - 1, min(len(hits), HITS)).round().long().to(hits.device)
+    chosen = torch.linspace(0, len(hits) - 1, min(len(hits), HITS), device=hits.device).round().long()
     found = thickness(field, hits[chosen], radius=radius).sort().values
     return float(found[int(SHARE * len(found))])
 

@@ -130,7 +130,7 @@ def steepest(
         margin: see `STEEPEST_MARGIN`.
         like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
-    draws = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
+    draws = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
     direction = torch.nn.functional.normalize(torch.randn(samples, 3, **draws), dim=-1)
     points = radius * torch.rand(samples, 1, **draws) ** (1 / 3) * direction
     gradients = autograd_gradients(field, points if like is None else points.to(like))

@@ -71,7 +71,10 @@ class Naive:
         if not self.serial or flat.shape.numel() == 0:
             parts = [render(field, flat)]
         else:
-            parts = [render(field, flat[index]) for index in torch.arange(flat.shape.numel()).split(1)]
+            parts = [
+                render(field, flat[index])
+                for index in torch.arange(len(flat.origins), device=flat.origins.device).split(1)
+            ]
         distance = torch.cat([part.distance for part in parts]).view(rays.shape)
         return Rendering(
             distance=distance,

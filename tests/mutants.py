@@ -42,7 +42,7 @@ MUTANTS = (
       "tests/renderers"),
     M("renderers/gradients.py", "distance + alpha * (total - total.detach())", "distance + (total - total.detach())",
       "tests/renderers"),
-    M("renderers/gradients.py", "distance.detach() - change / slope", "distance.detach() + change / slope",
+    M("renderers/gradients.py", "distance.detach() - at.change / slope", "distance.detach() + at.change / slope",
       "tests/renderers"),
     M("renderers/gradients.py", "slope.clamp_max(-least_slope)", "slope.clamp_max(0.0)", "tests/renderers"),
     M("renderers/gradients.py", "total = table.sum(dim=1)", "total = table.mean(dim=1)", "tests/renderers"),
