@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
-from renderers.field import Field
+from renderers.field import Field, carries_gradient
 from renderers.rendering import Guided, Observed, Renderer, Rendering
 
 PARTS = ("distance", "status", "points", "residual", "closest")
@@ -120,8 +120,7 @@ def _lacked(renderer: Renderer, field: Field, rays: Rays, output: Tensor) -> str
     can = renderer.capabilities
     if can.ray_gradient and (rays.origins.requires_grad or rays.directions.requires_grad):
         return "ray_gradient"
-    nowhere = rays.origins.detach().reshape(-1, 3)[:0]  # no points, so no cost
-    return "field_gradient" if can.field_gradient and field(nowhere).requires_grad else ""
+    return "field_gradient" if can.field_gradient and carries_gradient(field, rays.origins) else ""
 
 
 def _no_gradient(renderer: Renderer, lacked: str, what: str) -> BrokenContract:

@@ -14,6 +14,7 @@ from renderers.camera import Rays
 from renderers.field import Field
 
 REFINEMENTS = ("secant", "bisection")
+BLOCK = 2**20  # samples along rays at a time: bounds memory, does not change results
 
 
 @dataclass(frozen=True)

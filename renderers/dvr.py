@@ -7,15 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from renderers.bracket import REFINEMENTS, first_crossing, refine
+from renderers.bracket import BLOCK, REFINEMENTS, first_crossing, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, Kind
 from renderers.gradients import fixed_samples, implicit
 from renderers.rendering import Capabilities, Observed, Rendering, Status, assemble
 from renderers.silhouette import PLACES, Occupancy
-
-BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
 
 @dataclass(frozen=True)

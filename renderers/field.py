@@ -106,6 +106,16 @@ class Meter(Wrapper):
         self.counts.gradient += int(gradient.count_nonzero())
 
 
+def carries_gradient(field: Field, like: Float[Tensor, "*batch 3"]) -> bool:
+    """Whether the field's values have a gradient towards its parameters; asked at no points, so that it costs nothing.
+
+    Args:
+        field: asked where gradients are enabled.
+        like: points of the dtype and device at which the field is evaluated.
+    """
+    return field(like.detach().reshape(-1, 3)[:0]).requires_grad
+
+
 def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Unit gradients of the field by automatic differentiation; zero where the gradient vanishes."""
     return torch.nn.functional.normalize(autograd_gradients(field, points), dim=-1)

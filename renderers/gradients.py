@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
-from renderers.field import Field
+from renderers.field import Field, carries_gradient
 from renderers.march import Front
 from renderers.rendering import Rendering, Status, assemble
 
@@ -105,13 +105,15 @@ class Crossing:
     change: Float[Tensor, " n"]
 
 
-def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"]) -> Crossing:
-    """The value and the slope of the field at `distance` along n rays, for one evaluation and one gradient each."""
+def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"], *, towards_field: bool) -> Crossing:
+    """The value and the slope of the field at `distance` along n rays, for one evaluation and one gradient each.
+
+    Args:
+        towards_field: whether the field's parameters are to get a gradient; see `field.carries_gradient`.
+    """
     reached = rays.at(distance.detach())
-    at, wanted = reached.detach(), torch.is_grad_enabled()
     with torch.enable_grad():
-        towards_field = wanted and field(at[:0]).requires_grad  # no points, so no cost
-        leaf = at.requires_grad_(True)
+        leaf = reached.detach().requires_grad_(True)
         value = field(leaf)
         (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=towards_field)
     gradient = gradient.nan_to_num(0.0, 0.0, 0.0)  # one point without a gradient must not spoil that of all others
@@ -143,9 +145,10 @@ def implicit(
     """
     if not torch.is_grad_enabled():
         return distance
-    if not (rays.at(distance.detach()).requires_grad or field(rays.origins.detach()[:0]).requires_grad):
+    towards_field = carries_gradient(field, rays.origins)
+    if not (towards_field or rays.origins.requires_grad or rays.directions.requires_grad):
         return distance
-    at = crossing(field, rays, distance)
+    at = crossing(field, rays, distance, towards_field=towards_field)
     slope = at.slope
     if keep_sign:
         slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))

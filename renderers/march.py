@@ -5,6 +5,8 @@ the graph instead.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -152,20 +154,34 @@ def march_coarse_to_fine(
     Returns:
         the front of the rays at full resolution, in one row.
     """
-    level = rays.coarser(PYRAMID[0])
-    front = Front.on_sphere(level.flat(), radius=radius, samples=samples)
-    for factor in (*PYRAMID[1:], 1):
-        march(field, level.flat(), front, stepping, min(PYRAMID_STEPS, steps))
+    levels = pyramid(rays)
+    front = Front.on_sphere(levels[0].coarse, radius=radius, samples=samples)
+    for level in levels:
+        march(field, level.coarse, front, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
-        finer = rays.coarser(factor) if factor > 1 else rays
-        parent = parents(level.shape, finer.shape, front.status.device)
-        front = front.split(parent, level.flat(), finer.flat(), radius=radius, careful=stepping.careful_split)
-        level = finer
-    march(field, level.flat(), front, stepping, steps)
+        front = front.split(level.parent, level.coarse, level.fine, radius=radius, careful=stepping.careful_split)
+    march(field, levels[-1].fine, front, stepping, steps)
     return front
 
 
-def parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, " children"]:
+class Level(NamedTuple):
+    """Two neighbouring resolutions of an image of rays, each in one row, and the coarse ray above each fine one."""
+
+    coarse: Rays
+    fine: Rays
+    parent: Int[Tensor, " children"]
+
+
+def pyramid(rays: Rays) -> list[Level]:
+    """An image of rays from one ray per 4 x 4 pixels to one per pixel (DIST, Sec. 3.2)."""
+    images = [*(rays.coarser(factor) for factor in PYRAMID), rays]
+    flat = [image.flat() for image in images]
+    device = rays.origins.device
+    above = [_parents(coarse.shape, fine.shape, device) for coarse, fine in pairwise(images)]
+    return [Level(*level) for level in zip(flat[:-1], flat[1:], above, strict=True)]
+
+
+def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[Tensor, " children"]:
     """For each ray of the finer image, the index of the coarse ray that covers it."""
     index = torch.arange(coarse.numel(), device=device).view(coarse)
     doubled = index.repeat_interleave(2, -2).repeat_interleave(2, -1)

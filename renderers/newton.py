@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import Bracket, first_crossing, refine
+from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind
+from renderers.field import Field, Kind, carries_gradient
 from renderers.gradients import crossing
 from renderers.march import Stepping
 from renderers.packed_march import Reached, Stop, approach
@@ -19,7 +19,6 @@ from renderers.silhouette import Hinge
 
 LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
 SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
-BLOCK = 2**20  # samples at a time: bounds memory, does not change results
 
 
 @dataclass(frozen=True)
@@ -124,12 +123,13 @@ class Newton:
         A root is settled where the step is short and stays on the ray, or the value is small. It lies at the ray's
         beginning where the step leads behind that.
         """
+        towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
         nothing = torch.zeros_like(guess)
         solved = Solved(index, guess, nothing, nothing, torch.zeros_like(index).bool())
         asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.march_epsilon
         for _ in range(self.newton_steps):
             ray, at = index[asked], solved.distance.detach()[asked]
-            found = crossing(field, rays[ray], at)
+            found = crossing(field, rays[ray], at, towards_field=towards_field)
             slope = found.slope.clamp_max(-self.least_slope)
             step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)

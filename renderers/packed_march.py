@@ -14,7 +14,7 @@ from torch import Tensor
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Field
-from renderers.march import CAREFUL, PYRAMID, PYRAMID_STEPS, Stepping, parents
+from renderers.march import CAREFUL, PYRAMID_STEPS, Stepping, pyramid
 
 SET_BACK = (
     0.5  # of the way between a ray and its coarse ray, where that stopped: with less, more begin behind the surface
@@ -170,17 +170,13 @@ def approach(field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius
         steps: most steps per ray, those of its coarse rays included.
         radius: of the sphere about the origin that holds the shape.
     """
-    level = rays.coarser(PYRAMID[0]) if rays.image else rays
-    flat = level.flat()
-    reached = Reached.on_sphere(flat, radius)
-    for factor in (*PYRAMID[1:], 1) if rays.image else ():
-        _march(field, flat, reached, stepping, min(PYRAMID_STEPS, steps))
+    levels = pyramid(rays) if rays.image else []
+    reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
+    for level in levels:
+        _march(field, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
-        finer = rays.coarser(factor) if factor > 1 else rays
-        parent = parents(level.shape, finer.shape, rays.origins.device)
-        reached = reached.split(parent, flat, finer_flat := finer.flat(), radius=radius)
-        level, flat = finer, finer_flat
-    _march(field, flat, reached, stepping, steps)
+        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius)
+    _march(field, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
 
 

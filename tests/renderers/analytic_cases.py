@@ -62,6 +62,12 @@ def vector(numbers: tuple[float, ...]) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
 
 
+def beam(*origins: tuple[float, float, float]) -> Rays:
+    """Rays along z."""
+    starts = vector(sum(origins, ())).view(-1, 3)
+    return Rays(starts, vector((0, 0, 1)).expand_as(starts))
+
+
 def ground(offset: float | Tensor) -> Shape:
     """All below y = offset."""
     return plane((0.0, 1.0, 0.0), offset)

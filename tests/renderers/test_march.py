@@ -13,7 +13,7 @@ from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import Status
-from tests.renderers.analytic_cases import vector
+from tests.renderers.analytic_cases import beam, vector
 
 PLAIN = Stepping(epsilon=5e-5, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, careful_split=False)
 AGGRESSIVE = replace(PLAIN, alpha=1.5)
@@ -26,12 +26,6 @@ FINE = DIST(
     silhouette_average="all",
 )  # fmt: skip
 COARSE = replace(FINE, coarse_to_fine=True)
-
-
-def beam(*origins: tuple[float, float, float]) -> Rays:
-    """Rays along z."""
-    starts = vector(sum(origins, ())).view(-1, 3)
-    return Rays(starts, vector((0, 0, 1)).expand_as(starts))
 
 
 def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:

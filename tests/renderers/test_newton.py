@@ -12,7 +12,7 @@ from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
 from renderers.rendering import Rendering, Status, closest_values
-from tests.renderers.analytic_cases import CASES, vector
+from tests.renderers.analytic_cases import CASES, beam
 
 NEWTON, DIST = load("renderer", "newton"), load("renderer", "dist")
 SHAPES = {
@@ -34,12 +34,6 @@ def exact(shape: Shape, size: int = 64) -> Rendering:
     """DIST in float64 with plain steps to 1e-12: the same hits, as exact as the field."""
     steady = replace(DIST, epsilon=1e-12, alpha=1.0, extra_step_cap=None, coarse_to_fine=False, steps=2000)
     return steady.render(shape, camera(size, torch.float64).rays())
-
-
-def beam(*origins: tuple[float, float, float]) -> Rays:
-    """Rays along z."""
-    starts = vector(sum(origins, ())).view(-1, 3)
-    return Rays(starts, vector((0, 0, 1)).expand_as(starts))
 
 
 @by_shape

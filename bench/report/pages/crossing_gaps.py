@@ -123,7 +123,7 @@ def _verdicts(lines: list[Line], losses: dict[str, str]) -> list[str]:
         for loss, label in losses.items()
         if line[loss] is not None and line[loss].ratio.known
     }
-    sure = [name for name, ratio in under_one.items() if not ratio.low <= 1 <= ratio.high]
+    sure = [name for name, ratio in under_one.items() if ratio.excludes(1)]
     named = f": {'; '.join(sure)}" if sure else ""
     said = (
         f"Under one loss, of {len(under_one)} ratios over all families {len(sure)} have an interval without 1{named}."

@@ -60,7 +60,7 @@ def verdict(lines: list[dict[str, Any]]) -> list[str]:
     tuned = [line for line in lines if line["tuned"] and line["gap"] is not None and line["gap"].ratio.known]
     if not tuned:
         return []
-    sure = [line for line in tuned if not line["gap"].ratio.low <= 1 <= line["gap"].ratio.high]
+    sure = [line for line in tuned if line["gap"].ratio.excludes(1)]
     found = "; ".join(f"{line['row']} on {line['family']}, {line['gap'].ratio}" for line in sure) or "none"
     return [f"Of {len(tuned)} ratios of tuned settings to the defaults, those with an interval without 1: {found}."]
 
