@@ -16,9 +16,9 @@ from renderers.camera import Rays, sphere_span
 from renderers.field import Field
 from renderers.march import CAREFUL, PYRAMID_STEPS, Stepping, pyramid
 
-SET_BACK = (
-    0.5  # of the way between a ray and its coarse ray, where that stopped: with less, more begin behind the surface
-)
+# Of the way between a ray and its coarse ray, where that stopped: with less, more begin behind the surface.
+SET_BACK = 0.5
+CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
 
 
 class Stop(IntEnum):
@@ -40,9 +40,9 @@ class Reached:
         table: the columns that the properties below name.
     """
 
-    table: Float[Tensor, "n 9"]
+    table: Float[Tensor, "n 11"]
 
-    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP = range(9)
+    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP, PASSED, ANCHOR = range(11)
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "Reached":
@@ -50,7 +50,7 @@ class Reached:
         entry, leave, meets = sphere_span(rays, radius)
         none = torch.full_like(entry, torch.inf)
         stop = torch.where(meets, float(Stop.ON_THE_WAY), float(Stop.LEFT)).to(entry.dtype)
-        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop)
+        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop, none, entry)
         return Reached(torch.stack(columns, dim=1))
 
     @property
@@ -93,6 +93,16 @@ class Reached:
         """Along each ray to where it leaves the sphere."""
         return self.table[:, self.LEAVE]
 
+    @property
+    def passed(self) -> Float[Tensor, " n"]:
+        """What the field is at least at the samples of each ray and of its coarse rays; infinite before the first."""
+        return self.table[:, self.PASSED]
+
+    @property
+    def anchor(self) -> Float[Tensor, " n"]:
+        """Along each ray to its last sample before `passed` fell to `CLEAR`; to where it begins if there is none."""
+        return self.table[:, self.ANCHOR]
+
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
         return self.table[:, self.STOP] == float(stop)
@@ -118,6 +128,9 @@ class Reached:
         to where it begins at the most.
         """
         at, epsilon = self.distance.clone(), stepping.epsilon
+        rises = value > self.free_value
+        before = torch.where(rises, self.free_value, value)
+        closest = torch.minimum(self.passed, before)
         self.keep_least(at, value)
         behind, own, begins = value < -epsilon, self.free_value.isfinite(), at <= self.entry
         left = (value > epsilon) & (at + value > self.leave)
@@ -133,6 +146,8 @@ class Reached:
         positive = (value > 0) & finite
         self.table[:, self.FREE] = torch.where(positive, at, self.free)
         self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
+        self.table[:, self.ANCHOR] = torch.where(closest > CLEAR, at, self.anchor)
+        self.table[:, self.PASSED] = torch.where(rises | left, torch.minimum(self.passed, before), self.passed)
         return goes_on & finite
 
     def split(self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float) -> "Reached":
@@ -158,6 +173,9 @@ class Reached:
         keeps = inherits & ~ended & (known.least > 0)
         for column in (self.VALUE, self.LEAST_DISTANCE, self.LEAST):
             child.table[:, column] = torch.where(keeps, known.table[:, column], child.table[:, column])
+        passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
+        child.table[:, self.PASSED] = torch.where(inherits, passed - apart, child.passed)
+        child.table[:, self.ANCHOR] = torch.where(child.passed > CLEAR, child.distance, child.entry)
         return child
 
 
@@ -173,14 +191,14 @@ def approach(field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius
     levels = pyramid(rays) if rays.image else []
     reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
-        _march(field, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
+        march(field, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
         reached = reached.split(level.parent, level.coarse, level.fine, radius=radius)
-    _march(field, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
+    march(field, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
 
 
-def _march(field: Field, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
+def march(field: Field, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
     origins, directions, moving = rays.origins[index], rays.directions[index], reached.some(index)

@@ -1,0 +1,228 @@
+"""What finds the surface along rays for `newton.Newton`: a loose march, Newton steps, and a search for what is left."""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from renderers.bracket import BLOCK, Bracket, first_crossing, refine
+from renderers.camera import Rays
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Field, carries_gradient
+from renderers.gradients import crossing
+from renderers.march import Stepping
+from renderers.packed_march import Reached, Stop, approach
+from renderers.rendering import Deferred, Rendering, Status, assemble
+
+LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
+SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """Marches coarse to fine to a loose threshold, solves for the crossings by Newton steps, searches for the rest.
+
+    Args:
+        steps: most marching steps per ray, those of its coarse rays included; rays that are left are searched densely.
+        march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
+            the rest.
+        alpha, extra_step_cap: see `march.Stepping`.
+        newton_steps: most evaluations of value and slope per root; a second one only where the first step is long.
+        search_samples: of the dense search, between a ray's last positive value and where it leaves the sphere, and as
+            many again about the least of these.
+        search_steps: values per hit that narrow the interval found there.
+        least_slope: see `gradients.implicit`.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    steps: int
+    march_epsilon: float
+    alpha: float
+    extra_step_cap: float
+    newton_steps: int
+    search_samples: int
+    search_steps: int
+    least_slope: float
+    sphere_radius: float
+
+    def __post_init__(self) -> None:
+        check_at_least("steps", self.steps, 1, "22 leave one ray in 200 to the search")
+        check_positive("march_epsilon", self.march_epsilon, "1e-3 is a twentieth of a pixel at 64 x 64")
+        check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, 1.7 is aggressive marching")
+        check_positive("extra_step_cap", self.extra_step_cap, "0.01 keeps parts of that thickness")
+        check_at_least("newton_steps", self.newton_steps, 1, "3 are enough")
+        check_at_least("search_samples", self.search_samples, 2, "32 find what a pixel shows")
+        check_at_least("search_steps", self.search_steps, 0, "4 are enough")
+        check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    @property
+    def stepping(self) -> Stepping:
+        """How the march steps."""
+        return Stepping(self.march_epsilon, self.alpha, self.extra_step_cap, None, active_only=True, careful_split=True)
+
+    def trace(self, field: Field, rays: Rays) -> tuple[Reached, "Solved"]:
+        """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
+        with torch.no_grad():
+            reached = approach(field, rays, self.stepping, steps=self.steps, radius=self.sphere_radius)
+        return reached, self.crossings(field, rays.flat(), reached)
+
+    def crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
+        """Where flat rays cross the surface, from where the march left them; in `reached`, also what a search saw."""
+        with torch.no_grad():
+            crossed = reached.stopped(Stop.CROSSED)
+            close = (crossed | reached.stopped(Stop.NEAR)).nonzero().squeeze(-1)
+            guess = torch.where(crossed, reached.bracket().secant(), reached.distance)[close]
+        first = self.solve(field, rays, reached, close, guess)
+        with torch.no_grad():
+            unsolved = close[~first.settled]
+            between = unsolved[crossed[unsolved]]
+            on_the_way = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
+            searched = torch.cat([unsolved[~crossed[unsolved]], on_the_way])
+            found, bracket = self._search(field, rays, reached, searched)
+            again = torch.cat([between, searched[found]])
+            bracket = reached.some(between).bracket().joined(bracket)
+            guess, _ = refine(field, rays[again], bracket, method="secant", steps=self.search_steps)
+        second = self.solve(field, rays, reached, again, guess)
+        return first.some(first.settled).joined(second)
+
+    def solve(
+        self,
+        field: Field,
+        rays: Rays,
+        reached: Reached,
+        index: Int[Tensor, " m"],
+        guess: Float[Tensor, " m"],
+        *,
+        furthest: float = 0.0,
+    ) -> "Solved":
+        """Newton steps from `guess` along m of the rays; more than one only where the step is long.
+
+        A root is settled where the step is short and stays on the ray, or the value is small. It lies at the ray's
+        beginning where the step leads behind that.
+
+        Args:
+            furthest: longest step, in scene units, where that is more than `LONGEST` times the march's threshold.
+        """
+        towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
+        nothing = torch.zeros_like(guess)
+        solved = Solved(index, guess, nothing, nothing, nothing, nothing, torch.zeros_like(index).bool())
+        asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.march_epsilon
+        furthest = max(furthest, longest)
+        for _ in range(self.newton_steps):
+            ray, at = index[asked], solved.distance.detach()[asked]
+            found = crossing(field, rays[ray], at, towards_field=towards_field)
+            slope = found.slope.clamp_max(-self.least_slope)
+            step = -found.value / slope
+            enters = found.value.isfinite() & (found.slope < 0)
+            short = enters & (step.abs() <= longest) & (at + step <= reached.leave[ray])
+            small = found.value.abs() <= SETTLED * self.march_epsilon
+            step = torch.where(enters | small, step.clamp(-furthest, furthest), 0.0)
+            step = torch.maximum(step, reached.entry[ray] - at)
+            distance = at + step - found.change / slope
+            begun = found.value if len(asked) == len(index) else solved.begun[asked]
+            solved = solved.updated(asked, distance, found.value, found.slope, begun, found.change, short | small)
+            asked = asked[enters & ~short]
+            if asked.numel() == 0:
+                break
+        return solved
+
+    def _search(
+        self, field: Field, rays: Rays, reached: Reached, index: Int[Tensor, " m"]
+    ) -> tuple[Bool[Tensor, " m"], Bracket]:
+        """The first change of sign among samples of m of the rays: which of them have one, and between which samples.
+
+        Writes into `reached` the rays' samples of least magnitude, and that a ray begins inside.
+        """
+        known = reached.some(index)
+        start = torch.where(known.free_value.isfinite(), known.free, known.entry)
+        distance, value = self._samples(field, rays[index], start, known.leave)
+        ends = start.new_full((len(index), 4), torch.nan)
+        _keep_crossing(ends, torch.arange(len(index), device=index.device), distance, value)
+        # What is thinner than the spacing may hide beside a small value in front of the change of sign.
+        free = torch.where((value <= 0).cumsum(dim=1) > 0, torch.inf, value.nan_to_num(torch.inf))
+        least, place = free.min(dim=1)
+        nearest = distance.gather(1, place[:, None]).squeeze(1)
+        known.keep_least(nearest, least)
+        inside = value[:, 0] < 0
+        known.table[:, Reached.STOP] = torch.where(inside, float(Stop.INSIDE), known.table[:, Reached.STOP])
+        reached.table[index] = known.table
+        spacing = (known.leave - start) / (self.search_samples - 1)
+        again = ((least < spacing / 2) & ~inside).nonzero().squeeze(-1)
+        low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, known.leave)
+        distance, value = self._samples(field, rays[index[again]], low[again], high[again])
+        _keep_crossing(ends, again, distance, value)
+        found = ends[:, 0].isfinite() & ~inside
+        return found, Bracket(*ends[found].unbind(dim=1))
+
+    def _samples(
+        self, field: Field, rays: Rays, start: Float[Tensor, " m"], end: Float[Tensor, " m"]
+    ) -> tuple[Float[Tensor, "m samples"], Float[Tensor, "m samples"]]:
+        """Equally spaced distances from `start` to `end`, and the field's values there."""
+        shares = torch.linspace(0, 1, self.search_samples, dtype=start.dtype, device=start.device)
+        distance = start[:, None] + shares * (end - start)[:, None]
+        points = rays.origins[:, None] + distance[..., None] * rays.directions[:, None]
+        return distance, torch.cat([field(some) for some in points.split(max(BLOCK // self.search_samples, 1))])
+
+    def assembled(self, rays: Rays, reached: Reached, solved: "Solved") -> Rendering:
+        """The rendering, with the gradient of hits; that of other rays' closest values is left to the loss."""
+        inside, not_finite = reached.stopped(Stop.INSIDE), reached.stopped(Stop.NOT_FINITE)
+        status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
+        status[inside], status[not_finite] = Status.STARTED_INSIDE, Status.OUT_OF_STEPS
+        distance = torch.where(inside, reached.entry, torch.where(not_finite, reached.distance, reached.leave))
+        residual, closest = reached.value.clone(), reached.least.clone()
+        index, settled = solved.index, solved.settled
+        status[index] = torch.where(settled, Status.HIT, Status.OUT_OF_STEPS).to(status.dtype)
+        residual[index] = solved.value.nan_to_num(0.0)
+        distance = distance.index_put((index,), torch.where(settled, solved.distance, solved.distance.detach()))
+        closest = closest.index_put((index[settled],), solved.change[settled])
+        sampled = reached.least.isfinite()
+        queried = sampled.nonzero().squeeze(-1)
+        rendering = assemble(
+            rays,
+            self.sphere_radius,
+            distance=distance,
+            status=status,
+            residual=residual,
+            closest=(queried, closest[queried]),
+        )
+        left_out = (sampled & (status != Status.HIT)).view(rays.shape)
+        return replace(rendering, deferred=Deferred(reached.least_distance.clone().view(rays.shape), left_out))
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Where m of the rays, at `index`, cross the surface, as far as they are `settled`; see `gradients.Crossing`."""
+
+    index: Int[Tensor, " m"]
+    distance: Float[Tensor, " m"]
+    value: Float[Tensor, " m"]
+    slope: Float[Tensor, " m"]
+    begun: Float[Tensor, " m"]
+    change: Float[Tensor, " m"]
+    settled: Bool[Tensor, " m"]
+
+    @property
+    def columns(self) -> tuple[Tensor, ...]:
+        """All of them, in their order."""
+        return tuple(getattr(self, column.name) for column in fields(self))
+
+    def some(self, which: Bool[Tensor, " m"]) -> "Solved":
+        """The same of some of them."""
+        return Solved(*(column[which] for column in self.columns))
+
+    def joined(self, other: "Solved") -> "Solved":
+        """These, and behind them the others."""
+        return Solved(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
+
+    def updated(self, some: Int[Tensor, " k"], *columns: Tensor) -> "Solved":
+        """The same with other answers for some of them: the columns behind the index."""
+        pairs = zip(self.columns[1:], columns, strict=True)
+        return Solved(self.index, *(old.index_put((some,), new) for old, new in pairs))
+
+
+def _keep_crossing(ends: Float[Tensor, "m 4"], index: Int[Tensor, " k"], distance: Tensor, value: Tensor) -> None:
+    """Writes the first change of sign among the samples of k rays, where they have one, as the ends of a Bracket."""
+    found, bracket = first_crossing(distance, value)
+    ends[index[found]] = torch.stack([bracket.near, bracket.far, bracket.near_value, bracket.far_value], dim=1)

@@ -1,0 +1,271 @@
+"""A rendering of the same rays as in the last iteration of an optimisation, begun where that one ended.
+
+How far the field's values have moved is measured where the field is asked anyway: at the last hits, and at the closest
+samples of some misses. A ray on whose path the field was larger than twice that movement is as free as before. A hit is
+solved again from its last place, by the Newton step that its gradient needs. All other rays are marched, from where
+their path came close to a surface if it is free up to there.
+
+None of this is a proof, since the movement is measured at samples. An audit marches one ray in a hundred from its
+beginning, whatever is known of it. Where the two answers differ too often, all rays are.
+"""
+
+from dataclasses import dataclass, field, replace
+from threading import get_ident
+from weakref import ref
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Rays
+from renderers.field import Field
+from renderers.packed_march import CLEAR, Reached, march
+from renderers.rendering import Rendering
+from renderers.tracer import Solved, Tracer
+
+SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have moved further
+STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
+MOSTLY = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
+MOST = 0.4  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
+LOOKED = 16  # of so many misses, the field is asked about one in a rendering
+WIDTH = 0.25  # times the value at a closest sample: how far before and behind it the field is asked for a closer one
+AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
+SHARE = 0.1  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
+WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
+APART = 10.0  # times march_epsilon: crossings further apart differ
+
+
+@dataclass
+class Image:
+    """What is known of n rays in one row, all of it without a graph.
+
+    Args:
+        reached: where the march left them.
+        hit, distance, slope: whether they met a surface, where, and the slope of the field along the ray there.
+        moved: how far values have moved since the first rendering, in field units.
+        step: how far of that in the last rendering.
+        marched: what `moved` was when the ray was last marched from its beginning.
+        looked: what it was when the field was last asked at its closest sample; infinite where that lies on a coarse
+            ray, or has been moved.
+        asked: of which misses the last loss wanted the gradient.
+        renderings: their number so far.
+    """
+
+    reached: Reached
+    hit: Bool[Tensor, " n"]
+    distance: Float[Tensor, " n"]
+    slope: Float[Tensor, " n"]
+    moved: Float[Tensor, ""]
+    step: Float[Tensor, ""]
+    marched: Float[Tensor, " n"]
+    looked: Float[Tensor, " n"]
+    asked: Bool[Tensor, " n"]
+    renderings: int = 0
+
+    @staticmethod
+    def of(reached: Reached, step: Float[Tensor, ""]) -> "Image":
+        """Rays that were just marched."""
+        none = torch.zeros_like(reached.distance)
+        never, unknown = torch.zeros_like(none).bool(), torch.full_like(none, torch.inf)
+        return Image(reached, never, none, none, none.sum(), step, none, unknown, never)
+
+    def note(self, solved: Solved) -> None:
+        """Notes where the rays meet a surface now."""
+        solved = solved.some(solved.settled)
+        self.hit = torch.zeros_like(self.hit).index_fill(0, solved.index, True)
+        self.distance = self.distance.index_put((solved.index,), solved.distance.detach())
+        self.slope = self.slope.index_put((solved.index,), solved.slope)
+        self.renderings += 1
+
+    def free(self, tracer: Tracer, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
+
+        Between two samples a march that may go too far by `extra_step_cap` has seen half the smaller value, less half
+        of that cap. A hit is not compared with what it passed on its last descent, which its Newton step sees.
+        """
+        margin = 2 * (moved - self.marched) + tracer.extra_step_cap
+        passed, up_to_anchor = self.reached.passed, margin < CLEAR
+        passed = torch.where(self.hit, passed, torch.minimum(passed, self.reached.least))
+        return (margin < passed) & (up_to_anchor | ~self.hit), up_to_anchor
+
+
+@dataclass
+class Memory:
+    """What an optimisation remembers: its images of rays, as long as these exist, and what the audit found.
+
+    It serves one optimisation in one thread: in another thread nothing is remembered.
+    """
+
+    images: dict[int, tuple[ref[Tensor], ref[Tensor], Image]] = field(default_factory=dict)
+    audited: int = 0
+    differed: int = 0
+    thread: int = field(default_factory=get_ident)
+
+    def forget(self) -> None:
+        """Begins another optimisation."""
+        self.images, self.audited, self.differed, self.thread = {}, 0, 0, get_ident()
+
+    @property
+    def unsound(self) -> bool:
+        """Whether the audit found so much that nothing is taken from memory any more."""
+        return self.audited >= ENOUGH and self.differed > WRONG * self.audited
+
+    def of(self, rays: Rays) -> Image | None:
+        """What is known of these very rays."""
+        origins, directions, image = self.images.get(id(rays.origins), (None, None, None))
+        known = origins is not None and origins() is rays.origins
+        return image if known and directions is not None and directions() is rays.directions else None
+
+    def keep(self, rays: Rays, image: Image) -> None:
+        """Remembers an image until its rays are gone."""
+        images, key = self.images, id(rays.origins)
+        images[key] = ref(rays.origins, lambda _: images.pop(key, None)), ref(rays.directions), image
+
+    def audit(self, rays: int, differing: int) -> bool:
+        """Notes how many audited rays have another answer; whether these are too many for one rendering."""
+        self.audited += rays
+        self.differed += differing
+        return differing > max(1, SHARE * rays)
+
+    def notes(self) -> list[str]:
+        """What the audit found, for the record; nothing where there was none."""
+        if not self.audited:
+            return []
+        found = f"renderer.warm: {self.differed} of {self.audited} audited rays had another answer when marched anew"
+        return [f"{found}: too many, so nothing was taken from memory any more" if self.unsound else found]
+
+
+def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rendering:
+    """The rendering, from what the memory knows of the rays; and from now on it knows more.
+
+    Rays with a gradient of their own move from one iteration to the next, and are not remembered.
+    """
+    if rays.origins.requires_grad or rays.directions.requires_grad or memory.thread != get_ident():
+        return tracer.assembled(rays, *tracer.trace(field, rays))
+    image, solved = memory.of(rays), None
+    if image is not None and not memory.unsound and _worthwhile(image, tracer):
+        solved = _continued(tracer, memory, field, rays.flat(), image)
+    if image is None or solved is None:
+        image, solved = _begun(tracer, field, rays, image)
+        memory.keep(rays, image)
+    image.note(solved)
+    rendering, known = tracer.assembled(rays, image.reached, solved), image
+
+    def note_asked(wanted: Bool[Tensor, "*rays"]) -> None:
+        known.asked = wanted.flatten()
+
+    assert rendering.deferred is not None
+    return replace(rendering, deferred=replace(rendering.deferred, asked=note_asked))
+
+
+def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tuple[Image, Solved]:
+    """All rays marched coarse to fine; what was known of them tells how far values have moved."""
+    reached, solved = tracer.trace(field, rays)
+    step = torch.zeros_like(reached.distance).sum()
+    if before is not None:
+        again = solved.some(solved.settled & before.hit[solved.index])
+        apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
+        step = SAFETY * apart.quantile(MOSTLY) if len(apart) else step
+    return Image.of(reached, step), solved
+
+
+def _worthwhile(image: Image, tracer: Tracer) -> bool:
+    """Whether enough rays will be free, if values move as far as the last time."""
+    free, _ = image.free(tracer, image.moved + image.step)
+    return bool((~free).sum() <= MOST * len(free))
+
+
+def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: Image) -> Solved | None:
+    """The crossings of flat rays; None where so many must be marched that coarse to fine is cheaper."""
+    reached = image.reached
+    steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
+    solved = tracer.solve(field, rays, reached, steady, image.distance[steady], furthest=CLEAR)
+    with torch.no_grad():
+        image.step = torch.maximum(SAFETY * _largest(solved.begun), _look(field, rays, image))
+        image.moved = image.moved + image.step
+        _move_closer(field, rays, image)
+        free, up_to_anchor = image.free(tracer, image.moved)
+        certain = free & ~image.hit.index_put((steady,), ~solved.settled)
+        audited = torch.zeros_like(free)
+        audited[STRIDE * image.renderings % AUDITED :: AUDITED] = True
+        index = (~certain | audited).nonzero().squeeze(-1)
+        if len(index) > MOST * len(free):
+            return None
+        anchored = up_to_anchor & ~audited
+        moving = _from_anchors(
+            Reached.on_sphere(rays[index], tracer.sphere_radius), reached.some(index), anchored[index]
+        )
+        march(field, rays[index], moving, tracer.stepping, tracer.steps)
+    found = tracer.crossings(field, rays[index], moving)
+    found = Solved(index[found.index], *found.columns[1:])
+    with torch.no_grad():
+        differing = _differing(tracer, solved, found, certain & audited)
+        if memory.audit(int((certain & audited).sum()), differing):
+            return None
+        reached.table[index] = moving.table
+        image.looked[index] = image.moved
+        image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
+    return solved.some((certain & ~audited)[solved.index]).joined(found)
+
+
+def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) -> Reached:
+    """Rays that start at their anchor, where they are `anchored`; what they have passed up to there stays known."""
+    passed = known.passed.clamp_min(CLEAR)
+    for column, value in (
+        (Reached.DISTANCE, known.anchor),
+        (Reached.ANCHOR, known.anchor),
+        (Reached.PASSED, passed),
+    ):
+        start.table[:, column] = torch.where(anchored, value, start.table[:, column])
+    return start
+
+
+def _look(field: Field, rays: Rays, image: Image) -> Float[Tensor, ""]:
+    """Asks the field at the closest samples of a share of the misses; how much further than thought values moved."""
+    reached = image.reached
+    turn = torch.zeros_like(image.hit)
+    turn[image.renderings % LOOKED :: LOOKED] = True
+    index = (turn & ~image.hit & ~image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
+    value = field(rays[index].at(reached.least_distance[index]))
+    beyond = (value - reached.least[index]).abs() - (image.moved - image.looked[index])
+    step = _largest(beyond.clamp_min(0)[image.looked[index].isfinite()])
+    reached.table[index, Reached.LEAST] = value
+    image.looked[index] = image.moved + step
+    return step
+
+
+def _move_closer(field: Field, rays: Rays, image: Image) -> None:
+    """Moves the closest samples of misses whose gradient the last loss wanted, to where the value is least now.
+
+    Beside an edge the squares of the values along a ray are a parabola; it is drawn through three of them.
+    """
+    reached = image.reached
+    index = (~image.hit & image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
+    at, width = reached.least_distance[index], WIDTH * reached.least[index].abs()
+    entry, leave = reached.entry[index], reached.leave[index]
+    places = torch.stack([at - width, at, at + width], dim=1).clamp(entry[:, None], leave[:, None])
+    values = field(rays.origins[index, None] + places[..., None] * rays.directions[index, None])
+    before, here, behind = values.square().unbind(dim=1)
+    bend = (before - 2 * here + behind).clamp_min(torch.finfo(values.dtype).tiny)
+    shift = (0.5 * (before - behind) / bend).nan_to_num(0.0).clamp(-1, 1) * width
+    reached.table[index, Reached.LEAST_DISTANCE] = (at + shift).clamp(entry, leave)
+    reached.table[index, Reached.LEAST] = values.gather(1, values.abs().argmin(dim=1, keepdim=True)).squeeze(1)
+    image.looked[index] = torch.inf
+
+
+def _differing(tracer: Tracer, kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:
+    """How many of the audited rays meet a surface elsewhere than was certain of them."""
+
+    def met(solved: Solved) -> Float[Tensor, " n"]:
+        nowhere = torch.full_like(audited, torch.inf, dtype=solved.distance.dtype)
+        solved = solved.some(solved.settled)
+        return nowhere.index_put((solved.index,), solved.distance.detach())[audited]
+
+    said, seen = met(kept), met(found)
+    alike = (said == seen) | ((said - seen).abs() <= APART * tracer.march_epsilon)
+    return int((~alike).sum())
+
+
+def _largest(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """The largest magnitude; 0 of nothing, infinite where one is not finite."""
+    return values.abs().nan_to_num(torch.inf).amax() if values.numel() else values.new_zeros(())
