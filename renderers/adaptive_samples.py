@@ -85,6 +85,17 @@ class Following:
         """That of the inner renderer."""
         return silhouette_loss(self.current(), field, rays, rendering, observed)
 
+    def fresh(self) -> "Following":
+        """For another optimisation: nothing is measured yet."""
+        return replace(self, seen=Seen())
+
+    def final_notes(self) -> list[str]:
+        """The final number of samples; none before a shape was seen."""
+        if self.seen.thinnest == inf:
+            return []
+        part = f"a part {self.seen.thinnest:.3g} scene units thick"
+        return [f"renderer.n_ray_samples=auto ends with {self.n_ray_samples}, for {part}"]
+
     def at_max_samples(self) -> Spaced:
         """The inner renderer with the largest number of samples."""
         return self.inner.with_samples(MOST)
@@ -117,22 +128,9 @@ def follow(renderer: Renderer) -> Following:
     )
 
 
-def fresh(renderer: Renderer) -> Renderer:
-    """The renderer for one of several optimisations: where it follows a shape, nothing is measured yet."""
-    return replace(renderer, seen=Seen()) if isinstance(renderer, Following) else renderer
-
-
 def at_max_samples(renderer: Renderer) -> Renderer:
     """The renderer for evaluating different fields alike: with most samples, where their number follows the shape."""
     return renderer.at_max_samples() if isinstance(renderer, Following) else renderer
-
-
-def final_note(renderer: Renderer) -> list[str]:
-    """A note of the final number of `renderer.n_ray_samples=auto`; none without it or before a shape was seen."""
-    if not isinstance(renderer, Following) or renderer.seen.thinnest == inf:
-        return []
-    part = f"a part {renderer.seen.thinnest:.3g} scene units thick"
-    return [f"renderer.n_ray_samples=auto ends with {renderer.n_ray_samples}, for {part}"]
 
 
 def thinnest(field: Field, rendering: Rendering, *, radius: float) -> float:

@@ -69,6 +69,14 @@ class Newton(Tracer):
             return warm_trace(self, self.memory, field, rays)
         return self.assembled(rays, *self.trace(field, rays))
 
+    def fresh(self) -> "Newton":
+        """For another optimisation: no ray is remembered."""
+        return replace(self, memory=Memory())
+
+    def final_notes(self) -> list[str]:
+        """What the audit of the warm start found."""
+        return self.memory.notes()
+
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:

@@ -127,6 +127,19 @@ class Scheduled(Protocol):
 
 
 @runtime_checkable
+class Remembering(Protocol):
+    """A renderer that remembers something of the optimisation that it serves."""
+
+    def fresh(self) -> Renderer:
+        """The renderer for another optimisation, with nothing remembered."""
+        ...
+
+    def final_notes(self) -> list[str]:
+        """What a reader of the record should know of what it remembers; none before it was used."""
+        ...
+
+
+@runtime_checkable
 class Guided(Protocol):
     """A renderer whose own silhouette loss takes given distances as well; the mask alone is `silhouette_loss`."""
 
@@ -152,6 +165,16 @@ class Spaced(Renderer, Protocol):
 def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
     """The renderer as it is at an iteration of an optimisation: itself, unless it has a schedule."""
     return renderer.at_iteration(iteration) if isinstance(renderer, Scheduled) else renderer
+
+
+def fresh(renderer: Renderer) -> Renderer:
+    """The renderer for one of several optimisations: itself, unless it remembers something."""
+    return renderer.fresh() if isinstance(renderer, Remembering) else renderer
+
+
+def final_notes(renderer: Renderer) -> list[str]:
+    """What is to be noted of an optimisation that a renderer served; none unless it remembers something."""
+    return renderer.final_notes() if isinstance(renderer, Remembering) else []
 
 
 def closest_values(

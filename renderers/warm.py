@@ -5,8 +5,10 @@ samples of some misses. A ray on whose path the field was larger than twice that
 solved again from its last place, by the Newton step that its gradient needs. All other rays are marched, from where
 their path came close to a surface if it is free up to there.
 
-None of this is a proof, since the movement is measured at samples. An audit marches one ray in a hundred from its
-beginning, whatever is known of it. Where the two answers differ too often, all rays are.
+None of this is a proof, since the movement is measured at samples: what appears on a path on which no value was asked
+for is seen when the ray is marched again. An audit marches one ray in a hundred from its beginning, whatever is known
+of it, and another one the next time. Where the two answers differ too often, all rays are. The closest samples of
+misses are moved only where a loss wanted their gradient.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,11 +29,12 @@ SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have mov
 STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
 MOSTLY = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
 MOST = 0.4  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
-LOOKED = 16  # of so many misses, the field is asked about one in a rendering
+LOOKED = 17  # of so many rays, the field is asked about one in each rendering; no part of a usual image's width
 WIDTH = 0.25  # times the value at a closest sample: how far before and behind it the field is asked for a closer one
 AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
-SHARE = 0.1  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
+SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
 WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
+REFRESHED = 8  # one of so many rays, at most, has its closest sample moved in a rendering
 APART = 10.0  # times march_epsilon: crossings further apart differ
 
 
@@ -45,8 +48,7 @@ class Image:
         moved: how far values have moved since the first rendering, in field units.
         step: how far of that in the last rendering.
         marched: what `moved` was when the ray was last marched from its beginning.
-        looked: what it was when the field was last asked at its closest sample; infinite where that lies on a coarse
-            ray, or has been moved.
+        known: whether the field's last value at the closest sample is known: it may lie on a coarse ray.
         asked: of which misses the last loss wanted the gradient.
         renderings: their number so far.
     """
@@ -58,7 +60,7 @@ class Image:
     moved: Float[Tensor, ""]
     step: Float[Tensor, ""]
     marched: Float[Tensor, " n"]
-    looked: Float[Tensor, " n"]
+    known: Bool[Tensor, " n"]
     asked: Bool[Tensor, " n"]
     renderings: int = 0
 
@@ -66,8 +68,8 @@ class Image:
     def of(reached: Reached, step: Float[Tensor, ""]) -> "Image":
         """Rays that were just marched."""
         none = torch.zeros_like(reached.distance)
-        never, unknown = torch.zeros_like(none).bool(), torch.full_like(none, torch.inf)
-        return Image(reached, never, none, none, none.sum(), step, none, unknown, never)
+        never = torch.zeros_like(none).bool()
+        return Image(reached, never, none, none, none.sum(), step, none, never, never)
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
@@ -148,7 +150,8 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
     if image is None or solved is None:
         image, solved = _begun(tracer, field, rays, image)
         memory.keep(rays, image)
-    image.note(solved)
+    else:
+        image.note(solved)
     rendering, known = tracer.assembled(rays, image.reached, solved), image
 
     def note_asked(wanted: Bool[Tensor, "*rays"]) -> None:
@@ -166,7 +169,11 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
         again = solved.some(solved.settled & before.hit[solved.index])
         apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
         step = SAFETY * apart.quantile(MOSTLY) if len(apart) else step
-    return Image.of(reached, step), solved
+    image = Image.of(reached, step)
+    image.note(solved)
+    with torch.no_grad():
+        _look(field, rays.flat(), image)
+    return image, solved
 
 
 def _worthwhile(image: Image, tracer: Tracer) -> bool:
@@ -181,7 +188,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
     steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
     solved = tracer.solve(field, rays, reached, steady, image.distance[steady], furthest=CLEAR)
     with torch.no_grad():
-        image.step = torch.maximum(SAFETY * _largest(solved.begun), _look(field, rays, image))
+        image.step = SAFETY * torch.maximum(_largest(solved.begun), _look(field, rays, image))
         image.moved = image.moved + image.step
         _move_closer(field, rays, image)
         free, up_to_anchor = image.free(tracer, image.moved)
@@ -203,7 +210,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         if memory.audit(int((certain & audited).sum()), differing):
             return None
         reached.table[index] = moving.table
-        image.looked[index] = image.moved
+        image.known[index] = True
         image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
     return solved.some((certain & ~audited)[solved.index]).joined(found)
 
@@ -221,17 +228,16 @@ def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) 
 
 
 def _look(field: Field, rays: Rays, image: Image) -> Float[Tensor, ""]:
-    """Asks the field at the closest samples of a share of the misses; how much further than thought values moved."""
+    """Asks the field at the closest samples of a share of the misses; how far these values have moved."""
     reached = image.reached
     turn = torch.zeros_like(image.hit)
-    turn[image.renderings % LOOKED :: LOOKED] = True
+    turn[::LOOKED] = True
     index = (turn & ~image.hit & ~image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
     value = field(rays[index].at(reached.least_distance[index]))
-    beyond = (value - reached.least[index]).abs() - (image.moved - image.looked[index])
-    step = _largest(beyond.clamp_min(0)[image.looked[index].isfinite()])
+    moved = _largest((value - reached.least[index])[image.known[index]])
     reached.table[index, Reached.LEAST] = value
-    image.looked[index] = image.moved + step
-    return step
+    image.known[index] = True
+    return moved
 
 
 def _move_closer(field: Field, rays: Rays, image: Image) -> None:
@@ -241,6 +247,8 @@ def _move_closer(field: Field, rays: Rays, image: Image) -> None:
     """
     reached = image.reached
     index = (~image.hit & image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
+    turns = -(-len(index) * REFRESHED // max(len(image.hit), 1))
+    index = index[image.renderings % turns :: turns] if turns else index
     at, width = reached.least_distance[index], WIDTH * reached.least[index].abs()
     entry, leave = reached.entry[index], reached.leave[index]
     places = torch.stack([at - width, at, at + width], dim=1).clamp(entry[:, None], leave[:, None])
@@ -250,7 +258,7 @@ def _move_closer(field: Field, rays: Rays, image: Image) -> None:
     shift = (0.5 * (before - behind) / bend).nan_to_num(0.0).clamp(-1, 1) * width
     reached.table[index, Reached.LEAST_DISTANCE] = (at + shift).clamp(entry, leave)
     reached.table[index, Reached.LEAST] = values.gather(1, values.abs().argmin(dim=1, keepdim=True)).squeeze(1)
-    image.looked[index] = torch.inf
+    image.known[index] = False
 
 
 def _differing(tracer: Tracer, kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:

@@ -22,9 +22,8 @@ from bench.setup.fields import FitSettings
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import NotReached, OptimiserSettings, Unsupported, check_kind
-from renderers.adaptive_samples import fresh
 from renderers.field import Counts, Field, Meter
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, fresh
 
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # the costs in an Evidence

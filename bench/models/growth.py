@@ -10,8 +10,8 @@ from bench.models.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate
 from bench.setup.fields import GrowthSettings
-from renderers.adaptive_samples import final_note
 from renderers.field import Field
+from renderers.rendering import final_notes
 
 MIN_TRIAL = 8  # iterations, where a quarter of the fit is more than that
 # Constants of the model `cost`, in milliseconds of a core, fitted to nine candidates at 256, 1,024 and 4,096 rays;
@@ -49,9 +49,9 @@ class Growth:
         path, size = " -> ".join(self.fields), self.fitted.model.size
         found = f"field={requested}: {path}, {size}, held-out error {error:.3g}"
         if not self.footprint or error <= self.footprint:
-            return [found, *final_note(self.fitted.renderer)]
+            return [found, *final_notes(self.fitted.renderer)]
         above = f"above half a pixel ({self.footprint:.3g}): {self.end}; more iterations may help"
-        return [f"{found}, {above}", *final_note(self.fitted.renderer)]
+        return [f"{found}, {above}", *final_notes(self.fitted.renderer)]
 
     @property
     def overhead(self) -> float:

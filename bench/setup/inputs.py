@@ -20,8 +20,8 @@ from bench.shape_prior.store import prior_for, prior_settings
 from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
-from renderers.adaptive_samples import final_note, follow
-from renderers.rendering import Renderer
+from renderers.adaptive_samples import follow
+from renderers.rendering import Renderer, final_notes
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class RunInputs:
     def last_notes(self) -> list[str]:
         """Notes at the end of a run: repairs of the scene's mesh, if it was made, and the final number of samples."""
         repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
-        return [*repairs, *final_note(self.renderer)]
+        return [*repairs, *final_notes(self.renderer)]
 
     @cached_property
     def prior(self) -> Prior:

@@ -23,8 +23,8 @@ from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.problem import check_field_gradient
 from bench.solve.solve import COSTS
 from datasets.truth import Truth
-from renderers.adaptive_samples import final_note
 from renderers.checks import check_choice, check_positive, check_share
+from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
 
 TINY = 1e-9  # seconds: for a clock that did not move
@@ -122,7 +122,7 @@ class Capacity:
             result.mesh.save(run.folder / "mesh.ply")
         saving = pixel_precision_summary(metrics, chosen.candidate.name)
         precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, *saving]]
-        record.notes = [*record.notes, summary(choice, growth), *final_note(chosen.renderer), *precision_notes]
+        record.notes = [*record.notes, summary(choice, growth), *final_notes(chosen.renderer), *precision_notes]
         title = f"{record.task}, {record.name}, {record.scene}"
         filmstrip.save(run.folder, f"{title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name)
         if inputs.evaluation.picture is not None:

@@ -11,10 +11,10 @@ from bench.records.record import Record
 from bench.run.execute import execute
 from bench.setup.auto import samples
 from bench.setup.inputs import set_up
-from renderers.adaptive_samples import Following, Seen, at_max_samples, final_note, follow, fresh, thickness, thinnest
+from renderers.adaptive_samples import Following, Seen, at_max_samples, follow, thickness, thinnest
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.rendering import Observed, Renderer, Scheduled, Status, at_iteration
+from renderers.rendering import Observed, Renderer, Scheduled, Status, at_iteration, final_notes, fresh
 from tests.renderers.analytic_cases import vector
 from tests.tiny import camera_of, silent
 
@@ -183,12 +183,12 @@ def test_a_run_notes_the_first_and_the_final_number(compose_config, tmp_path):
 
 def test_each_of_several_fits_measures_its_own_shape_and_all_are_evaluated_alike():
     shared = follow(DVR)
-    assert final_note(shared) == final_note(DVR) == []
+    assert final_notes(shared) == final_notes(DVR) == []
     plate, ball = fresh(shared), fresh(shared)
     for renderer, shape in ((plate, PLATE), (ball, sphere(0.6)), (plate, PLATE)):
         at_iteration(renderer, 0).render(shape, RAYS)
     assert [renderer.n_ray_samples for renderer in (shared, plate, ball)] == [16, 81, 16]
-    assert final_note(plate) == ["renderer.n_ray_samples=auto ends with 81, for a part 0.05 scene units thick"]
+    assert final_notes(plate) == ["renderer.n_ray_samples=auto ends with 81, for a part 0.05 scene units thick"]
     for renderer in (shared, plate, ball):
         assert torch.equal(at_max_samples(renderer).render(PLATE, RAYS).hit, hits_of(PLATE, RAYS, 128).hit)
     assert at_max_samples(DVR) is fresh(DVR) is DVR

@@ -1,0 +1,235 @@
+"""The warm start: what a rendering finds that begins where the last one ended is what one from the beginning finds."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.config import load
+from renderers.boundary import rendered
+from renderers.camera import Rays
+from renderers.field import Field, Kind, Meter
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.rendering import Rendering, Status, at_iteration, final_notes, fresh
+from renderers.silhouette import Hinge
+from renderers.warm import AUDITED, ENOUGH, Memory
+from tests.tiny import camera_of
+
+RAYS = camera_of(64, angles=(30.0, 25.0)).rays()
+COLD = load("renderer", "newton", warm=False)
+NOTHING = sphere(0.01, (0.0, 0.9, 0.0))
+
+
+@pytest.fixture
+def warm():
+    return load("renderer", "newton", warm=True)
+
+
+def in_turn(renderer, fields, rays: Rays = RAYS) -> list[tuple[Rendering, int]]:
+    """Each field's rendering in an optimisation, and the values that it took."""
+    found = []
+    for iteration, field in enumerate(fields):
+        meter = Meter(field)
+        found.append((rendered(at_iteration(renderer, iteration), meter, rays), meter.counts.value))
+    return found
+
+
+def differing(found: Rendering, field: Field, rays: Rays = RAYS) -> int:
+    """Rays that end otherwise when they are marched from the beginning."""
+    cold = COLD.render(field, rays)
+    apart = (found.distance - cold.distance).abs() > 2e-4
+    return int(((found.hit != cold.hit) | (found.hit & apart)).sum())
+
+
+def begun() -> int:
+    """The values that an optimisation's first rendering of the ball takes."""
+    return in_turn(fresh(load("renderer", "newton", warm=True)), [ball(0.5)])[0][1]
+
+
+def ball(radius: float, x: float = 0.0) -> Shape:
+    return sphere(radius, (x, 0.0, 0.0))
+
+
+def test_a_shape_that_moves_is_found_with_fewer_values(warm):
+    fields = [ball(0.5 + 0.0005 * i, x=0.001 * i) for i in range(20)]
+    renderings = in_turn(warm, fields)
+    assert max(differing(found, field) for (found, _), field in zip(renderings, fields, strict=True)) <= 1
+    cold = sum(values for _, values in in_turn(COLD, fields))
+    assert sum(values for _, values in renderings) < 0.7 * cold
+
+
+def test_a_shape_that_stays_costs_its_hits_and_little_besides(warm):
+    (found, _), _, _, (again, values) = in_turn(warm, [ball(0.5)] * 4)
+    assert torch.equal(found.hit, again.hit)
+    torch.testing.assert_close(again.distance, found.distance, atol=5e-5, rtol=0)
+    assert found.hit.sum() < values < 0.45 * begun()
+
+
+def test_a_thin_part_that_enters_from_the_side_is_seen(warm):
+    wall = box((0.9, 0.9, 0.02)).translate((0.0, 0.0, -0.3))
+    fields = [wall | box((0.15, 0.15, 0.01)).translate((-1.0 + 0.02 * i, 0.1, 0.3)) for i in range(40)]
+    renderings = in_turn(warm, fields)
+    assert max(differing(found, field) for (found, _), field in zip(renderings, fields, strict=True)) <= 5
+
+
+def test_hits_that_leave_become_misses(warm):
+    fields = [ball(0.4 - 0.01 * i) for i in range(39)]
+    for (found, _), field in zip(in_turn(warm, fields), fields, strict=True):
+        assert differing(found, field) <= 1
+
+
+@pytest.mark.parametrize("second", [box((0.6, 0.3, 0.4)), NOTHING, ball(0.3, x=0.5), ball(0.3) | ball(0.3, x=-0.6)])
+def test_a_field_that_jumps_is_found_at_once(warm, second):
+    _, (found, _) = in_turn(warm, [ball(0.5), second])
+    assert differing(found, second) == 0
+
+
+def test_what_appears_where_no_value_moved_is_found_by_the_audit(warm):
+    plate = ball(0.5) | box((0.9, 0.9, 0.01)).translate((0.0, 0.0, 0.7))
+    blind = {"on": True}
+
+    def values(points):
+        """The plate shows only to rays that pass it from their beginning."""
+        return torch.where(points[..., 2] > 0.6, plate(points), ball(0.5)(points)) if blind["on"] else ball(0.5)(points)
+
+    field = Shape(values, Kind.BOUND, None)
+    blind["on"] = False
+    rays = replace(RAYS, origins=RAYS.origins.clone())
+    at_iteration(warm, 0).render(field, rays)
+    blind["on"] = True
+    found = at_iteration(warm, 1).render(field, rays)
+    assert differing(found, field, rays) == 0
+    assert "had another answer" in final_notes(warm)[0]
+
+
+def test_after_too_many_disagreements_nothing_is_taken_from_memory(warm):
+    in_turn(warm, [ball(0.5)] * 2)
+    warm.memory.audited, warm.memory.differed = ENOUGH, ENOUGH
+    assert warm.memory.unsound
+    assert "nothing was taken from memory" in final_notes(warm)[0]
+    meter = Meter(ball(0.5))
+    at_iteration(warm, 2).render(meter, RAYS)
+    assert meter.counts.value == begun()
+
+
+def test_the_audit_takes_one_ray_in_a_hundred_and_another_one_each_time(warm):
+    in_turn(warm, [ball(0.5)] * 11)
+    assert 9.5 < warm.memory.audited / (64 * 64 / AUDITED) < 10.5
+    assert final_notes(warm) == [
+        f"renderer.warm: 0 of {warm.memory.audited} audited rays had another answer when marched anew"
+    ]
+
+
+def test_another_optimisation_remembers_nothing(warm):
+    in_turn(warm, [ball(0.5)] * 3)
+    assert in_turn(warm, [ball(0.5)])[0][1] == begun()
+    in_turn(warm, [ball(0.5)] * 2)
+    assert fresh(warm).memory == Memory(thread=warm.memory.thread) != warm.memory
+    assert final_notes(fresh(warm)) == final_notes(COLD) == []
+
+
+def test_renderings_outside_of_an_optimisation_neither_use_nor_change_what_is_remembered(warm):
+    in_turn(warm, [ball(0.5)] * 2)
+    before = [image.renderings for *_, image in warm.memory.images.values()]
+    meter, cold = Meter(ball(0.5)), Meter(ball(0.5))
+    warm.render(meter, RAYS)
+    COLD.render(cold, RAYS)
+    assert meter.counts.value == cold.counts.value
+    assert [image.renderings for *_, image in warm.memory.images.values()] == before == [2]
+
+
+def test_a_camera_that_moves_is_another_image_and_rays_that_are_gone_are_forgotten(warm):
+    at_iteration(warm, 0).render(ball(0.5), RAYS)
+    moved = camera_of(64, angles=(40.0, 25.0)).rays()
+    found = at_iteration(warm, 1).render(ball(0.5), moved)
+    assert differing(found, ball(0.5), moved) == 0
+    assert len(warm.memory.images) == 2
+    del moved, found
+    assert len(warm.memory.images) == 1
+
+
+def test_rays_with_a_gradient_are_not_remembered(warm):
+    origins = RAYS.origins.clone().requires_grad_(True)
+    for iteration in range(2):
+        found = at_iteration(warm, iteration).render(ball(0.5), replace(RAYS, origins=origins))
+    assert found.distance.requires_grad
+    assert not warm.memory.images
+
+
+def test_a_batch_of_views(warm):
+    other = camera_of(64, angles=(120.0, 25.0)).rays()
+    views = Rays(
+        torch.stack([RAYS.origins, other.origins]), torch.stack([RAYS.directions, other.directions]), image=True
+    )
+    fields = [ball(0.5, x=0.01 * i) for i in range(4)]
+    for (found, _), field in zip(in_turn(warm, fields, views), fields, strict=True):
+        assert found.distance.shape == (2, 64, 64)
+        assert differing(found, field, views) <= 1
+
+
+def test_rays_that_are_no_image(warm):
+    flat = RAYS.flat()
+    fields = [ball(0.5, x=0.01 * i) for i in range(4)]
+    for (found, _), field in zip(in_turn(warm, fields, flat), fields, strict=True):
+        assert differing(found, field, flat) <= 1
+
+
+def test_a_field_that_is_nan_somewhere(warm):
+    def values(points):
+        inner = ball(0.5)(points)
+        return torch.where(points[..., 0] > 0.3, torch.nan, inner)
+
+    broken = Shape(values, Kind.BOUND, None)
+    for field in (broken, ball(0.5), broken, broken, ball(0.5)):
+        found = rendered(at_iteration(warm, 1), field, RAYS)
+        for part in (found.distance, found.closest, found.residual):
+            assert part.isfinite().all()
+    assert differing(found, ball(0.5)) == 0
+
+
+def test_in_another_thread_nothing_is_remembered(warm):
+    in_turn(warm, [ball(0.5)] * 2)
+
+    def values() -> int:
+        meter = Meter(ball(0.5))
+        at_iteration(warm, 2).render(meter, RAYS)
+        return meter.counts.value
+
+    cold = in_turn(COLD, [ball(0.5)])[0][1]
+    with ThreadPoolExecutor(1) as pool:
+        elsewhere = pool.submit(values).result()
+    assert values() < elsewhere == cold
+
+
+def test_its_gradient_is_that_of_a_rendering_from_the_beginning(warm):
+    mask = torch.zeros(64, 64, dtype=torch.bool)
+    mask[10:50, 12:60] = True
+    loss = Hinge(5e-5, signed=True, average="violating")
+    for iteration in range(4):
+        by = []
+        for renderer in (at_iteration(warm, iteration), COLD):
+            radius = torch.tensor(0.4 + 0.004 * iteration, requires_grad=True)
+            field = Shape(lambda points, radius=radius: points.norm(dim=-1) - radius, Kind.DISTANCE, None)
+            found = renderer.render(field, RAYS)
+            (found.distance[found.hit].sum() + loss.of_rendering(field, RAYS, found, mask)).backward()
+            by.append(radius.grad.item())
+        assert by[0] == pytest.approx(by[1], rel=0.01)
+
+
+def test_closest_samples_that_a_loss_asked_for_follow_the_shape(warm):
+    everywhere = torch.ones(64, 64, dtype=torch.bool)
+    loss = Hinge(5e-5, signed=True, average="all")
+    for iteration in range(12):
+        field = ball(0.2, x=0.5 - 0.06 * iteration)
+        found = at_iteration(warm, iteration).render(field, RAYS)
+        with torch.enable_grad():
+            loss.of_rendering(
+                Shape(lambda p, f=field: f(p) + torch.zeros((), requires_grad=True), Kind.BOUND, None),
+                RAYS,
+                found,
+                everywhere,
+            )
+    cold = COLD.render(field, RAYS)
+    seen = ~cold.hit & (cold.status == Status.MISS) & (cold.closest < 0.5)
+    assert (found.closest - cold.closest)[seen].mean() < 0.02
