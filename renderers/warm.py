@@ -28,7 +28,7 @@ from renderers.tracer import Solved, Tracer
 SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have moved further
 STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
 MOSTLY = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
-MOST = 0.4  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
+MOST = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
 LOOKED = 17  # of so many rays, the field is asked about one in each rendering; no part of a usual image's width
 WIDTH = 0.25  # times the value at a closest sample: how far before and behind it the field is asked for a closer one
 AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
