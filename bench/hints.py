@@ -53,6 +53,8 @@ RENAMED = {  # what users typed before, a choice as GROUP/NAME or a key, and wha
     "task.samples": "renderer.n_gradient_samples",
     **{f"task.{name}": f"task.optimiser.{name}" for name in ("iterations", "learning_rate", "schedule")},
     **{f"task.code_{name}": f"task.code.{name}" for name in ("weight", "average")},
+    "scale.limits.seconds": "scale.limits.values",
+    "task.limits.seconds": "task.limits.values",
     "ladder.rungs": "models.candidates",
     "ladder": "models",
     **{f"ladder.{name}": f"models.{name}" for name in ("fit", "growth", "views")},

@@ -1,7 +1,7 @@
-"""Limits of time and memory of a rendering, checked at each evaluation of the field."""
+"""Limits of work and memory of a rendering, checked at each evaluation of the field."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from renderers.checks import check_positive
 from renderers.field import Field, Wrapper
 
 MEMORY_INTERVAL = 0.05  # seconds between two checks of the memory
+LEAST = 32  # values that a call counts as at least: calls for fewer points take about as long
 
 
 class LimitReached(Exception):
@@ -27,16 +28,19 @@ class LimitReached(Exception):
 class Limits:
     """The limits of one rendering, or of one step of an optimisation.
 
+    Work is limited, and not time, so that a busy or a slow machine reaches no other limit than a quiet one.
+
     Args:
-        seconds: of wall-clock time.
+        values: of the field, most of them that are evaluated. A call counts as `LEAST` or more, and as much again where
+            a gradient is propagated back through it.
         memory: rise above the process's memory before, in GiB.
     """
 
-    seconds: float
+    values: float
     memory: float
 
     def __post_init__(self) -> None:
-        check_positive("limits.seconds", self.seconds, "60 suits a laptop")
+        check_positive("limits.values", self.values, "4e6 is about a minute of a laptop with a network of 8 x 512")
         check_positive("limits.memory", self.memory, "8 GiB suit a laptop")
 
     def watch(self, inner: Field, device: torch.device, work: str = "") -> "Watched":
@@ -52,29 +56,38 @@ class Limits:
 
 @dataclass
 class Watched(Wrapper):
-    """A Field that raises LimitReached when it is evaluated, or differentiated, beyond the limits."""
+    """A Field that raises LimitReached when it is evaluated, or differentiated, beyond the limits.
+
+    Args:
+        where: the end of the reason: " in a step".
+        spent: values evaluated so far, as `Limits` counts them.
+    """
 
     inner: Field
     limits: Limits
     memory: MemoryPeak
-    where: str = ""  # " in a step": the end of the reason
-    started: float = field(default_factory=lambda: time.perf_counter())
+    where: str = ""
+    spent: int = 0
     memory_checked: float = 0.0
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        self._check()
+        self._spend(points.numel() // 3)
         values = self.inner(points)
         if values.requires_grad:
-            values.register_hook(self._check_backward)
+            values.register_hook(lambda gradient: self._spend(gradient.numel()))
         return values
 
-    def _check_backward(self, gradient: Tensor) -> None:
-        self._check()
+    def _spend(self, values: int) -> None:
+        """Counts values before they are evaluated.
 
-    def _check(self) -> None:
+        Raises:
+            LimitReached: where they are too many, or the memory has grown too much.
+        """
+        self.spent += max(values, LEAST)
+        if self.spent > self.limits.values:
+            reason = f"more than {self.limits.values:,.0f} field values{self.where}"
+            raise LimitReached(RunStatus.TIMEOUT, reason)
         now = time.perf_counter()
-        if now - self.started > self.limits.seconds:
-            raise LimitReached(RunStatus.TIMEOUT, f"more than {self.limits.seconds:g} s{self.where}")
         if now - self.memory_checked > MEMORY_INTERVAL:
             self.memory_checked = now
             growth = self.memory.growth()

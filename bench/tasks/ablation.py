@@ -239,11 +239,11 @@ class Workbench:
         return time.perf_counter() - start
 
     def _clock(self, name: str, work: Callable[[Field], float], repeats: int) -> Clocked:
-        """Times the same work `repeats` times, or until all took a quarter of the time limit of one."""
+        """Times the same work `repeats` times, or until all took a quarter of the values that one may take."""
         seconds: list[float] = []
         second: list[float] = []
-        counts, memory = Counts(), None
-        while len(seconds) < repeats and (not seconds or sum(seconds) < self.limits.seconds / 4):
+        counts, memory, spent = Counts(), None, 0
+        while len(seconds) < repeats and spent < self.limits.values / 4:
             counts = Counts()
             field = self.limits.watch(self.decoder.at(self.code), self.device, name)
             synchronise(self.device)
@@ -251,5 +251,6 @@ class Workbench:
             second.append(work(Meter(field, counts)))
             synchronise(self.device)
             seconds.append(time.perf_counter() - start)
+            spent += field.spent
             memory = field.memory.growth() if memory is None else max(memory, field.memory.growth() or 0)
         return Clocked(seconds, second, counts, memory, counts.flops(self.decoder.at(self.code)))

@@ -1,4 +1,4 @@
-"""Limits on time and memory: reached, told with their kind and number, and no hindrance below."""
+"""Limits on work and memory: reached, told with their kind and number, and no hindrance below."""
 
 import ctypes
 
@@ -7,7 +7,7 @@ import torch
 
 from bench.machine import limits
 from bench.machine.environment import MemoryPeak
-from bench.machine.limits import LimitReached, Limits
+from bench.machine.limits import LEAST, LimitReached, Limits
 from bench.records.record import RunStatus
 from renderers.field import Flops, Kind
 from renderers.fields.analytic import Shape, sphere
@@ -20,7 +20,7 @@ MIB = 2**20
 
 def test_below_the_limits_values_are_unchanged():
     points = torch.rand(7, 3, requires_grad=True)
-    values = Limits(seconds=60, memory=8).watch(FIELD, CPU)(points)
+    values = Limits(values=1e6, memory=8).watch(FIELD, CPU)(points)
     assert torch.equal(values, FIELD(points))
     (gradient,) = torch.autograd.grad(values.sum(), points)
     (expected,) = torch.autograd.grad(FIELD(points).sum(), points)
@@ -29,36 +29,43 @@ def test_below_the_limits_values_are_unchanged():
 
 def test_properties_of_the_field_pass_through():
     field = Shape(FIELD.function, Kind.LEVEL, lipschitz=3.0, flops=Flops(11, 13))
-    watched = Limits(seconds=60, memory=8).watch(field, CPU)
+    watched = Limits(values=1e6, memory=8).watch(field, CPU)
     assert (watched.kind, watched.lipschitz, watched.flops) == (Kind.LEVEL, 3.0, Flops(11, 13))
 
 
-def test_time_is_limited_from_when_the_watch_begins(clock):
-    limit = Limits(seconds=0.2, memory=8)
-    clock.sleep(0.25)
-    watched = limit.watch(FIELD, CPU)
-    clock.sleep(0.19)
-    watched(POINTS)
-    clock.sleep(0.02)
-    with pytest.raises(LimitReached) as caught:
-        watched(POINTS)
-    assert caught.value.status is RunStatus.TIMEOUT
-    assert str(caught.value) == "more than 0.2 s"
+def test_values_are_limited_from_when_the_watch_begins():
+    limit = Limits(values=100, memory=8)
+    for _ in range(2):
+        watched = limit.watch(FIELD, CPU, "a step")
+        watched(torch.zeros(60, 3))
+        watched(torch.zeros(2, 20, 3))
+        with pytest.raises(LimitReached) as caught:
+            watched(POINTS)
+        assert caught.value.status is RunStatus.TIMEOUT
+        assert str(caught.value) == "more than 100 field values in a step"
 
 
-def test_time_is_limited_on_the_way_back_too(clock):
-    points = POINTS.clone().requires_grad_(True)
-    watched = Limits(seconds=0.2, memory=8).watch(FIELD, CPU)
+def test_a_call_for_few_points_counts_as_one_for_more():
+    watched = Limits(values=10 * LEAST, memory=8).watch(FIELD, CPU)
+    for _ in range(10):
+        watched(torch.zeros(1, 3))
+    assert watched.spent == 10 * LEAST
+    with pytest.raises(LimitReached, match=r"more than 320 field values"):
+        watched(torch.zeros(1, 3))
+
+
+def test_values_are_limited_on_the_way_back_too():
+    points = torch.zeros(60, 3, requires_grad=True)
+    watched = Limits(values=100, memory=8).watch(FIELD, CPU)
     values = watched(points + 1)
-    clock.sleep(0.25)
-    with pytest.raises(LimitReached, match=r"more than 0\.2 s") as caught:
+    with pytest.raises(LimitReached, match=r"more than 100 field values") as caught:
         values.sum().backward()
     assert caught.value.status is RunStatus.TIMEOUT
     assert points.grad is None
 
 
 def test_memory_is_limited(clock):
-    limit = Limits(seconds=60, memory=0.125)
+    limit = Limits(values=1e6, memory=0.125)
     watched, held = limit.watch(FIELD, CPU), []
     if watched.memory.growth() is None:
         pytest.skip("the memory of a process cannot be measured here")
@@ -73,7 +80,7 @@ def test_memory_is_limited(clock):
 
 
 def test_memory_is_limited_on_the_way_back_too(monkeypatch):
-    watched = Limits(seconds=60, memory=1).watch(FIELD, CPU)
+    watched = Limits(values=1e6, memory=1).watch(FIELD, CPU)
     values = watched(POINTS.clone().requires_grad_(True) + 1)
     monkeypatch.setattr(watched, "memory_checked", 0.0)
     monkeypatch.setattr(watched.memory, "growth", lambda: 2**30 + 1)
@@ -81,11 +88,10 @@ def test_memory_is_limited_on_the_way_back_too(monkeypatch):
         values.sum().backward()
 
 
-def test_where_memory_cannot_be_measured_time_is_still_limited(clock, monkeypatch):
+def test_where_memory_cannot_be_measured_work_is_still_limited(monkeypatch):
     monkeypatch.setattr(MemoryPeak, "growth", lambda self: None)
-    watched = Limits(seconds=60, memory=1e-6).watch(FIELD, CPU)
+    watched = Limits(values=LEAST, memory=1e-6).watch(FIELD, CPU)
     watched(POINTS)
-    clock.sleep(61)
     with pytest.raises(LimitReached) as caught:
         watched(POINTS)
     assert caught.value.status is RunStatus.TIMEOUT
@@ -94,7 +100,7 @@ def test_where_memory_cannot_be_measured_time_is_still_limited(clock, monkeypatc
 def test_the_memory_is_not_checked_in_every_evaluation(clock, monkeypatch):
     looks = []
     monkeypatch.setattr(MemoryPeak, "growth", lambda self: looks.append(1) or 0)
-    watched = Limits(seconds=60, memory=1).watch(FIELD, CPU)
+    watched = Limits(values=1e6, memory=1).watch(FIELD, CPU)
     for number in (1, 2):
         for _ in range(100):
             watched(POINTS)
@@ -103,10 +109,10 @@ def test_the_memory_is_not_checked_in_every_evaluation(clock, monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["seconds", "memory"])
+@pytest.mark.parametrize("name", ["values", "memory"])
 def test_invalid_limits_are_errors(name, wrong):
     with pytest.raises(ValueError, match=rf"limits\.{name} must be positive, not {wrong}"):
-        Limits(**({"seconds": 1.0, "memory": 1.0} | {name: wrong}))
+        Limits(**({"values": 1.0, "memory": 1.0} | {name: wrong}))
 
 
 def held_but_free(mib: int) -> torch.Tensor:

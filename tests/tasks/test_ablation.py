@@ -1,7 +1,6 @@
 """What a renderer costs on one view: counts, clock, limits and errors, on networks of a few neurons."""
 
 import json
-import time
 import weakref
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -29,7 +28,7 @@ from renderers.field import Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 from tests.tiny import PEAK, ball_prior, camera_of, phases_of, run_of
 
-SETTINGS = Ablation(repeats=2, limits=Limits(seconds=60, memory=8), smallest=2, wrong=0.02)
+SETTINGS = Ablation(repeats=2, limits=Limits(values=1e6, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
 SIZE = 16
 ERRORS = ("rays", "hits", "lost", "false", "wrong", "depth_error_median", "depth_error_p99", "depth_error_max")
@@ -243,11 +242,11 @@ def test_where_nothing_is_hit_there_is_no_depth_error(tmp_path, monkeypatch):
 
 
 @dataclass
-class Slow(Fake):
-    """Takes a while for each rendering with more rays than some, and asks the field again after it."""
+class Costly(Fake):
+    """Evaluates more values in each rendering with more rays than some."""
 
     above: int = 0
-    seconds: float = 0.0
+    values: int = 0
     rendered: list[int] = field(default_factory=list)
     held: list[Any] = field(default_factory=list)  # weak references to what each rendering made
 
@@ -257,27 +256,27 @@ class Slow(Fake):
         self.held.append(weakref.ref(made))
         self.rendered.append(rays.shape.numel())
         if rays.shape.numel() > self.above:
-            time.sleep(self.seconds)
+            field(torch.zeros(self.values, 3))
         return super().render(field, rays)
 
 
-def test_where_the_time_is_up_a_smaller_image_is_measured(clock, tmp_path):
-    slow = Slow(above=16 * 16 - 1, seconds=0.5)
-    run = measured(tmp_path, slow, replace(SETTINGS, limits=Limits(0.4, 8)))
+def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
+    costly = Costly(above=16 * 16 - 1, values=10_000)
+    run = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(9000, 8)))
     side = SIZE // SMALLER
     assert run.record.status is RunStatus.TIMEOUT
-    assert run.record.reason == f"more than 0.4 s in a step at 16 x 16; it finishes at {side} x {side}"
+    assert run.record.reason == f"more than 9,000 field values in a step at 16 x 16; it finishes at {side} x {side}"
     assert run.record.metrics["size"] == side
     assert run.record.metrics["rays"] == side**2
     assert np.load(run.folder / "images.npz")["hit"].shape == (side, side)
-    # Each size begins with a warm-up. What is too slow once is not tried again.
-    assert slow.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
+    # Each size begins with a warm-up. What is too much once is not tried again.
+    assert costly.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
 
 
 def test_where_the_memory_is_up_a_smaller_image_is_measured(tmp_path, monkeypatch):
     growths = iter([2**34])
     monkeypatch.setattr(limits.MemoryPeak, "growth", lambda self: next(growths, 12345))
-    run = measured(tmp_path, Slow(), replace(SETTINGS, limits=Limits(60, 15.5)))
+    run = measured(tmp_path, Costly(), replace(SETTINGS, limits=Limits(1e6, 15.5)))
     side = SIZE // SMALLER
     assert run.record.status is RunStatus.OOM
     assert run.record.reason == f"more than 15.5 GiB of memory in a step at 16 x 16; it finishes at {side} x {side}"
@@ -285,21 +284,21 @@ def test_where_the_memory_is_up_a_smaller_image_is_measured(tmp_path, monkeypatc
 
 
 def test_a_limit_says_whether_a_step_or_a_rendering_reached_it(tmp_path):
-    class SlowForward(Slow):
+    class CostlyForward(Costly):
         def render(self, field: Field, rays: Rays) -> Rendering:
-            self.seconds = 0.0 if torch.is_grad_enabled() else 0.5
+            self.values = 0 if torch.is_grad_enabled() else 10_000
             return super().render(field, rays)
 
-    run = measured(tmp_path, SlowForward(above=16 * 16 - 1), replace(SETTINGS, limits=Limits(0.4, 8)))
-    assert run.record.reason.startswith("more than 0.4 s in a rendering at 16 x 16; ")
+    run = measured(tmp_path, CostlyForward(above=16 * 16 - 1), replace(SETTINGS, limits=Limits(9000, 8)))
+    assert run.record.reason.startswith("more than 9,000 field values in a rendering at 16 x 16; ")
 
 
 @pytest.mark.parametrize("smallest", [SIZE // SMALLER + 1, SIZE, 1])
-def test_where_no_size_finishes_there_are_no_numbers(clock, tmp_path, smallest):
-    slow = Slow(above=0, seconds=0.06)
-    run = measured(tmp_path, slow, replace(SETTINGS, limits=Limits(0.05, 8), smallest=smallest))
+def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
+    costly = Costly(above=0, values=1000)
+    run = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(900, 8), smallest=smallest))
     assert run.record.status is RunStatus.TIMEOUT
-    assert run.record.reason == "more than 0.05 s in a step at 16 x 16; it finishes at no smaller size"
+    assert run.record.reason == "more than 900 field values in a step at 16 x 16; it finishes at no smaller size"
     assert run.record.metrics == {}
     assert not (run.folder / "images.npz").exists()
 
@@ -310,18 +309,18 @@ def test_an_asked_size_below_the_smallest_is_measured(tmp_path):
     assert run.record.metrics["size"] == 4
 
 
-@pytest.mark.parametrize(("seconds", "times"), [(0.0, 5), (0.12, 1)])
-def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(clock, tmp_path, seconds, times):
-    slow = Slow(above=WARM_UP**2, seconds=seconds)
-    run = measured(tmp_path, slow, replace(SETTINGS, repeats=5, limits=Limits(0.4, 8)))
+@pytest.mark.parametrize(("values", "times"), [(0, 5), (1000, 1)])
+def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, values, times):
+    costly = Costly(above=WARM_UP**2, values=values)
+    run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK
     assert run.record.metrics["repeats"] == times
-    assert slow.rendered == [WARM_UP**2] + [SIZE**2] * 2 * times
+    assert costly.rendered == [WARM_UP**2] + [SIZE**2] * 2 * times
 
 
 def test_the_warm_up_is_neither_timed_nor_counted(tmp_path):
-    slow = Slow(above=WARM_UP**2 - 1, seconds=0.0)
-    run = measured(tmp_path, slow, replace(SETTINGS, repeats=1))
+    costly = Costly(above=WARM_UP**2 - 1)
+    run = measured(tmp_path, costly, replace(SETTINGS, repeats=1))
     assert run.record.metrics["step_queries"] == run.record.metrics["queries"] == SIZE**2
 
 

@@ -30,7 +30,7 @@ def run(folder: Path, stress: str, renderer, *, resolution: int = 24) -> dict:
     folder.mkdir(exist_ok=True)
     run = run_of(folder, renderer, ball_prior(), camera_of(8))
     small = SearchSettings(levels=5, repeats=2)
-    Stability(stress_named(stress), SEARCH, small, CRITERIA, SHORT, resolution, Limits(60, 8)).execute(run)
+    Stability(stress_named(stress), SEARCH, small, CRITERIA, SHORT, resolution, Limits(1e8, 8)).execute(run)
     assert run.record.status is RunStatus.OK
     return run.record.metrics
 
@@ -108,7 +108,7 @@ def test_a_renderer_that_always_raises_has_crashed(tmp_path):
             raise RuntimeError("no more")
 
     run = run_of(tmp_path, Broken(**vars(load("renderer", "idr"))), ball_prior(), camera_of(8))
-    Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, SHORT, 16, Limits(60, 8)).execute(run)
+    Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, SHORT, 16, Limits(1e8, 8)).execute(run)
     assert run.record.status is RunStatus.CRASHED
     assert run.record.reason == "every trial raised an error: RuntimeError: no more"
     assert "trials raised an error, the last: RuntimeError: no more" in run.record.notes[0]
@@ -118,7 +118,7 @@ def test_success_that_rises_with_severity_is_noted(tmp_path):
     stress = stress_named("gap")
     turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
     run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
-    Stability(turned, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(60, 8)).execute(run)
+    Stability(turned, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(1e8, 8)).execute(run)
     assert any(note.startswith("success does not fall with severity") for note in run.record.notes)
 
 
@@ -204,9 +204,9 @@ def test_a_missing_setting_is_an_error_before_the_first_trial(tmp_path):
 
 def test_a_task_without_a_stress_names_the_remedy():
     with pytest.raises(ValueError, match="set stress=thin_plate"):
-        Stability(None, SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(60, 8))
+        Stability(None, SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(1e8, 8))
     with pytest.raises(ValueError, match=r"task\.resolution must be at least 8, not 4"):
-        replace(Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(60, 8)), resolution=4)
+        replace(Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(1e8, 8)), resolution=4)
 
 
 def test_a_fit_is_searched_with_its_own_settings(tmp_path):
