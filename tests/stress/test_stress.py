@@ -189,6 +189,16 @@ def test_pixels_are_counted_by_kind_of_error():
     assert wide.numbers["false"] == (wide.images["kinds"] == 3).sum() > 20
 
 
+def test_spurious_hits_are_judged_by_their_share_of_the_hits():
+    exam, renderer = SCENES["wires"](0.05, drawn(), 32), load("renderer", "idr", epsilon=0.005)
+    numbers = judge_rendering(exam, renderer, conditions()).numbers
+    of_hits, of_rays = numbers["false"] / numbers["hits"], numbers["false"] / 32**2
+    assert 0 < of_rays < of_hits
+    for allowed, failure in (((of_rays + of_hits) / 2, Failure.FALSE), (1.01 * of_hits, Failure.NONE)):
+        judged = replace(conditions(), criteria=replace(CRITERIA, false_hits=allowed))
+        assert judge_rendering(exam, renderer, judged).failure is failure
+
+
 def test_the_footprint_is_a_pixel_at_the_true_distance():
     exam = SCENES["near_camera"](1.0, drawn(), 33)  # from there it looks at the sphere's middle
     first, footprint = truth(exam)
