@@ -229,6 +229,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     epsilon = stress_named("epsilon")
     assert epsilon.stressed(load("renderer", "idr"), 0.01).epsilon == 0.01
     assert stress_named("few_steps").stressed(load("renderer", "idr"), 12.4).steps == 12
+    assert stress_named("few_steps").stressed(load("renderer", "idr"), 0.3).steps == 1  # a renderer takes no 0
     with pytest.raises(Unsupported, match="DVR has no epsilon, or it is null: choose another"):
         epsilon.stressed(load("renderer", "dvr"), 0.01)
     with pytest.raises(Unsupported, match="DVR has no n_gradient_samples"):
