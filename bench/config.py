@@ -125,6 +125,8 @@ def check_names(config: DictConfig) -> None:
         if key not in names:
             what = f"{key}/{config[key]}" if isinstance(config[key], str) else key
             raise ValueError(f"unknown key {key!r}{renamed(what) or nearest(key, names)}")
+    if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
+        raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
     loss, task = config.get("silhouette") or {}, config.get("task") or {}
     if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {*task, *task.get("fit", {})}:
         raise ValueError("silhouette is read by task=completion, pose, capacity and stability alone: leave it out")

@@ -80,7 +80,8 @@ def renamed(name: str, known: list[str] | None = None) -> str:
 def nearest(word: str, known: list[str]) -> str:
     """A hint at the end of an error message: the nearest known names, or all of them."""
     last = [name for name in known if "." not in word and name.rsplit(".", 1)[-1] == word]
-    close = last or [name for name in get_close_matches(word, known, n=3, cutoff=0.5) if name != word]
+    folder = [name for name in known if "/" in word and name.startswith(word.rpartition("/")[0] + "/")]
+    close = last or [name for name in get_close_matches(word, folder or known, n=3, cutoff=0.5) if name != word]
     if close:
         return f": did you mean {' or '.join(close)}?"
     roots = [name for name in known if not any(name.startswith(f"{other}_") for other in known)]

@@ -1,4 +1,4 @@
-"""`python -m bench.tune`: writes each method's best drawn setting as a file of method/tuned.
+"""`python -m bench.tune --into conf/method/tuned`: writes each method's best drawn setting as a file of its own.
 
 It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
 on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice.
@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from bench.config import CONF
 from bench.records.files import write_text
 from bench.records.format import number
 from bench.records.read import read_records
 from bench.report.data.experiments import Experiment, choose
-from bench.report.data.tuning import SPACE, TUNING, Tuning, tunings, unfinished
+from bench.report.data.tuning import SPACE, TUNING, Tuning, left_out, tunings, unfinished
 
 HEAD = """# @package _global_
 # Draw {draw} of {draws} of method/space/{method}: geometric mean of Chamfer x 1000 on {runs} validation runs
-# {best}, of the median draw {middle}. Written by `python -m bench.tune` from runs of commit {commit}; do not edit.
+# at scale={scale} of {families}: {best}, of the median draw {middle}.
+# Written by `python -m bench.tune` from runs of commit {commit}; do not edit.
 defaults:
   - /method/{method}
   - _self_
@@ -44,8 +44,14 @@ def write(results_dir: Path, folder: Path) -> list[str]:
     found = tunings(experiment)
     if not found:
         raise ValueError("no draw has a run on every validation and test shape for every method: sweep over them all")
+    if len(found[0].draws) < 2:
+        raise ValueError(
+            f"draw {found[0].draws[0]} alone has a run on every shape for every method, and one is no choice: type the "
+            "command of the sweep again, it makes the others"
+        )
     folder.mkdir(parents=True, exist_ok=True)
-    lines = []
+    lacking = left_out(experiment, found)
+    lines = [f"left out, since a method or a shape lacks them: draws {', '.join(map(str, lacking))}"] if lacking else []
     for method in found:
         path = folder / f"{method.method}.yaml"
         write_text(path, _text(method, experiment))
@@ -65,6 +71,8 @@ def _text(method: Tuning, experiment: Experiment) -> str:
         runs=method.validation.shape[1],
         best=number(np.exp(method.scores[method.best])),
         middle=number(np.exp(np.median(method.scores))),
+        scale=" and ".join(sorted({record["config"]["scale"]["name"] for record in records})),
+        families=" and ".join(sorted({record["config"]["dataset"]["name"] for record in records})),
         commit=" and ".join(sorted(commits)),
     )
     node = OmegaConf.create({"label": f"{method.label}, tuned"})
@@ -77,12 +85,11 @@ def main(arguments: list[str]) -> int:
     """Writes the files and prints a line for each."""
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__.split("\n\n")[1])
     parser.add_argument("--results", type=Path, default=Path("results"), metavar="FOLDER", help="results folder")
-    parser.add_argument(
-        "--into", type=Path, default=CONF / "method" / "tuned", metavar="FOLDER", help="where the files go"
-    )
+    folder = "where the files go: conf/method/tuned to use them as +method=tuned/NAME; without it, RESULTS/tuned"
+    parser.add_argument("--into", type=Path, metavar="FOLDER", help=folder)
     options = parser.parse_args(arguments)
     try:
-        print("\n".join(write(options.results, options.into)))
+        print("\n".join(write(options.results, options.into or options.results / "tuned")))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

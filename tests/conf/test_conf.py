@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, build, check_names, load, register
-from bench.hints import RENAMED, SETTINGS, STRATEGIES, renamed
+from bench.hints import RENAMED, SETTINGS, STRATEGIES, nearest, renamed
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
@@ -459,6 +459,18 @@ def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
         check_names(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "pose", "capacity", "stability", "gradients"):
         check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
+
+
+def test_a_draw_is_refused_where_no_setting_is_drawn(compose_config):
+    with pytest.raises(ValueError, match=r"draw is read by a method of method/space alone: add \+method=space/NAME"):
+        check_names(compose_config("renderer=dist", "draw=3"))
+    check_names(compose_config("+method=space/dist_mask", "draw=3"))
+
+
+def test_a_name_of_a_folder_is_compared_with_the_names_there():
+    known = ["dist_mask", "tuned/dist_mask", "tuned/idr_mask", "space/dist_mask"]
+    assert nearest("tuned/dist_masc", known).startswith(": did you mean tuned/dist_mask")
+    assert "did you mean dist_mask" in nearest("dist_masc", known)
 
 
 def test_a_mask_loss_is_a_file_and_no_name(compose_config):

@@ -138,7 +138,7 @@ def test_intervals_hold_the_mean_and_pairing_is_by_shape(tmp_path):
     assert cell(result, OTHER, "Ratio to the reference") == "2.00 [2.00, 2.00]"
     assert cell(result, REFERENCE, "Mean rank") == "1.00"
     assert cell(result, OTHER, "Mean rank") == "2.00"
-    assert p_values(result) == [f"{OTHER} is no better (0 of 8 shapes) than {REFERENCE}: p = 0.0078"]  # 2 / 2^8
+    assert p_values(result) == [f"{OTHER} has a lower error than {REFERENCE} on 0 of 8 shapes: p = 0.0078"]  # 2 / 2^8
 
 
 @pytest.mark.parametrize("missing", ["deleted", "not_run"])
@@ -178,7 +178,7 @@ def test_a_method_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
     result = made(tmp_path, table2.make_intervals)
     assert cell(result, OTHER, "Ratio to the reference").startswith("∞")
     assert cell(result, OTHER, "Shapes with a failure") == "6 of 6 [54.1, 100] %"
-    assert p_values(result) == [f"{OTHER} is no better (0 of 6 shapes) than {REFERENCE}: p = 0.031"]
+    assert p_values(result) == [f"{OTHER} has a lower error than {REFERENCE} on 0 of 6 shapes: p = 0.031"]
 
 
 def test_wins_are_counted_on_the_runs_that_both_have(tmp_path):

@@ -39,6 +39,7 @@ def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), kill
                         **{"split": split, "draw": draw, "index": index, "dataset": {"name": "sofa"}},
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
+                        "scale": {"name": "desk"},
                     },
                 )
 
@@ -123,11 +124,31 @@ def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
     assert f"{path}: " in capsys.readouterr().out
     text = path.read_text()
     assert text.startswith("# @package _global_\n# Draw 1 of 4 of method/space/dist_mask: geometric mean")
-    assert "6 validation runs\n# 1.00, of the median draw 2.45" in text
+    assert "6 validation runs\n# at scale=desk of sofa: 1.00, of the median draw 2.45" in text
     node = OmegaConf.load(path)
     assert node.defaults == ["/method/dist_mask", "_self_"]
     assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
     assert set(node) == {"defaults", "label", "task", "renderer"}
+
+
+def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):
+    drawn(tmp_path, left_out={("test", draw, 0) for draw in (0, 2)})
+    drawn(tmp_path, method="idr_mask")
+    for path in tmp_path.glob("runs/*/record.json"):
+        text = path.read_text().replace('"steps": 13', '"steps": 11')
+        path.write_text(text)
+    assert main(["--results", str(tmp_path)]) == 0
+    assert "lacks them: draws 0, 2" in capsys.readouterr().out
+    for name in ("dist_mask", "idr_mask"):
+        assert OmegaConf.load(tmp_path / "tuned" / f"{name}.yaml").renderer.steps == 11
+
+
+def test_one_draw_is_no_choice(tmp_path, capsys):
+    drawn(tmp_path, left_out={("test", draw, 0) for draw in (0, 2, 3)})
+    drawn(tmp_path, method="idr_mask")
+    assert main(["--results", str(tmp_path)]) == 1
+    assert "draw 1 alone has a run on every shape" in capsys.readouterr().err
+    assert not (tmp_path / "tuned").exists()
 
 
 def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):

@@ -125,6 +125,12 @@ def tunings(experiment: Experiment) -> list[Tuning]:
     return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
 
 
+def left_out(experiment: Experiment, methods: list[Tuning]) -> list[int]:
+    """The draws that some runs have, and that no method is read on, since others lack them."""
+    used = {draw for method in methods for draw in method.draws}
+    return sorted({_draw(record) for record in experiment.records} - used)
+
+
 def _tuning(method: str, table: Table, draws: list[int], worst: dict[str, dict[RunKey, float]]) -> Tuning:
     used = {split: [[table[split, draw, run] for run in of] for draw in draws] for split, of in worst.items()}
     logs = {
@@ -140,7 +146,7 @@ def _tuning(method: str, table: Table, draws: list[int], worst: dict[str, dict[R
         method=method.removeprefix(SPACE),
         label=str(first.get("label") or method.removeprefix(SPACE)),
         draws=draws,
-        settings=_settings([line[0] for line in used[VALIDATION]]),
+        settings=_settings([line[0] for line in used[VALIDATION]], [*table.values()]),
         validation=logs[VALIDATION],
         test=logs[TEST],
         failures=failed[VALIDATION],
@@ -169,11 +175,12 @@ def _worst(tables: list[Table], split: str, draws: list[int], runs: list[RunKey]
     return {run: max((value for value in of if math.isfinite(value)), default=1.0) for run, of in found.items()}
 
 
-def _settings(records: list[Record]) -> list[dict[str, Any]]:
-    """The values in which the configurations of a method's draws differ, by dotted key."""
-    flat = [dict(_flat(record["config"])) for record in records]
-    varies = [name for name in flat[0] if len({str(each.get(name)) for each in flat}) > 1]
+def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]]:
+    """The values of some of a method's draws, by dotted key, in which the configurations of any of its draws differ."""
+    every = [dict(_flat(record["config"])) for record in among]
+    varies = [name for name in every[0] if len({str(each.get(name)) for each in every}) > 1]
     names = [name for name in varies if name.partition(".")[0] not in {*OTHER, *NEUTRAL_KEYS}]
+    flat = [dict(_flat(record["config"])) for record in records]
     return [{name: each[name] for name in names} for each in flat]
 
 

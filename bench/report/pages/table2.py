@@ -253,14 +253,14 @@ def _statistics(runs: Completions, cell: Cell, mean: statistics.Interval) -> dic
 
 
 def _tests(runs: Completions, reference: Row) -> list[str]:
-    """A note for each row: whether it is better than the reference over the shapes of all families, Holm's p-value."""
+    """A note for each row: on how many shapes of all families it has the lower error; Holm's p-value."""
     found: dict[str, float] = {}
     for row in runs.rows:
         first, second = runs.pair(EVERY, row, reference)
         if row != reference and len(first) > 1:
             won = statistics.lower(*map(statistics.shape_medians, (first, second)))
-            better = f"{'better' if 2 * won > len(first) else 'no better'} ({won:g} of {len(first)} shapes)"
-            found[f"{row.name} is {better} than {reference.name}"] = statistics.compare(first, second)
+            shapes = f"on {won:g} of {len(first)} shapes"
+            found[f"{row.name} has a lower error than {reference.name} {shapes}"] = statistics.compare(first, second)
     adjusted = statistics.holm([*found.values()]) if found else []
     return [f"{test}: p = {p:.2g}" for test, p in zip(found, adjusted, strict=True)]
 

@@ -14,6 +14,7 @@ from bench.report.data.statistics import Interval
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 MOST_FAILURES = 4  # most failed runs that a caption lists one by one
 OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
+FEWEST_COUNTED = 4  # rows that are named one by one in a warning; more are counted
 SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."
 FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
@@ -138,7 +139,8 @@ def _loaded(experiment: Experiment) -> str:
     """A warning where other work on the machine, or a missing synchronisation, makes times doubtful."""
     doubtful = ("loaded machine", "missing synchronisation")
     names = [r["name"] for r in experiment.named() if any(note.startswith(doubtful) for note in r["notes"])]
-    rows = "all rows" if len(names) == len(experiment.records) > 1 else _listed(names)
+    few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(experiment.records)} runs"
+    rows = "all rows" if len(names) == len(experiment.records) > 1 else few
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
 
 

@@ -41,7 +41,7 @@ def write_index(results_dir: Path) -> Path:
         papers=find_paper(results_dir),
         problems=problems,
         statuses=Counter(record["status"] for record in records),
-        machines=Counter(_machine(record) for record in records if record["environment"]),
+        machines=Counter(_machine(record) for record in records if record["environment"].get("cpu")),
         tones=TONES,
     )
     # Names and reasons may contain bytes that are not text; the page must be written all the same.
