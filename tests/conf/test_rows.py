@@ -71,7 +71,7 @@ def rows(plan: sweep.Plan) -> list[str]:
 
 @pytest.mark.parametrize(
     ("experiment", "ours"),
-    [("table1", 12), ("stability", 12), ("speed_completion", 20), ("speed_rendering", 20), ("crossing", 4)],
+    [("table1", 13), ("stability", 13), ("speed_completion", 21), ("speed_rendering", 21), ("crossing", 4)],
 )
 def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_renderers(
     swept, tmp_path, package, experiment, ours
@@ -168,8 +168,11 @@ def test_records_and_plans_without_a_method_are_read(tmp_path):
     assert OmegaConf.create(record.config).renderer._label_ == "DIST"
 
 
+SPACE = "label: Mine\ntask:\n  silhouette_weight: ${drawn:0,1.0,100.0}\n"
+
+
 def test_the_tuning_has_all_spaces_and_the_tuned_rows_that_there_are(swept, tmp_path):
-    for folder, text in (("", "label: Mine\n"), ("space", "label: Mine\n"), ("tuned", "label: Mine, tuned\n")):
+    for folder, text in (("", "label: Mine\n"), ("space", SPACE), ("tuned", "label: Mine, tuned\n")):
         path = tmp_path / "own/method" / folder / "mine_mask.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"# @package _global_\n{text}")
