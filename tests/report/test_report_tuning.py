@@ -106,6 +106,7 @@ def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path
     drawn(tmp_path, method="idr_mask", shapes=7, scale=10)
     first, second = tunings(read(tmp_path))
     assert first.draws == second.draws == [0, 1, 3]
+    assert "lacks them: draws 2." in told(tuning.make(read(tmp_path)))
     assert first.test.shape == second.test.shape == (3, 6)
     assert second.test == pytest.approx(first.test + math.log(10))
     assert [(method.method, method.runs) for method in (first, second)] == [("dist_mask", 36), ("idr_mask", 36)]

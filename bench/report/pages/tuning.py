@@ -9,7 +9,7 @@ from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.completions import CHAMFER
 from bench.report.data.experiments import Experiment
-from bench.report.data.tuning import TUNING, Tuning, tunings, unfinished
+from bench.report.data.tuning import TUNING, Tuning, left_out, tunings, unfinished
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -85,6 +85,8 @@ def make(experiment: Experiment) -> Result:
     waiting = unfinished(experiment)
     sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].test_runs)} if methods else {}
     notes = [note.format(waiting=waiting, **sizes) for note in (NOTES if waiting else NOTES[:-1])] if methods else []
+    if methods and (lacking := left_out(experiment, methods)):
+        notes.append(f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, lacking))}.")
     notes = [*verdicts(methods), *notes]
     return Result(
         experiment,
