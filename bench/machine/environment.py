@@ -47,10 +47,22 @@ def describe(device: torch.device) -> dict[str, Any]:
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
+        "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
     }
+
+
+@contextmanager
+def using_threads(count: int) -> Iterator[None]:
+    """Within it, PyTorch uses so many threads of the CPU."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def gemm_peak(device: torch.device, repeats: int = 5) -> float:
