@@ -268,3 +268,12 @@ def test_size(value, text):
 )
 def test_seconds(value, text):
     assert format.seconds(value) == text
+
+
+def test_runs_that_differ_in_the_loss_of_the_mask_are_told_apart(tmp_path):
+    for name, loss in (("one", {}), ("two", {"_label_": "DIST's mask loss"})):
+        config = {"label": "IDR", "silhouette": loss}
+        write_run(tmp_path, record(name, config=config), name)
+    text = write_index(tmp_path).read_text()
+    assert text.count("IDR, DIST&#39;s mask loss") == 1
+    assert ">IDR<" in text

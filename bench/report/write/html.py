@@ -8,6 +8,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bench.records import format
 from bench.records.read import read_records
+from bench.records.record import row_name
 from bench.report.write.paper import find_paper, link
 
 # Colours of statuses; a status that is not listed is shown as bad.
@@ -56,10 +57,11 @@ def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     names = sorted({*record["metrics"], *record["metrics_start"]}, key=lambda name: (name in _NOT_OTHERS, name))
     machine, threads = _machine(record)
     return {
-        **{name: record[name] for name in ("folder", "task", "renderer", "dataset", "seed", "status", "reason")},
+        **{name: record[name] for name in ("folder", "task", "dataset", "seed", "status", "reason")},
         **{name: record[name] for name in ("started", "environment", "reused", "notes")},
         "definitions": {name: text for name in names if (text := _definition(record["definitions"], name))},
         **{name: _number(record, name) for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
+        "name": row_name(record["config"], record["renderer"]),
         "scene": record.get("scene") or record["dataset"],  # a run that failed early has no scene
         "metrics": {name: _value(record["metrics"], name) for name in names},
         "start": {name: _number(record["metrics_start"], name) for name in names},
