@@ -140,7 +140,8 @@ class Memory:
 def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rendering:
     """The rendering, from what the memory knows of the rays; and from now on it knows more.
 
-    Rays with a gradient of their own move from one iteration to the next, and are not remembered.
+    Rays with a gradient of their own move from one iteration to the next, and are not remembered. Others are known by
+    their tensors, which must not be changed in place.
     """
     if rays.origins.requires_grad or rays.directions.requires_grad or memory.thread != get_ident():
         return tracer.assembled(rays, *tracer.trace(field, rays))
