@@ -108,6 +108,14 @@ def test_lambertian_light_is_fixed(ball):
     lit = replace(PLAINLY, texture="plain", shading="lambertian").take(ball, CAMERA, seed=0)
     bright = [photograph.colours[photograph.view.mask].mean().item() for photograph in lit]
     assert max(bright) > 1.2 * min(bright)  # the ball has a dark side, which some cameras see
+    inner = [photograph.colours[12:20, 12:20] for photograph in lit]  # no outline pixels, which mix with the background
+    assert min(part.min() for part in inner) > 0.38 * max(part.max() for part in inner)  # which is not black
+
+
+def test_a_camera_turns_from_z_to_minus_x():
+    before, after = (camera.center.double() for camera in (CAMERA, turned(CAMERA, pi / 2)))
+    expected = torch.stack([-before[2], before[1], before[0]])
+    torch.testing.assert_close(after, expected, atol=1e-5, rtol=0)
 
 
 def test_a_surface_of_one_colour_is_refused(ball):

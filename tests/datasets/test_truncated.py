@@ -55,6 +55,12 @@ def test_a_file_without_its_end_is_truncated_wherever_it_was_cut(name, share, tm
         load_mesh(path)
 
 
+def test_a_file_without_its_last_face_is_truncated(tmp_path):
+    (tmp_path / "cut.stl").write_bytes(FORMATS["stl"][:-50])
+    with pytest.raises(ValueError, match="its header claims 320 faces, and it holds 319"):
+        load_mesh(tmp_path / "cut.stl")
+
+
 def test_a_header_of_four_thousand_million_faces_is_not_believed(tmp_path):
     data = bytearray(FORMATS["stl"])
     data[80:84] = struct.pack("<I", 4_000_000_000)

@@ -13,7 +13,7 @@ from renderers.field import Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Rendering, Status, at_iteration, final_notes, fresh
 from renderers.silhouette import Hinge
-from renderers.warm import AUDITED, ENOUGH, Memory
+from renderers.warm import AUDITED, ENOUGH, LOOKED, Memory
 from tests.tiny import camera_of
 
 RAYS = camera_of(64, angles=(30.0, 25.0)).rays()
@@ -83,6 +83,13 @@ def test_hits_that_leave_become_misses(warm):
 def test_a_field_that_jumps_is_found_at_once(warm, second):
     _, (found, _) = in_turn(warm, [ball(0.5), second])
     assert differing(found, second) == 0
+
+
+def test_where_values_move_too_far_nothing_is_asked_of_the_last_hits(warm):
+    fields = [ball(0.4, x=0.3 * i - 0.3) for i in range(3)]
+    *_, (_, values) = in_turn(warm, fields)
+    cold = in_turn(COLD, fields[-1:])[0][1]
+    assert cold <= values <= cold + 64 * 64 / LOOKED + 1
 
 
 def test_what_appears_where_no_value_moved_is_found_by_the_audit(warm):
