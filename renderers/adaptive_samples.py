@@ -179,7 +179,7 @@ def first_exit(field: Field, rays: Rays, *, radius: float) -> Float[Tensor, " n"
     spacing, diameter = 2 * radius / (MOST - 1), 2 * radius
     shares = torch.linspace(0, 1, round(2 * log2(MOST - 1)) + 1, dtype=rays.origins.dtype, device=rays.origins.device)
     distance = spacing * (diameter / spacing) ** shares
-    value = field(rays.origins[:, None] + distance[:, None] * rays.directions[:, None])
+    value = field(rays.at_each(distance))
     leaves, bracket = first_crossing(distance.expand_as(value), -value)
     found, _ = refine(field, rays[leaves], bracket, method="secant", steps=0)
     exits = torch.full_like(value[:, 0], inf).masked_scatter(leaves, found)

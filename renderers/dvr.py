@@ -115,7 +115,7 @@ class DVR:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""
         shares = torch.linspace(0, 1, self.n_ray_samples, dtype=entry.dtype, device=entry.device)
         distance = entry[:, None] + shares * (leave - entry)[:, None]
-        value = self._in_order(field, rays, distance) if self.early_stop else field(_along(rays, distance))
+        value = self._in_order(field, rays, distance) if self.early_stop else field(rays.at_each(distance))
         inside = value[:, 0] < 0
         outside = (~inside).nonzero().squeeze(-1)
         found, bracket = first_crossing(distance[outside], value[outside])
@@ -142,7 +142,3 @@ class DVR:
             value[searching, sample] = found
             searching = searching[~(found < 0 if sample == 0 else found <= 0)]
         return value
-
-
-def _along(rays: Rays, distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n samples 3"]:
-    return rays.origins[:, None] + distance[..., None] * rays.directions[:, None]

@@ -162,7 +162,7 @@ class Tracer:
         """Equally spaced distances from `start` to `end`, and the field's values there."""
         shares = torch.linspace(0, 1, self.search_samples, dtype=start.dtype, device=start.device)
         distance = start[:, None] + shares * (end - start)[:, None]
-        points = rays.origins[:, None] + distance[..., None] * rays.directions[:, None]
+        points = rays.at_each(distance)
         return distance, torch.cat([field(some) for some in points.split(max(BLOCK // self.search_samples, 1))])
 
     def assembled(self, rays: Rays, reached: Reached, solved: "Solved") -> Rendering:
@@ -193,7 +193,10 @@ class Tracer:
 
 @dataclass(frozen=True)
 class Solved:
-    """Where m of the rays, at `index`, cross the surface, as far as they are `settled`; see `gradients.Crossing`."""
+    """Where m of the rays, at `index`, cross the surface, as far as they are `settled`; see `gradients.Crossing`.
+
+    `begun` is the value where the first step began.
+    """
 
     index: Int[Tensor, " m"]
     distance: Float[Tensor, " m"]

@@ -69,7 +69,7 @@ class Image:
         """Rays that were just marched."""
         none = torch.zeros_like(reached.distance)
         never = torch.zeros_like(none).bool()
-        return Image(reached, never, none, none, none.sum(), step, none, never, never)
+        return Image(reached, never, none, none, none.new_zeros(()), step, none, never, never)
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
@@ -78,6 +78,10 @@ class Image:
         self.distance = self.distance.index_put((solved.index,), solved.distance.detach())
         self.slope = self.slope.index_put((solved.index,), solved.slope)
         self.renderings += 1
+
+    def note_asked(self, wanted: Bool[Tensor, "*rays"]) -> None:
+        """Notes of which rays a loss wanted the gradient."""
+        self.asked = wanted.flatten()
 
     def free(self, tracer: Tracer, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
         """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
@@ -153,19 +157,15 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
         memory.keep(rays, image)
     else:
         image.note(solved)
-    rendering, known = tracer.assembled(rays, image.reached, solved), image
-
-    def note_asked(wanted: Bool[Tensor, "*rays"]) -> None:
-        known.asked = wanted.flatten()
-
+    rendering = tracer.assembled(rays, image.reached, solved)
     assert rendering.deferred is not None
-    return replace(rendering, deferred=replace(rendering.deferred, asked=note_asked))
+    return replace(rendering, deferred=replace(rendering.deferred, asked=image.note_asked))
 
 
 def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tuple[Image, Solved]:
     """All rays marched coarse to fine; what was known of them tells how far values have moved."""
     reached, solved = tracer.trace(field, rays)
-    step = torch.zeros_like(reached.distance).sum()
+    step = reached.distance.new_zeros(())
     if before is not None:
         again = solved.some(solved.settled & before.hit[solved.index])
         apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
@@ -218,13 +218,9 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
 
 def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) -> Reached:
     """Rays that start at their anchor, where they are `anchored`; what they have passed up to there stays known."""
-    passed = known.passed.clamp_min(CLEAR)
-    for column, value in (
-        (Reached.DISTANCE, known.anchor),
-        (Reached.ANCHOR, known.anchor),
-        (Reached.PASSED, passed),
-    ):
-        start.table[:, column] = torch.where(anchored, value, start.table[:, column])
+    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.PASSED]
+    begun = torch.stack([known.anchor, known.anchor, known.passed.clamp_min(CLEAR)], dim=1)
+    start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
     return start
 
 
@@ -253,7 +249,7 @@ def _move_closer(field: Field, rays: Rays, image: Image) -> None:
     at, width = reached.least_distance[index], WIDTH * reached.least[index].abs()
     entry, leave = reached.entry[index], reached.leave[index]
     places = torch.stack([at - width, at, at + width], dim=1).clamp(entry[:, None], leave[:, None])
-    values = field(rays.origins[index, None] + places[..., None] * rays.directions[index, None])
+    values = field(rays[index].at_each(places))
     before, here, behind = values.square().unbind(dim=1)
     bend = (before - 2 * here + behind).clamp_min(torch.finfo(values.dtype).tiny)
     shift = (0.5 * (before - behind) / bend).nan_to_num(0.0).clamp(-1, 1) * width

@@ -50,8 +50,7 @@ def write(results_dir: Path, folder: Path) -> list[str]:
             "command of the sweep again, it makes the others"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    lacking = left_out(experiment, found)
-    lines = [f"left out, since a method or a shape lacks them: draws {', '.join(map(str, lacking))}"] if lacking else []
+    lines = left_out(experiment, found)
     for method in found:
         path = folder / f"{method.method}.yaml"
         write_text(path, _text(method, experiment))

@@ -125,10 +125,11 @@ def tunings(experiment: Experiment) -> list[Tuning]:
     return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
 
 
-def left_out(experiment: Experiment, methods: list[Tuning]) -> list[int]:
-    """The draws that some runs have, and that no method is read on, since others lack them."""
+def left_out(experiment: Experiment, methods: list[Tuning]) -> list[str]:
+    """A note of the draws that some runs have, and that no method is read on; none where there are none."""
     used = {draw for method in methods for draw in method.draws}
-    return sorted({_draw(record) for record in experiment.records} - used)
+    draws = sorted({_draw(record) for record in experiment.records} - used)
+    return [f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, draws))}."] if draws else []
 
 
 def _tuning(method: str, table: Table, draws: list[int], worst: dict[str, dict[RunKey, float]]) -> Tuning:

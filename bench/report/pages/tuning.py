@@ -85,9 +85,7 @@ def make(experiment: Experiment) -> Result:
     waiting = unfinished(experiment)
     sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].test_runs)} if methods else {}
     notes = [note.format(waiting=waiting, **sizes) for note in (NOTES if waiting else NOTES[:-1])] if methods else []
-    if methods and (lacking := left_out(experiment, methods)):
-        notes.append(f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, lacking))}.")
-    notes = [*verdicts(methods), *notes]
+    notes = [*verdicts(methods), *notes, *(left_out(experiment, methods) if methods else [])]
     return Result(
         experiment,
         "What tuning is worth.",
