@@ -44,7 +44,7 @@ class Rays:
         """The points at `distance` along the rays."""
         return self.origins + distance[..., None] * self.directions
 
-    def at_each(self, distances: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples 3"]:
+    def at_each(self, distances: Float[Tensor, "... samples"]) -> Float[Tensor, "*rays samples 3"]:
         """The points at several distances along each ray; distances [samples] are the same for all."""
         return self.origins[..., None, :] + distances[..., None] * self.directions[..., None, :]
 
