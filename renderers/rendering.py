@@ -1,6 +1,5 @@
 """The contract of renderers: the Rendering that they return, and their capabilities."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
@@ -29,12 +28,10 @@ class Deferred:
     Args:
         distance: along each ray to the sample.
         left_out: the rays whose value has no gradient yet.
-        asked: called with the rays of which a loss wanted the gradient, for a renderer that remembers them.
     """
 
     distance: Float[Tensor, "*rays"]
     left_out: Bool[Tensor, "*rays"]
-    asked: Callable[[Bool[Tensor, "*rays"]], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -186,8 +183,6 @@ def closest_values(
     """
     if rendering.deferred is None or not torch.is_grad_enabled():
         return rendering.closest
-    if rendering.deferred.asked is not None:
-        rendering.deferred.asked(wanted)
     index = (wanted & rendering.deferred.left_out).flatten().nonzero().squeeze(-1)
     values = field(rays.flat()[index].at(rendering.deferred.distance.flatten()[index]))
     return rendering.closest.flatten().index_put((index,), values).view(rays.shape)

@@ -1,17 +1,17 @@
 """A rendering of the same rays as in the last iteration of an optimisation, begun where that one ended.
 
-How far the field's values have moved is measured where the field is asked anyway: at the last hits, and at the closest
-samples of some misses. A ray on whose path the field was larger than twice that movement is as free as before. A hit is
+How far the field's values have moved is measured at the last hits, where they are asked for anyway, and at one place on
+each of some rays. A ray on whose path the field was larger than twice that movement is as free as before. A hit is
 solved again from its last place, by the Newton step that its gradient needs. All other rays are marched, from where
 their path came close to a surface if it is free up to there.
 
-None of this is a proof, since the movement is measured at samples: what appears on a path on which no value was asked
-for is seen when the ray is marched again. An audit marches one ray in a hundred from its beginning, whatever is known
-of it, and another one the next time. Where the two answers differ too often, all rays are. The closest samples of
-misses are moved only where a loss wanted their gradient.
+None of this is a proof, since the movement is measured at samples: what appears between them is seen when the ray is
+marched again. An audit marches one ray in a hundred from its beginning, whatever is known of it, and another one the
+next time. Where the two answers differ too often, all rays are. A miss keeps its closest sample until it is marched
+again.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from threading import get_ident
 from weakref import ref
 
@@ -29,12 +29,11 @@ SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have mov
 STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
 MOSTLY = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
 MOST = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
-LOOKED = 17  # of so many rays, the field is asked about one in each rendering; no part of a usual image's width
-WIDTH = 0.25  # times the value at a closest sample: how far before and behind it the field is asked for a closer one
+LOOKED = 29  # on one of so many rays the field's movement is measured; no part of a usual image's width
+GOLDEN = 0.618034  # of the way along a ray from one of these places to the next: they spread over all of it
 AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
 SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
 WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
-REFRESHED = 8  # one of so many rays, at most, has its closest sample moved in a rendering
 APART = 10.0  # times march_epsilon: crossings further apart differ
 
 
@@ -48,8 +47,7 @@ class Image:
         moved: how far values have moved since the first rendering, in field units.
         step: how far of that in the last rendering.
         marched: what `moved` was when the ray was last marched from its beginning.
-        known: whether the field's last value at the closest sample is known: it may lie on a coarse ray.
-        asked: of which misses the last loss wanted the gradient.
+        looked: the field's last values at the places of `_look`.
         renderings: their number so far.
     """
 
@@ -60,16 +58,14 @@ class Image:
     moved: Float[Tensor, ""]
     step: Float[Tensor, ""]
     marched: Float[Tensor, " n"]
-    known: Bool[Tensor, " n"]
-    asked: Bool[Tensor, " n"]
+    looked: Float[Tensor, " m"]
     renderings: int = 0
 
     @staticmethod
-    def of(reached: Reached, step: Float[Tensor, ""]) -> "Image":
+    def of(reached: Reached, step: Float[Tensor, ""], looked: Float[Tensor, " m"]) -> "Image":
         """Rays that were just marched."""
         none = torch.zeros_like(reached.distance)
-        never = torch.zeros_like(none).bool()
-        return Image(reached, never, none, none, none.new_zeros(()), step, none, never, never)
+        return Image(reached, torch.zeros_like(none).bool(), none, none, none.new_zeros(()), step, none, looked)
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
@@ -78,10 +74,6 @@ class Image:
         self.distance = self.distance.index_put((solved.index,), solved.distance.detach())
         self.slope = self.slope.index_put((solved.index,), solved.slope)
         self.renderings += 1
-
-    def note_asked(self, wanted: Bool[Tensor, "*rays"]) -> None:
-        """Notes of which rays a loss wanted the gradient."""
-        self.asked = wanted.flatten()
 
     def free(self, tracer: Tracer, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
         """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
@@ -157,9 +149,7 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
         memory.keep(rays, image)
     else:
         image.note(solved)
-    rendering = tracer.assembled(rays, image.reached, solved)
-    assert rendering.deferred is not None
-    return replace(rendering, deferred=replace(rendering.deferred, asked=image.note_asked))
+    return tracer.assembled(rays, image.reached, solved)
 
 
 def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tuple[Image, Solved]:
@@ -170,10 +160,9 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
         again = solved.some(solved.settled & before.hit[solved.index])
         apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
         step = SAFETY * apart.quantile(MOSTLY) if len(apart) else step
-    image = Image.of(reached, step)
-    image.note(solved)
     with torch.no_grad():
-        _look(field, rays.flat(), image)
+        image = Image.of(reached, step, _look(field, rays.flat(), reached))
+    image.note(solved)
     return image, solved
 
 
@@ -189,9 +178,9 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
     steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
     solved = tracer.solve(field, rays, reached, steady, image.distance[steady], furthest=CLEAR)
     with torch.no_grad():
-        image.step = SAFETY * torch.maximum(_largest(solved.begun), _look(field, rays, image))
-        image.moved = image.moved + image.step
-        _move_closer(field, rays, image)
+        looked = _look(field, rays, reached)
+        image.step = SAFETY * torch.maximum(_largest(solved.begun), _largest(looked - image.looked))
+        image.moved, image.looked = image.moved + image.step, looked
         free, up_to_anchor = image.free(tracer, image.moved)
         certain = free & ~image.hit.index_put((steady,), ~solved.settled)
         audited = torch.zeros_like(free)
@@ -211,51 +200,25 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         if memory.audit(int((certain & audited).sum()), differing):
             return None
         reached.table[index] = moving.table
-        image.known[index] = True
         image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
     return solved.some((certain & ~audited)[solved.index]).joined(found)
 
 
 def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) -> Reached:
     """Rays that start at their anchor, where they are `anchored`; what they have passed up to there stays known."""
-    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.PASSED]
-    begun = torch.stack([known.anchor, known.anchor, known.passed.clamp_min(CLEAR)], dim=1)
+    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.PASSED, Reached.LEAST_DISTANCE, Reached.LEAST]
+    least = torch.where(known.least_distance < known.anchor, known.least, torch.inf)
+    begun = torch.stack([known.anchor, known.anchor, known.passed.clamp_min(CLEAR), known.least_distance, least], dim=1)
     start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
     return start
 
 
-def _look(field: Field, rays: Rays, image: Image) -> Float[Tensor, ""]:
-    """Asks the field at the closest samples of a share of the misses; how far these values have moved."""
-    reached = image.reached
-    turn = torch.zeros_like(image.hit)
-    turn[::LOOKED] = True
-    index = (turn & ~image.hit & ~image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
-    value = field(rays[index].at(reached.least_distance[index]))
-    moved = _largest((value - reached.least[index])[image.known[index]])
-    reached.table[index, Reached.LEAST] = value
-    image.known[index] = True
-    return moved
-
-
-def _move_closer(field: Field, rays: Rays, image: Image) -> None:
-    """Moves the closest samples of misses whose gradient the last loss wanted, to where the value is least now.
-
-    Beside an edge the squares of the values along a ray are a parabola; it is drawn through three of them.
-    """
-    reached = image.reached
-    index = (~image.hit & image.asked & reached.least.isfinite()).nonzero().squeeze(-1)
-    turns = -(-len(index) * REFRESHED // max(len(image.hit), 1))
-    index = index[image.renderings % turns :: turns] if turns else index
-    at, width = reached.least_distance[index], WIDTH * reached.least[index].abs()
+def _look(field: Field, rays: Rays, reached: Reached) -> Float[Tensor, " m"]:
+    """The field's values at one place on each of a share of the rays, the same places in each rendering; 0 for NaN."""
+    index = torch.arange(0, len(reached.entry), LOOKED, device=reached.entry.device)
     entry, leave = reached.entry[index], reached.leave[index]
-    places = torch.stack([at - width, at, at + width], dim=1).clamp(entry[:, None], leave[:, None])
-    values = field(rays[index].at_each(places))
-    before, here, behind = values.square().unbind(dim=1)
-    bend = (before - 2 * here + behind).clamp_min(torch.finfo(values.dtype).tiny)
-    shift = (0.5 * (before - behind) / bend).nan_to_num(0.0).clamp(-1, 1) * width
-    reached.table[index, Reached.LEAST_DISTANCE] = (at + shift).clamp(entry, leave)
-    reached.table[index, Reached.LEAST] = values.gather(1, values.abs().argmin(dim=1, keepdim=True)).squeeze(1)
-    image.known[index] = False
+    shares = torch.arange(1, len(index) + 1, dtype=entry.dtype, device=entry.device) * GOLDEN % 1
+    return field(rays[index].at(entry + shares * (leave - entry))).nan_to_num(0.0)
 
 
 def _differing(tracer: Tracer, kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:
