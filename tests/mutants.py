@@ -69,7 +69,7 @@ MUTANTS = (
       "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "certain = free & ", "certain = ", "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "return differing > max(1, SHARE * rays)", "return False", "tests/renderers/test_warm.py"),
-    M("renderers/warm.py", "image.note(solved)\n    with", "with", "tests/renderers/test_warm.py"),
+    M("renderers/warm.py", "image.note(solved)\n    return image", "return image", "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "reached.table[index] = moving.table", "pass", "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "memory.thread != get_ident()", "False", "tests/renderers/test_warm.py"),
     M("renderers/tracer.py", "short = enters & (step.abs() <= longest)", "short = (step.abs() <= longest)",

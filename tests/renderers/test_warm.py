@@ -240,4 +240,4 @@ def test_closest_samples_of_misses_follow_a_shape_that_moves(warm):
     for (found, _), field in zip(in_turn(warm, fields), fields, strict=True):
         cold = COLD.render(field, RAYS)
         passes = (cold.status == Status.MISS) & (cold.closest < 0.5)
-        assert (found.closest - cold.closest)[passes].max() < 0.15
+        assert (found.closest - cold.closest)[passes].max() < 0.2  # all of its movement
