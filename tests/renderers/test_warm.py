@@ -236,7 +236,7 @@ def test_its_gradient_is_that_of_a_rendering_from_the_beginning(warm):
 
 
 def test_closest_samples_of_misses_follow_a_shape_that_moves(warm):
-    fields = [ball(0.2, x=0.3 - 0.005 * i) for i in range(40)]
+    fields = [ball(0.2, x=0.3 - 0.002 * i) for i in range(40)]
     for (found, _), field in zip(in_turn(warm, fields), fields, strict=True):
         cold = COLD.render(field, RAYS)
         close = (cold.status == Status.MISS) & (cold.closest < 0.15)
