@@ -206,9 +206,8 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
 
 def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) -> Reached:
     """Rays that start at their anchor, where they are `anchored`; what they have passed up to there stays known."""
-    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.PASSED, Reached.LEAST_DISTANCE, Reached.LEAST]
-    least = torch.where(known.least_distance < known.anchor, known.least, torch.inf)
-    begun = torch.stack([known.anchor, known.anchor, known.passed.clamp_min(CLEAR), known.least_distance, least], dim=1)
+    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.PASSED]
+    begun = torch.stack([known.anchor, known.anchor, known.passed.clamp_min(CLEAR)], dim=1)
     start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
     return start
 

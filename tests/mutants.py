@@ -65,8 +65,6 @@ MUTANTS = (
       "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "torch.maximum(_largest(solved.begun), _largest(looked - image.looked))",
       "_largest(solved.begun)", "tests/renderers/test_warm.py"),
-    M("renderers/warm.py", "known.least_distance < known.anchor", "known.least_distance < 0",
-      "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "certain = free & ", "certain = ", "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "return differing > max(1, SHARE * rays)", "return False", "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "image.note(solved)\n    return image", "return image", "tests/renderers/test_warm.py"),
