@@ -40,9 +40,9 @@ class Reached:
         table: the columns that the properties below name.
     """
 
-    table: Float[Tensor, "n 11"]
+    table: Float[Tensor, "n 12"]
 
-    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP, PASSED, ANCHOR = range(11)
+    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP, PASSED, ANCHOR, CLEARED = range(12)
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "Reached":
@@ -50,7 +50,7 @@ class Reached:
         entry, leave, meets = sphere_span(rays, radius)
         none = torch.full_like(entry, torch.inf)
         stop = torch.where(meets, float(Stop.ON_THE_WAY), float(Stop.LEFT)).to(entry.dtype)
-        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop, none, entry)
+        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop, none, entry, entry)
         return Reached(torch.stack(columns, dim=1))
 
     @property
@@ -103,6 +103,11 @@ class Reached:
         """Along each ray to its last sample before `passed` fell to `CLEAR`; to where it begins if there is none."""
         return self.table[:, self.ANCHOR]
 
+    @property
+    def cleared(self) -> Float[Tensor, " n"]:
+        """Along each ray that has LEFT, to where its samples are above `CLEAR` from then on; its end at the most."""
+        return self.table[:, self.CLEARED]
+
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
         return self.table[:, self.STOP] == float(stop)
@@ -143,6 +148,8 @@ class Reached:
         self.table[:, self.STOP] = torch.where(finite, stop, Stop.NOT_FINITE).to(value.dtype)
         self.table[:, self.VALUE] = torch.where(finite, value, 0.0)
         self.table[:, self.DISTANCE] = torch.where(goes_on & finite, moved, torch.where(left, self.leave, at))
+        cleared = torch.where(left & (value <= CLEAR), self.leave, at)
+        self.table[:, self.CLEARED] = torch.where(before <= CLEAR, cleared, self.cleared)
         positive = (value > 0) & finite
         self.table[:, self.FREE] = torch.where(positive, at, self.free)
         self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
@@ -176,6 +183,7 @@ class Reached:
         passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
         child.table[:, self.PASSED] = torch.where(inherits, passed - apart, child.passed)
         child.table[:, self.ANCHOR] = torch.where(child.passed > CLEAR, child.distance, child.entry)
+        child.table[:, self.CLEARED] = child.distance
         return child
 
 

@@ -11,6 +11,7 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
+from renderers.packed_march import CLEAR, Stop
 from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, beam
 
@@ -263,3 +264,15 @@ def test_the_gradient_of_an_image_is_that_of_each_of_its_rays():
 def test_settings_that_cannot_be_are_refused(setting, value, remedy):
     with pytest.raises(ValueError, match=f"{setting} must be .*{remedy}"):
         replace(NEWTON, **{setting: value})
+
+
+@pytest.mark.parametrize("image", [True, False])
+def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
+    field, rays = SHAPES["ring"] | sphere(0.2, (0.0, 0.0, -0.7)), camera().rays()
+    reached = NEWTON.trace(field, rays if image else rays.flat())[0]
+    left = reached.stopped(Stop.LEFT).nonzero().squeeze(-1)
+    cleared = reached.cleared[left]
+    assert ((cleared < reached.leave[left]) & (reached.least[left] < CLEAR)).sum() > 50
+    shares = torch.linspace(0, 1, 200)
+    behind = field(rays.flat()[left].at_each(cleared[:, None] + shares * (reached.leave[left] - cleared)[:, None]))
+    assert behind.min() > CLEAR - NEWTON.extra_step_cap
