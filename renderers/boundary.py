@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
-from renderers.field import Field, carries_gradient
+from renderers.field import Field, Meter, carries_gradient
 from renderers.rendering import Guided, Observed, Renderer, Rendering
 
 PARTS = ("distance", "status", "points", "residual", "closest")
@@ -21,7 +21,7 @@ class BrokenContract(ValueError):
 
 
 def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
-    """The renderer's rendering of the field along the rays.
+    """The renderer's rendering of the field along the rays; a Meter's counts note its hits.
 
     Raises:
         BrokenContract: where it is no Rendering, a part has a wrong shape, type or device for the rays, or hits carry
@@ -37,6 +37,8 @@ def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
     _check_deferred(name, rendering)
     if (lacked := _lacked(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
         raise _no_gradient(renderer, lacked, "the distances of its hits carry")
+    if isinstance(field, Meter):
+        field.counts.hits += int(rendering.hit.sum())
     return rendering
 
 

@@ -48,10 +48,14 @@ class Field(Protocol):
 
 @dataclass
 class Counts:
-    """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed."""
+    """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
+
+    `hits` are those of the renderings of the metered field that `boundary.rendered` has checked.
+    """
 
     value: int = 0
     gradient: int = 0
+    hits: int = field(default=0, repr=False, compare=False)
 
     def flops(self, field: Field) -> int | None:
         """The floating-point operations of these evaluations; None where the field does not state them."""
@@ -59,8 +63,18 @@ class Counts:
             return None
         return field.flops.value * self.value + field.flops.gradient * self.gradient
 
+    def over_bound(self, field: Field) -> float | None:
+        """The work of these evaluations, divided by that of one value and one gradient per hit; None without hits.
+
+        No renderer can do with less, if every hit has a gradient. Of a field that does not state its operations, a
+        gradient counts as much as a value.
+        """
+        cost = field.flops or Flops(1, 1)
+        least = (cost.value + cost.gradient) * self.hits
+        return (cost.value * self.value + cost.gradient * self.gradient) / least if least else None
+
     def __sub__(self, other: "Counts") -> "Counts":
-        return Counts(self.value - other.value, self.gradient - other.gradient)
+        return Counts(self.value - other.value, self.gradient - other.gradient, self.hits - other.hits)
 
 
 class Wrapper(ABC):

@@ -58,7 +58,7 @@ def optimise(
     """
     optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
     history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
-    before = Counts(problem.counts.value, problem.counts.gradient)
+    before = problem.counts - Counts()
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
         optimiser.param_groups[0]["lr"] = settings.rate(iteration)

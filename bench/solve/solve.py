@@ -18,6 +18,8 @@ COSTS = {
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
     "evaluations.observed": "pixels whose depth was given",
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
+    "evaluations.work_over_bound": "the operations of all evaluations, divided by those of one value and one gradient "
+    "per hit; absent without hits",
     "seconds.warmup": "one step's forward and backward pass before the clock starts; its evaluations are not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
@@ -170,6 +172,8 @@ def _note_history(record: Record, problem: Problem, history: History) -> None:
         "observed": int(problem.observed.sum()),
         "iterations": len(history.curve),
     }
+    if (over_bound := history.counts.over_bound(problem.field())) is not None:
+        evaluations["work_over_bound"] = over_bound
     record.peak_memory_bytes = history.peak_memory_bytes
     flops = history.counts.flops(problem.field())
     note_costs(record, seconds=history.seconds, flops=flops, evaluations=evaluations)

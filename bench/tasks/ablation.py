@@ -37,6 +37,8 @@ DEFINITIONS = {
     "repeats": "how often a step was timed",
     "evaluations.value, evaluations.gradient": "as step_queries and step_gradients",
     "evaluations.per_ray": "queries divided by rays",
+    "evaluations.work_over_bound": "the operations of a step, divided by those of one value and one gradient per hit; "
+    "absent without hits",
     "seconds.total": "the whole run, with making or loading shape, network and reference",
     "forward_gemm, step_gemm": "floating-point operations per second at the median time, divided by the machine's peak "
     "rate of a float32 matrix product",
@@ -121,6 +123,8 @@ class Ablation:
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
         record.evaluations = {"value": measured.step.counts.value, "gradient": measured.step.counts.gradient}
         record.evaluations["per_ray"] = measured.forward.counts.value / bench.rays.shape.numel()
+        if (over_bound := measured.step.counts.over_bound(bench.decoder.at(bench.code))) is not None:
+            record.evaluations["work_over_bound"] = over_bound
         record.peak_memory_bytes = measured.step.memory
         found, true = bench.views()
         save_images(run.folder, found, true)

@@ -367,3 +367,11 @@ def test_the_meter_is_the_field_that_it_wraps_and_tells_its_cost():
     assert Counts(value=5, gradient=2).flops(meter) == 10 * 5 + 20 * 2
     assert Counts(5, 2).flops(A) is None
     assert Counts(5, 7) - Counts(1, 2) == Counts(4, 5)
+
+
+def test_work_over_the_bound_is_that_over_one_value_and_one_gradient_a_hit():
+    shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
+    assert Counts(12, 3, hits=3).over_bound(shape) == (12 * 10 + 3 * 20) / (3 * 30)
+    assert Counts(12, 3, hits=3).over_bound(A) == 15 / 6  # where operations are not stated, a gradient is as a value
+    assert Counts(12, 3).over_bound(shape) is None
+    assert (Counts(12, 3, hits=9) - Counts(2, 1, hits=4)).hits == 5

@@ -153,7 +153,7 @@ def test_every_metric_is_there_before_and_after_with_its_definition(finished):
     record = finished.record
     assert set(record["metrics"]) == set(record["metrics_start"]) == METRICS
     assert set(record["definitions"]) >= METRICS
-    costs = {f"evaluations.{name}" for name in ("value", "gradient", "per_ray")}
+    costs = {f"evaluations.{name}" for name in ("value", "gradient", "per_ray", "work_over_bound")}
     costs |= {f"seconds.{name}" for name in record["seconds"]}
     assert set(record["definitions"]) >= costs
     assert all(len(text) > 20 for text in record["definitions"].values())
@@ -194,6 +194,10 @@ def test_evaluations_add_up(finished):
     assert evaluations["value"] == last["value_evaluations"] > 0
     assert evaluations["gradient"] == last["gradient_evaluations"] > 0
     assert evaluations["per_ray"] == pytest.approx(evaluations["value"] / pixels**2 / iterations)
+    rays = evaluations["rays_per_iteration"] * iterations
+    hits = (evaluations["value"] + evaluations["gradient"]) / 2 / evaluations["work_over_bound"]
+    assert hits == pytest.approx(round(hits))  # a value and a gradient of the network take as many operations
+    assert 0 < hits < rays
     width, inputs = 128, 67  # the shipped network: 4 layers with a skip; the code is folded into the biases
     weights = 3 * width + width * width + (width + 3) * width + width * width + width
     assert inputs == 64 + 3

@@ -112,6 +112,9 @@ def test_counts_are_those_of_a_meter(name, tmp_path):
     assert record.metrics["step_queries"] == record.evaluations["value"] == step.counts.value > 0
     assert record.metrics["step_gradients"] == record.evaluations["gradient"] == step.counts.gradient > 0
     assert record.evaluations["per_ray"] == forward.counts.value / SIZE**2
+    least = 2 * (record.metrics["hits"] - record.metrics["lost"] + record.metrics["false"])
+    work = record.metrics["step_queries"] + record.metrics["step_gradients"]
+    assert record.evaluations["work_over_bound"] == pytest.approx(work / least, rel=1e-12)
 
 
 def test_times_and_rates_agree_with_each_other(dist):
