@@ -4,6 +4,7 @@ The noise floor of a surface metric is the metric between two independent sample
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from bench.config import load
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.extract import extract
@@ -21,6 +23,7 @@ from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
 from renderers.fields.analytic import Shape, sphere
+from renderers.rendering import Renderer
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
 REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
@@ -227,8 +230,24 @@ def true_surface(inputs: RunInputs, seed: int) -> Surface:
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """Renders a field with the run's renderer from a camera, as a View on the CPU."""
+    return _view(inputs.renderer, field, camera, inputs.device)
+
+
+def picture_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
+    """A field as pictures show it: by one fast renderer, whatever is under test, if the field is of its kind."""
+    fast = _fast()
+    renderer = fast if field.kind in fast.capabilities.needs else inputs.renderer
+    return _view(renderer, field, camera, inputs.device)
+
+
+@cache
+def _fast() -> Renderer:
+    return load("renderer", "newton", warm=False)
+
+
+def _view(renderer: Renderer, field: Field, camera: Camera, device: torch.device) -> View:
     with torch.no_grad():
-        rendering = rendered(inputs.renderer, field, camera.rays().to(inputs.device))
+        rendering = rendered(renderer, field, camera.rays().to(device))
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()

@@ -8,7 +8,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
 
-from bench.evaluate.evaluate import render_view
+from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from bench.setup.inputs import RunInputs
@@ -46,7 +46,7 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            self.frames[name] = render_view(field, self._fine(camera), self.inputs)
+            self.frames[name] = picture_view(field, self._fine(camera), self.inputs)
 
     @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from torch import Tensor
 
-from bench.evaluate.evaluate import render_view
+from bench.evaluate.evaluate import picture_view
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
@@ -95,7 +95,7 @@ def draw_run(
     truth = Truth(inputs.scene.mesh)
     pairs = (
         *(
-            ViewPair(name, render_view(field, front, inputs), render_view(field, back, inputs))
+            ViewPair(name, picture_view(field, front, inputs), picture_view(field, back, inputs))
             for name, field in zip(("before", "after"), fields, strict=True)
         ),
         ViewPair("truth", see(truth, front), see(truth, back)),

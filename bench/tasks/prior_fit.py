@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import render_view, surface_metrics, true_surface
+from bench.evaluate.evaluate import picture_view, surface_metrics, true_surface
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_distances
@@ -76,7 +76,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        found, true = render_view(field, camera, inputs), see(Truth(inputs.scene.mesh), camera)
+        found, true = picture_view(field, camera, inputs), see(Truth(inputs.scene.mesh), camera)
         save_images(run.folder, found, true, gradient_length=lengths.cpu().numpy())
 
     def problem(

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from bench.config import EvaluationSettings, load
-from bench.evaluate.evaluate import DEFINITIONS, evaluate, render_view
+from bench.evaluate.evaluate import DEFINITIONS, evaluate, picture_view, render_view
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
@@ -16,6 +16,7 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
+from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
 
@@ -95,6 +96,24 @@ def test_evaluation_depends_on_the_seed(inputs):
     first, again = evaluate(sphere(0.5), inputs).metrics, evaluate(sphere(0.5), inputs).metrics
     assert first == again
     assert evaluate(sphere(0.5), replace(inputs, seed=1)).metrics["accuracy"] != first["accuracy"]
+
+
+def test_pictures_of_a_distance_ask_for_few_values_whatever_renderer_is_under_test(inputs):
+    slow = replace(inputs, renderer=load("renderer", "dvr"))
+    camera, counts = inputs.scene.view.camera, []
+    for view in (picture_view, render_view):
+        meter = Meter(sphere(RADIUS))
+        seen = view(meter, camera, slow)
+        counts.append(meter.counts.value / seen.mask.numel())
+        assert (seen.mask ^ inputs.scene.view.mask).sum() < 0.03 * seen.mask.sum()
+    assert counts[0] < 6 < 30 < counts[1]
+
+
+def test_pictures_of_a_level_set_are_those_of_the_renderer_under_test(inputs):
+    level = Shape(lambda points: 9 * sphere(RADIUS)(points), Kind.LEVEL)
+    slow = replace(inputs, renderer=load("renderer", "dvr"))
+    by = [view(level, inputs.scene.view.camera, slow).depth for view in (picture_view, render_view)]
+    assert torch.equal(*by)
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):
