@@ -28,7 +28,7 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-RESERVED = ("_target_", "_package_", LABEL, ROWS)  # of a node; its other keys are arguments
+RESERVED = ("_target_", "_package_", "_prior_", LABEL, ROWS)  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
 
 

@@ -1,6 +1,10 @@
-"""Shows progress on a terminal: a line for the run and one for the sweep; silent where there is no terminal."""
+"""Shows progress on a terminal: a line for the run and one for the sweep.
+
+Where there is no terminal, a line is printed of a phase that takes long, again and again.
+"""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
@@ -8,6 +12,7 @@ from typing import Protocol, runtime_checkable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+PLAIN = 15.0  # seconds between two printed lines of a phase, where there is no terminal
 HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may take minutes each
 
 
@@ -78,15 +83,19 @@ def run_progress(name: str) -> Iterator[Report]:
     """Shows one line for a run: its phase, its progress, and its loss."""
     with display() as shown:
         line = shown.add_task(name, total=None, said="")
-        current = ""
+        current, begun, printed = "", 0.0, 0.0
 
         def report(phase: str, done: int, total: int, loss: float | None = None) -> None:
-            nonlocal current
+            nonlocal current, begun, printed
             said = "" if loss is None else f"loss {loss:.4g}"
+            now = time.monotonic()
             if phase != current:  # another phase has another speed
-                current = phase
+                current, begun, printed = phase, now, now
                 shown.reset(line, total=total, description=f"{name}: {phase}", said=said)
             shown.update(line, completed=done, said=said)
+            if shown.disable and now - printed >= PLAIN and 0 < done < total:
+                printed = now
+                _print(f"{name}: {phase}, {done / total:.0%}, about {(now - begun) * (total / done - 1):.0f} s left")
 
         try:
             yield report

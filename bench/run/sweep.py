@@ -1,6 +1,7 @@
 """Plans a sweep before its first cell starts, and prints a line as each cell ends."""
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -121,22 +122,28 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 def followed(plan: Plan) -> Iterator[None]:
     """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
 
-    On a terminal it also shows how many have ended, how many of them failed, and the time left.
+    It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
     """
     with display() as shown:
         progress = shown.add_task("sweep", total=len(plan.cells), said="")
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
+        begun, anew = time.monotonic(), 0
 
         common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
 
         def update() -> None:
-            nonlocal failed
+            nonlocal failed, anew
             for cell in list(pending.values()):
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
+                    anew += not record["reused"]
                     differing = " ".join(override for override in cell.overrides if override not in common)
-                    print(line(plan.results_dir / "runs" / cell.id, record, differing), flush=True)
+                    ended = len(plan.cells) - len(pending)
+                    left = seconds((time.monotonic() - begun) / anew * len(pending)) if anew and pending else ""
+                    place = f"{ended}/{len(plan.cells)}{f', {left} left' if left else ''}"
+                    text = line(plan.results_dir / "runs" / cell.id, record, differing)
+                    print(f"[{place}] {text}" if shown.disable else text, flush=True)
             shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
 
         def follow() -> None:

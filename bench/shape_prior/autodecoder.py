@@ -157,25 +157,27 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
 
 
-def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 400, near: float = 0.02) -> float:
+def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200, near: float = 0.02) -> float:
     """Mean error of the distance within `near` of the surface, with codes fitted to the samples from zero.
 
     Args:
         decoder: not changed.
         samples: of any shapes, in training or not.
-        steps: of Adam; 0 evaluates the mean shape.
+        steps: of Adam, whose rate falls to zero; 0 evaluates the mean shape.
         near: in scene units, as the result.
     """
     shapes, count = samples.distances.shape
     codes = torch.zeros(shapes, decoder.code_length, requires_grad=True)
     optimiser = torch.optim.Adam([codes], lr=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1))
     rows = torch.arange(shapes)[:, None]
     for _ in range(steps):
-        picked = torch.randint(count, (shapes, min(count, 2000)))
+        picked = torch.randint(count, (shapes, min(count, 256)))
         error = (decoder.at(codes)(samples.points[rows, picked]) - samples.distances[rows, picked]).abs()
         optimiser.zero_grad()
         error.mean().backward()
         optimiser.step()
+        schedule.step()
     return surface_error(decoder, codes, samples, near=near)
 
 

@@ -128,7 +128,7 @@ class Multiview:
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
         if len(prior.codes) < 2:
-            raise ValueError("a prior of one shape has no spread from which to draw codes: set scale.shapes=96")
+            raise ValueError("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
         spread = self.start_scale * prior.codes.std(0)
         codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
         return CodeProblem(

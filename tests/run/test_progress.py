@@ -1,0 +1,34 @@
+"""What is said of the progress where there is no terminal."""
+
+import pytest
+
+from bench import progress
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that the progress believes in."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_phase_that_takes_long_says_now_and_then_how_far_it_is(clock, capsys):
+    with progress.run_progress("DIST") as report:
+        for done in range(1, 101):
+            clock[0] += 0.5
+            report("training the prior", done, 100, 0.25)
+    assert capsys.readouterr().err.splitlines() == [
+        "DIST: training the prior, 31%, about 33 s left",
+        "DIST: training the prior, 61%, about 19 s left",
+        "DIST: training the prior, 91%, about 4 s left",
+    ]
+
+
+def test_short_phases_say_nothing(clock, capsys):
+    with progress.run_progress("DIST") as report:
+        for phase in range(20):
+            for done in range(1, 5):
+                clock[0] += 2.0
+                report(f"phase {phase}", done, 4)
+    assert capsys.readouterr().err == ""
