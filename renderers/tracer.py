@@ -54,7 +54,7 @@ class Tracer:
         check_at_least("newton_steps", self.newton_steps, 1, "3 are enough")
         check_at_least("search_samples", self.search_samples, 2, "32 find what a pixel shows")
         check_at_least("search_steps", self.search_steps, 0, "4 are enough")
-        check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
+        check_positive("least_slope", self.least_slope, "0.03 keeps grazing rays from throwing a fit off")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     @property

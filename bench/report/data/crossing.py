@@ -16,11 +16,12 @@ from bench.report.data.statistics import geometric_mean
 from bench.report.data.wins import Gap, gap
 
 CROSSING = Selection("crossing", ("completion",), ("dataset", "task", "silhouette"), ("points",))
-OWN = {  # the loss of each renderer's paper; the naive one has that of DIST
+OWN = {  # the loss of each renderer's paper; the naive one and newton have that of DIST
     "renderers.DIST": "Hinge",
     "renderers.IDR": "CrossEntropy",
     "renderers.DVR": "Occupancy",
     "renderers.Naive": "Hinge",
+    "renderers.Newton": "Hinge",
 }
 LOSSES = (
     "Losses have the numbers of conf/silhouette: DIST's weight 1, IDR's 100 and sharpness 50, as printed, and DVR's 3, "

@@ -1,0 +1,55 @@
+"""The loop of a task makes no tensor without a device: with another default device, it stays on that of the run."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hydra import compose, initialize_config_dir
+
+from bench.config import CONF, build, load, register
+from bench.solve.optimise import History, optimise
+from bench.solve.problem import OptimiserSettings
+from bench.tasks.pose import Pose, PoseProblem
+from datasets.mesh import Mesh
+from datasets.scene import Scene, see
+from datasets.truth import Truth
+from renderers.fields.analytic import sphere
+from tests.tiny import CPU, ball_prior, camera_of
+
+CASES = {
+    "completion": ("task.points=50",),
+    "multiview": ("task.starts=2",),
+    "deepsdf": ("task.points=50",),
+    "prior_fit": ("task.distances=500", "task.batch=200"),
+    "pose": ("task.starts=2", "task.normal_weight=1"),
+}
+ADAM = OptimiserSettings(iterations=3, learning_rate=0.01, schedule="cosine")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A ball of radius 0.5, seen in 24 x 24 pixels."""
+    made = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    return Scene("ball", mesh, see(Truth(mesh), camera_of(24, angles=(30.0, 20.0))), lambda: sphere(0.5))
+
+
+@pytest.mark.parametrize("renderer", ["dist", "dvr", "newton"])
+@pytest.mark.parametrize("name", CASES)
+def test_the_loop_stays_on_the_device_of_its_run(scene, name, renderer):
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [f"task={name}", "scale=smoke", "task.optimiser.iterations=50", *CASES[name]])
+    task, tested = build(config.task, "task"), load("renderer", renderer)
+    if isinstance(task, Pose):
+        problem = PoseProblem(task, tested, sphere(0.5), scene.view, task.cameras(scene.view.camera, 0), CPU)
+    else:
+        problem = task.problem(scene, ball_prior(radius=0.45), tested, seed=0, device=CPU)
+    history = History()
+    torch.set_default_device("meta")  # holds no data: what is made on it by mistake cannot meet what the run has made
+    try:
+        optimise(problem, ADAM, CPU, history=history, on_step=lambda line: None)
+    finally:
+        torch.set_default_device(None)
+    assert len(history.curve) == ADAM.iterations
+    assert all(parameter.device == CPU and parameter.isfinite().all() for parameter in problem.parameters)
