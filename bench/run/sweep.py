@@ -131,6 +131,15 @@ def followed(plan: Plan) -> Iterator[None]:
 
         common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
 
+        def place() -> str:
+            """What stands in front of a cell's line where there is no terminal; cells that are reused take no time."""
+            if not shown.disable:
+                return ""
+            parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
+            if anew and pending:
+                parts.append(f"{seconds((time.monotonic() - begun) / anew * len(pending))} left")
+            return f"[{', '.join(parts)}] "
+
         def update() -> None:
             nonlocal failed, anew
             for cell in list(pending.values()):
@@ -139,11 +148,8 @@ def followed(plan: Plan) -> Iterator[None]:
                     failed += record["status"] != "ok"
                     anew += not record["reused"]
                     differing = " ".join(override for override in cell.overrides if override not in common)
-                    ended = len(plan.cells) - len(pending)
-                    left = seconds((time.monotonic() - begun) / anew * len(pending)) if anew and pending else ""
-                    place = f"{ended}/{len(plan.cells)}{f', {left} left' if left else ''}"
                     text = line(plan.results_dir / "runs" / cell.id, record, differing)
-                    print(f"[{place}] {text}" if shown.disable else text, flush=True)
+                    print(place() + text, flush=True)
             shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
 
         def follow() -> None:

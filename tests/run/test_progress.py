@@ -7,7 +7,8 @@ from bench import progress
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds that the progress believes in."""
+    """Seconds that the progress believes in, where no variable asks for a terminal."""
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now
