@@ -1,7 +1,8 @@
 """Fields: callables from points to values, negative inside; their properties; normals; the Meter."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
@@ -46,35 +47,73 @@ class Field(Protocol):
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
 
+Values = Callable[[Tensor], Tensor]  # points [*batch, 3] to values [*batch]: a field, or its coarse values
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """Cheaper values of a field, for where they decide nothing.
+
+    Args:
+        values: without a gradient.
+        error: most that one of them is off where it is small, in field units, stated or measured.
+    """
+
+    values: Values
+    error: float
+
+    def noted(self, note: Callable[[int], None]) -> "Coarse":
+        """The same; `note` is told of how many points values are asked for, before they are evaluated."""
+
+        def values(points: Tensor) -> Tensor:
+            note(points.numel() // 3)
+            return self.values(points)
+
+        return replace(self, values=values)
+
+
+def coarse_of(field: Field) -> Coarse | None:
+    """The cheaper values that a field offers as `coarse`; None where it offers none."""
+    return getattr(field, "coarse", None)
+
+
 @dataclass
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
 
-    `hits` are those of the renderings of the metered field that `boundary.rendered` has checked.
+    `coarse` are points whose value was computed by `Coarse`; they are not in `value`. `hits` are those of the
+    renderings of the metered field that `boundary.rendered` has checked.
     """
 
     value: int = 0
     gradient: int = 0
     hits: int = field(default=0, repr=False, compare=False)
+    coarse: int = 0
 
     def flops(self, field: Field) -> int | None:
-        """The floating-point operations of these evaluations; None where the field does not state them."""
+        """The floating-point operations of these evaluations, without coarse ones; None where the field has none."""
         if field.flops is None:
             return None
         return field.flops.value * self.value + field.flops.gradient * self.gradient
+
+    def coarse_flops(self, field: Field) -> int:
+        """The operations of coarse evaluations, each of which has as many as one that is not; 0 if none are stated."""
+        return field.flops.value * self.coarse if field.flops else 0
 
     def over_bound(self, field: Field) -> float | None:
         """The work of these evaluations, divided by that of one value and one gradient per hit; None without hits.
 
         No renderer can do with less, if every hit has a gradient. Of a field that does not state its operations, a
-        gradient counts as much as a value.
+        gradient counts as much as a value. A coarse value counts as much as any.
         """
         cost = field.flops or Flops(1, 1)
         least = (cost.value + cost.gradient) * self.hits
-        return (cost.value * self.value + cost.gradient * self.gradient) / least if least else None
+        work = cost.value * (self.value + self.coarse) + cost.gradient * self.gradient
+        return work / least if least else None
 
     def __sub__(self, other: "Counts") -> "Counts":
-        return Counts(self.value - other.value, self.gradient - other.gradient, self.hits - other.hits)
+        mine, others = vars(self), vars(other)
+        return Counts(**{name: mine[name] - others[name] for name in mine})
 
 
 class Wrapper(ABC):
@@ -115,6 +154,15 @@ class Meter(Wrapper):
         if values.requires_grad:
             values.register_hook(self._count_backward)
         return values
+
+    @property
+    def coarse(self) -> Coarse | None:
+        """The coarse values of the field, counted apart."""
+        offered = coarse_of(self.inner)
+        return offered and offered.noted(self._count_coarse)
+
+    def _count_coarse(self, points: int) -> None:
+        self.counts.coarse += points
 
     def _count_backward(self, gradient: Tensor) -> None:
         self.counts.gradient += int(gradient.count_nonzero())

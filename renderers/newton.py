@@ -32,9 +32,12 @@ class Newton(Tracer):
     Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; in an
         image also those that a coarse ray passed on its way to a surface behind, as with DIST; on the rays of the dense
         search, what is thinner than the spacing of its samples, unless it is next to the least one. A ray that passes
-        an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step.
+        an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. Where the field
+        offers coarse values, a step may be longer by their error, and a miss's `closest` is off by it: rays that came
+        within that error of the surface are marched again, on the field itself.
 
     Args:
+        coarse: see `tracer.Tracer` and `field.Coarse`.
         silhouette_epsilon, silhouette_signed, silhouette_average: see `silhouette.Hinge`.
         warm: whether a rendering in an optimisation begins where that of the same rays ended before; see `warm`.
         memory: of the optimisation.

@@ -6,6 +6,7 @@ The rays that go on are rows of one table, so that a step costs few operations. 
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import inf
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
-from renderers.field import Field
+from renderers.field import Values
 from renderers.march import CAREFUL, PYRAMID_STEPS, Stepping, pyramid
 
 # Of the way between a ray and its coarse ray, where that stopped: with less, more begin behind the surface.
@@ -40,9 +41,10 @@ class Reached:
         table: the columns that the properties below name.
     """
 
-    table: Float[Tensor, "n 12"]
+    table: Float[Tensor, "n 13"]
 
-    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP, PASSED, ANCHOR, CLEARED = range(12)
+    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP = range(9)
+    PASSED, ANCHOR, CLEARED, GRAZED = range(9, 13)
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "Reached":
@@ -50,8 +52,8 @@ class Reached:
         entry, leave, meets = sphere_span(rays, radius)
         none = torch.full_like(entry, torch.inf)
         stop = torch.where(meets, float(Stop.ON_THE_WAY), float(Stop.LEFT)).to(entry.dtype)
-        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop, none, entry, entry)
-        return Reached(torch.stack(columns, dim=1))
+        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop)
+        return Reached(torch.stack([*columns, none, entry, entry, none], dim=1))
 
     @property
     def distance(self) -> Float[Tensor, " n"]:
@@ -108,6 +110,11 @@ class Reached:
         """Along each ray that has LEFT, to where its samples are above `CLEAR` from then on; its end at the most."""
         return self.table[:, self.CLEARED]
 
+    @property
+    def grazed(self) -> Float[Tensor, " n"]:
+        """The least of each ray's own values behind which they rose, or it left the sphere; infinite without any."""
+        return self.table[:, self.GRAZED]
+
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
         return self.table[:, self.STOP] == float(stop)
@@ -115,6 +122,24 @@ class Reached:
     def some(self, index: Int[Tensor, " m"]) -> "Reached":
         """The same of some of the rays, as a copy."""
         return Reached(self.table[index])
+
+    def begun_again(self, rays: Rays, anchored: Bool[Tensor, " n"], *, radius: float) -> "Reached":
+        """The rays to be marched again, from their anchor where they are `anchored`, else from their beginning.
+
+        What they have passed up to there stays known. Those that had LEFT end where they had passed all that is close,
+        since they are free from there on.
+        """
+        start = Reached.on_sphere(rays, radius)
+        columns = [self.DISTANCE, self.ANCHOR, self.CLEARED, self.PASSED, self.LEAVE]
+        leave = torch.where(self.stopped(Stop.LEFT), self.cleared, self.leave)
+        begun = torch.stack([self.anchor, self.anchor, self.cleared, self.passed.clamp_min(CLEAR), leave], dim=1)
+        start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
+        return start
+
+    def replace(self, index: Int[Tensor, " m"], others: "Reached") -> None:
+        """Has m of the rays as `others` are now; they still leave the sphere where they did."""
+        others.table[:, self.LEAVE] = self.leave[index]
+        self.table[index] = others.table
 
     def bracket(self) -> Bracket:
         """Between the last positive value of each ray and its last value; meant for rays that have CROSSED."""
@@ -154,14 +179,22 @@ class Reached:
         self.table[:, self.FREE] = torch.where(positive, at, self.free)
         self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
         self.table[:, self.ANCHOR] = torch.where(closest > CLEAR, at, self.anchor)
-        self.table[:, self.PASSED] = torch.where(rises | left, torch.minimum(self.passed, before), self.passed)
+        for column in (self.PASSED, self.GRAZED):
+            least = self.table[:, column]
+            self.table[:, column] = torch.where(rises | left, torch.minimum(least, before), least)
         return goes_on & finite
 
-    def split(self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float) -> "Reached":
+    def split(
+        self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, hidden: float = -inf
+    ) -> "Reached":
         """The same of finer rays, each of which continues from its coarse `parent`.
 
         Where that stopped at a surface, or one is about as close as the two rays are apart, a ray begins before its
         closest sample. One whose coarse ray met nothing keeps its closest sample, if that is free.
+
+        Args:
+            hidden: largest value at which the coarse ray may have met a surface: rays below one that passed such a
+                value begin anew.
         """
         child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
@@ -171,6 +204,7 @@ class Reached:
             coarse.origins[parent] + at * coarse.directions[parent] - rays.origins - at * rays.directions, dim=-1
         )
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
+        inherits &= (known.grazed > hidden) & (ended | (known.least > hidden))
         close = ended | (known.least.abs() <= CAREFUL * apart)
         start = torch.where(close, known.least_distance - SET_BACK * apart, known.distance)
         gone = inherits & ~ended & (start >= child.leave)
@@ -187,7 +221,9 @@ class Reached:
         return child
 
 
-def approach(field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius: float) -> Reached:
+def approach(
+    field: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, hidden: float = -inf
+) -> Reached:
     """Marches all rays; those of an image coarse to fine, as in `march.march_coarse_to_fine`.
 
     Args:
@@ -195,18 +231,19 @@ def approach(field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius
         stepping: its epsilon, alpha, extra_step_cap and step_clamp.
         steps: most steps per ray, those of its coarse rays included.
         radius: of the sphere about the origin that holds the shape.
+        hidden: see `Reached.split`.
     """
     levels = pyramid(rays) if rays.image else []
     reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
         march(field, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
-        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius)
+        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius, hidden=hidden)
     march(field, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
 
 
-def march(field: Field, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
+def march(field: Values, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
     origins, directions, moving = rays.origins[index], rays.directions[index], reached.some(index)

@@ -9,13 +9,14 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, carries_gradient
+from renderers.field import Field, carries_gradient, coarse_of
 from renderers.gradients import crossing
 from renderers.march import Stepping
-from renderers.packed_march import Reached, Stop, approach
+from renderers.packed_march import CLEAR, Reached, Stop, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
 LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
+PATIENT = 2  # times as many steps on coarse values: they cost less than the search
 SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
 
 
@@ -34,6 +35,7 @@ class Tracer:
         search_steps: values per hit that narrow the interval found there.
         least_slope: see `gradients.implicit`.
         sphere_radius: of the sphere about the origin that holds the shape.
+        coarse: whether rays are first marched on the field's coarse values, where it offers any.
     """
 
     steps: int
@@ -45,6 +47,7 @@ class Tracer:
     search_steps: int
     least_slope: float
     sphere_radius: float
+    coarse: bool
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "22 leave one ray in 200 to the search")
@@ -65,18 +68,48 @@ class Tracer:
     def trace(self, field: Field, rays: Rays) -> tuple[Reached, "Solved"]:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
-            reached = approach(field, rays, self.stepping, steps=self.steps, radius=self.sphere_radius)
-        return reached, self.crossings(field, rays.flat(), reached)
+            coarse = coarse_of(field) if self.coarse else None
+            if coarse is None:
+                reached = approach(field, rays, self.stepping, steps=self.steps, radius=self.sphere_radius)
+            else:
+                settings = {"steps": PATIENT * self.steps, "radius": self.sphere_radius, "hidden": coarse.error}
+                reached = approach(coarse.values, rays, self.stepping, **settings)
+        if coarse is None:
+            return reached, self.crossings(field, rays.flat(), reached)
+        return reached, self._decided(field, rays.flat(), reached, coarse.error)
 
-    def crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
-        """Where flat rays cross the surface, from where the march left them; in `reached`, also what a search saw."""
+    def _decided(self, field: Field, rays: Rays, reached: Reached, error: float) -> "Solved":
+        """The crossings of flat rays that were marched on coarse values, which are off by at most `error`.
+
+        A ray is certain where it left the sphere, or where a Newton step finds the surface; if it came close to no
+        other one on its way. Others are marched again, on the field itself, from where they came near.
+        """
+        first = self._close(field, rays, reached, furthest=CLEAR)
+        with torch.no_grad():
+            reached.table[:, Reached.PASSED] -= error
+            certain = reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & (reached.grazed > error)
+            anew = reached.stopped(Stop.INSIDE) | reached.stopped(Stop.NOT_FINITE)
+            index = (~certain).nonzero().squeeze(-1)
+            again = reached.some(index).begun_again(rays[index], ~anew[index], radius=self.sphere_radius)
+            march(field, rays[index], again, self.stepping, PATIENT * self.steps)
+        second = self.crossings(field, rays[index], again).among(index)
+        reached.replace(index, again)
+        return first.some(certain[first.index]).joined(second)
+
+    def _close(self, field: Field, rays: Rays, reached: Reached, *, furthest: float = 0.0) -> "Solved":
+        """The crossings of those flat rays that stopped close to a surface; `furthest` as in `solve`."""
         with torch.no_grad():
             crossed = reached.stopped(Stop.CROSSED)
             close = (crossed | reached.stopped(Stop.NEAR)).nonzero().squeeze(-1)
             guess = torch.where(crossed, reached.bracket().secant(), reached.distance)[close]
-        first = self.solve(field, rays, reached, close, guess)
+        return self.solve(field, rays, reached, close, guess, furthest=furthest)
+
+    def crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
+        """Where flat rays cross the surface, from where the march left them; in `reached`, also what a search saw."""
+        first = self._close(field, rays, reached)
         with torch.no_grad():
-            unsolved = close[~first.settled]
+            crossed = reached.stopped(Stop.CROSSED)
+            unsolved = first.index[~first.settled]
             between = unsolved[crossed[unsolved]]
             on_the_way = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
             searched = torch.cat([unsolved[~crossed[unsolved]], on_the_way])
@@ -214,6 +247,10 @@ class Solved:
     def some(self, which: Bool[Tensor, " m"]) -> "Solved":
         """The same of some of them."""
         return Solved(*(column[which] for column in self.columns))
+
+    def among(self, index: Int[Tensor, " n"]) -> "Solved":
+        """The same of rays that are those at `index` of more rays."""
+        return replace(self, index=index[self.index])
 
     def joined(self, other: "Solved") -> "Solved":
         """These, and behind them the others."""

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.packed_march import CLEAR, Reached, Stop, march
+from renderers.packed_march import CLEAR, Reached, march
 from renderers.rendering import Rendering
 from renderers.tracer import Solved, Tracer
 
@@ -189,32 +189,16 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         if len(index) > MOST * len(free):
             return None
         anchored = up_to_anchor & ~audited
-        moving = _from_anchors(
-            Reached.on_sphere(rays[index], tracer.sphere_radius), reached.some(index), anchored[index]
-        )
+        moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
         march(field, rays[index], moving, tracer.stepping, tracer.steps)
-    found = tracer.crossings(field, rays[index], moving)
-    found = Solved(index[found.index], *found.columns[1:])
+    found = tracer.crossings(field, rays[index], moving).among(index)
     with torch.no_grad():
         differing = _differing(tracer, solved, found, certain & audited)
         if memory.audit(int((certain & audited).sum()), differing):
             return None
-        moving.table[:, Reached.LEAVE] = reached.leave[index]
-        reached.table[index] = moving.table
+        reached.replace(index, moving)
         image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
     return solved.some((certain & ~audited)[solved.index]).joined(found)
-
-
-def _from_anchors(start: Reached, known: Reached, anchored: Bool[Tensor, " n"]) -> Reached:
-    """Rays that start at their anchor, where they are `anchored`; what they have passed up to there stays known.
-
-    Those that had left the sphere end where they had passed all that is close, since they are free from there on.
-    """
-    columns = [Reached.DISTANCE, Reached.ANCHOR, Reached.CLEARED, Reached.PASSED, Reached.LEAVE]
-    leave = torch.where(known.stopped(Stop.LEFT), known.cleared, known.leave)
-    begun = torch.stack([known.anchor, known.anchor, known.cleared, known.passed.clamp_min(CLEAR), leave], dim=1)
-    start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
-    return start
 
 
 def _look(field: Field, rays: Rays, reached: Reached) -> Float[Tensor, " m"]:

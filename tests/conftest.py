@@ -112,10 +112,10 @@ def asked_once() -> Iterator[None]:
     from bench.machine import environment
 
     measure = environment.gemm_peak
-    rate = cache(lambda device, threads: measure(device))
+    rate = cache(lambda *asked: measure(*asked[:-1]))  # for each number of threads
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(environment, "_git", cache(environment._git))
-        patch.setattr(environment, "gemm_peak", lambda device: rate(device, torch.get_num_threads()))
+        patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         yield
 

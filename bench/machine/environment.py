@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from bench.records.record import Record
+from renderers.fields.bfloat16 import multiplies_faster
 
 ROOT = Path(__file__).resolve().parents[2]
 GEMM_SIZE = 1024  # of the square matrices whose product is timed
@@ -51,6 +52,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
+        "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if multiplies_faster(device) else None,
     }
 
 
@@ -65,9 +67,9 @@ def using_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def gemm_peak(device: torch.device, repeats: int = 5) -> float:
-    """Best rate of a float32 matrix product on this device with the current threads, in operations per second."""
-    matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device)
+def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32, repeats: int = 5) -> float:
+    """Best rate of a matrix product on this device with the current threads, in operations per second."""
+    matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device).to(dtype)
     best = float("inf")
     for _ in range(repeats + 1):  # one more, since the first one is a warm-up
         synchronise(device)
@@ -76,6 +78,12 @@ def gemm_peak(device: torch.device, repeats: int = 5) -> float:
         synchronise(device)
         best = min(best, time.perf_counter() - start)
     return 2 * GEMM_SIZE**3 / best
+
+
+def seconds_at_peak(environment: dict[str, Any], flops: int, coarse_flops: int) -> float:
+    """The seconds that operations take at the machine's peak rates; `coarse_flops` are those in bfloat16."""
+    seconds = flops / environment["gemm_peak_flops"]
+    return seconds + coarse_flops / environment["bfloat16_peak_flops"] if coarse_flops else seconds
 
 
 def synchronise(device: torch.device) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.machine.environment import MemoryPeak
 from bench.records.record import RunStatus
 from renderers.checks import check_positive
-from renderers.field import Field, Wrapper
+from renderers.field import Coarse, Field, Wrapper, coarse_of
 
 MEMORY_INTERVAL = 0.05  # seconds between two checks of the memory
 LEAST = 32  # values that a call counts as at least: calls for fewer points take about as long
@@ -31,8 +31,8 @@ class Limits:
     Work is limited, and not time, so that a busy or a slow machine reaches no other limit than a quiet one.
 
     Args:
-        values: of the field, most of them that are evaluated. A call counts as `LEAST` or more, and as much again where
-            a gradient is propagated back through it.
+        values: of the field, most of them that are evaluated, coarse ones included. A call counts as `LEAST` or more,
+            and as much again where a gradient is propagated back through it.
         memory: rise above the process's memory before, in GiB.
     """
 
@@ -76,6 +76,12 @@ class Watched(Wrapper):
         if values.requires_grad:
             values.register_hook(lambda gradient: self._spend(gradient.numel()))
         return values
+
+    @property
+    def coarse(self) -> Coarse | None:
+        """The coarse values of the field, until a limit is reached."""
+        offered = coarse_of(self.inner)
+        return offered and offered.noted(self._spend)
 
     def _spend(self, values: int) -> None:
         """Counts values before they are evaluated.

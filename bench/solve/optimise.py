@@ -5,7 +5,7 @@ Several starts share one budget of iterations: successive halving keeps the bett
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isnan
 from typing import Any
 
@@ -58,7 +58,7 @@ def optimise(
     """
     optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
     history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
-    before = problem.counts - Counts()
+    before = replace(problem.counts)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
         optimiser.param_groups[0]["lr"] = settings.rate(iteration)
@@ -72,7 +72,7 @@ def optimise(
         line = {
             "iteration": iteration,
             "seconds": history.seconds["forward"] + history.seconds["backward"],
-            "value_evaluations": history.counts.value,
+            "value_evaluations": history.counts.value + history.counts.coarse,
             "gradient_evaluations": history.counts.gradient,
             **{name: term.item() for name, term in terms.items()},
         }

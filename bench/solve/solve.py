@@ -6,15 +6,19 @@ from dataclasses import replace
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
+from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import InverseTask, NotReached, OptimiserSettings, Problem, check_kind
+from renderers.field import Counts, Field
 
 COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
+    "evaluations.coarse": "points whose value was computed more cheaply, in bfloat16, where it decides nothing; absent "
+    "without any, and not among those of value",
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
     "evaluations.observed": "pixels whose depth was given",
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
@@ -26,8 +30,9 @@ COSTS = {
     "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
     "peak_memory_bytes": "highest rise, during the loop, of the process's resident memory (CPU) or PyTorch's (GPU)",
-    "flops": "evaluations times the field's operations per evaluation",
-    "gemm_fraction": "flops over the loop's seconds, divided by the machine's best float32 matrix product rate",
+    "flops": "evaluations times the field's operations per evaluation, coarse ones included",
+    "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
+    "coarse values, in bfloat16, over the loop's seconds",
 }
 
 
@@ -152,31 +157,47 @@ def descend(
     return history
 
 
-def note_costs(record: Record, *, seconds: dict[str, float], flops: int | None, evaluations: dict[str, float]) -> None:
-    """Notes a loop's costs in the record; `seconds` has "forward" and "backward"."""
+def note_costs(
+    record: Record,
+    *,
+    seconds: dict[str, float],
+    flops: int | None,
+    evaluations: dict[str, float],
+    coarse_flops: int = 0,
+) -> None:
+    """Notes a loop's costs in the record; `seconds` has "forward" and "backward", `flops` are without coarse ones."""
     record.seconds |= seconds
-    record.flops, record.evaluations = flops, evaluations
+    record.evaluations = evaluations
     loop = seconds["forward"] + seconds["backward"]
+    if flops is not None:
+        record.flops = flops + coarse_flops
     if flops is not None and loop > 0:
-        record.gemm_fraction = flops / loop / record.environment["gemm_peak_flops"]
+        record.gemm_fraction = seconds_at_peak(record.environment, flops, coarse_flops) / loop
+
+
+def counted(counts: Counts, field: Field) -> dict[str, float]:
+    """Evaluations of a field as they stand in a record; without hits no work is known to be needed."""
+    numbers: dict[str, float] = {"value": counts.value, "gradient": counts.gradient}
+    if counts.coarse:
+        numbers["coarse"] = counts.coarse
+    if (over_bound := counts.over_bound(field)) is not None:
+        numbers["work_over_bound"] = over_bound
+    return numbers
 
 
 def _note_history(record: Record, problem: Problem, history: History) -> None:
     """Notes the costs of a loop, also of one that was stopped."""
     iterations = max(len(history.curve), 1)
     evaluations = {
-        "value": history.counts.value,
-        "gradient": history.counts.gradient,
+        **counted(history.counts, problem.field()),
         "per_ray": history.counts.value / problem.rays_per_iteration / iterations,
         "rays_per_iteration": problem.rays_per_iteration,
         "observed": int(problem.observed.sum()),
         "iterations": len(history.curve),
     }
-    if (over_bound := history.counts.over_bound(problem.field())) is not None:
-        evaluations["work_over_bound"] = over_bound
     record.peak_memory_bytes = history.peak_memory_bytes
-    flops = history.counts.flops(problem.field())
-    note_costs(record, seconds=history.seconds, flops=flops, evaluations=evaluations)
+    flops, coarse = history.counts.flops(problem.field()), history.counts.coarse_flops(problem.field())
+    note_costs(record, seconds=history.seconds, flops=flops, coarse_flops=coarse, evaluations=evaluations)
 
 
 def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | None:

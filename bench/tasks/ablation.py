@@ -5,23 +5,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 from statistics import median
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bench.evaluate.reference import Reference, reference_for
-from bench.machine.environment import gemm_peak, synchronise
+from bench.machine.environment import gemm_peak, seconds_at_peak, synchronise
 from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.problem import check_field_gradient, check_kind
+from bench.solve.solve import counted
 from datasets.scene import View
 from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
-from renderers.rendering import Observed, Rendering
+from renderers.rendering import Observed, Renderer, Rendering
 
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
 WARM_UP = 8  # pixels per side of the image that is rendered before the timing
@@ -29,6 +31,8 @@ WARM_UP = 8  # pixels per side of the image that is rendered before the timing
 DEFINITIONS = {
     "size": "pixels per side of the image for which the other numbers were measured",
     "queries": "points whose field value was computed in one rendering without gradient; counted at the field",
+    "coarse_queries, step_coarse_queries": "beside these, points whose value was computed more cheaply, in bfloat16, "
+    "where it decides nothing; in a rendering, and in a step",
     "step_queries, step_gradients": "points whose value was computed in a step, and points through whose value a "
     "non-zero gradient was propagated back",
     "forward_seconds": "rendering without gradient: median of the repeats; _low and _high: least and largest",
@@ -40,8 +44,8 @@ DEFINITIONS = {
     "evaluations.work_over_bound": "the operations of a step, divided by those of one value and one gradient per hit; "
     "absent without hits",
     "seconds.total": "the whole run, with making or loading shape, network and reference",
-    "forward_gemm, step_gemm": "floating-point operations per second at the median time, divided by the machine's peak "
-    "rate of a float32 matrix product",
+    "forward_gemm, step_gemm": "seconds that the floating-point operations take at the machine's peak rate of a matrix "
+    "product, in float32 or, of coarse values, in bfloat16, over the median time",
     "peak_memory_bytes": "largest growth of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
     "rays, hits": "pixels of the image; pixels that the reference hits",
@@ -109,7 +113,8 @@ class Ablation:
         inputs, size = run.inputs, f"{camera.height} x {camera.width}"
         fitted = inputs.fitted()
         run.progress(f"making the reference at {size}", 0, 1)
-        bench = Workbench(inputs, camera, reference_for(fitted, camera, inputs.cache), self.limits)
+        reference = reference_for(fitted, camera, inputs.cache)
+        bench = Workbench(inputs, inputs.renderer, camera, reference, self.limits)
         run.progress(f"timing steps at {size}", 0, 1)
         step = bench.steps(repeats)  # first: it costs more, and where it exceeds a limit the rest would be wasted
         run.progress(f"timing renderings at {size}", 0, 1)
@@ -117,14 +122,12 @@ class Ablation:
 
     def _note(self, run: RunContext, measured: "Measured") -> None:
         record, bench = run.record, measured.bench
-        peak = max(record.environment["gemm_peak_flops"], gemm_peak(bench.device))  # measured close to the times
-        record.environment["gemm_peak_flops"] = peak
-        record.metrics = {"size": bench.camera.height, **measured.costs(peak), **bench.errors(self.wrong)}
+        machine, again = record.environment, gemm_peak(bench.device)  # measured close to the times
+        machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], again)
+        record.metrics = {"size": bench.camera.height, **measured.costs(machine), **bench.errors(self.wrong)}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
-        record.evaluations = {"value": measured.step.counts.value, "gradient": measured.step.counts.gradient}
+        record.evaluations = counted(measured.step.counts, bench.decoder.at(bench.code))
         record.evaluations["per_ray"] = measured.forward.counts.value / bench.rays.shape.numel()
-        if (over_bound := measured.step.counts.over_bound(bench.decoder.at(bench.code))) is not None:
-            record.evaluations["work_over_bound"] = over_bound
         record.peak_memory_bytes = measured.step.memory
         found, true = bench.views()
         save_images(run.folder, found, true)
@@ -133,13 +136,24 @@ class Ablation:
 
 @dataclass(frozen=True)
 class Clocked:
-    """The costs of repeats of the same work; `second` has the times of its second part, the backward pass."""
+    """The costs of repeats of the same work.
+
+    Args:
+        seconds: of each.
+        second: of the second part of each, the backward pass.
+        cpu: seconds of all threads together.
+        counts: of the last one.
+        memory: bytes by which the largest rose.
+        flops, coarse_flops: operations of the last one, those in bfloat16 apart; None where they are not stated.
+    """
 
     seconds: list[float]
     second: list[float]
+    cpu: list[float]
     counts: Counts
     memory: int | None
     flops: int | None
+    coarse_flops: int = 0
 
 
 @dataclass(frozen=True)
@@ -150,12 +164,14 @@ class Measured:
     forward: Clocked
     step: Clocked
 
-    def costs(self, peak: float) -> dict[str, float]:
-        """The costs by their names in DEFINITIONS; `peak` is the machine's peak rate in operations per second."""
+    def costs(self, machine: dict[str, Any]) -> dict[str, float]:
+        """The costs by their names in DEFINITIONS; `machine` has its peak rates."""
         times = {"forward": self.forward.seconds, "step": self.step.seconds, "backward": self.step.second}
         costs: dict[str, float] = {
             "queries": self.forward.counts.value,
+            "coarse_queries": self.forward.counts.coarse,
             "step_queries": self.step.counts.value,
+            "step_coarse_queries": self.step.counts.coarse,
             "step_gradients": self.step.counts.gradient,
             "repeats": len(self.step.seconds),
         }
@@ -164,7 +180,8 @@ class Measured:
             costs[f"{name}_seconds_high"] = max(seconds)
         for name, clocked in (("forward", self.forward), ("step", self.step)):
             if clocked.flops is not None:
-                costs[f"{name}_gemm"] = clocked.flops / median(clocked.seconds) / peak
+                at_peak = seconds_at_peak(machine, clocked.flops, clocked.coarse_flops)
+                costs[f"{name}_gemm"] = at_peak / median(clocked.seconds)
         if self.step.memory is not None:
             costs["peak_memory_bytes"] = self.step.memory
         return costs
@@ -173,11 +190,13 @@ class Measured:
 class Workbench:
     """Renders one view of a network with a renderer, under limits, and times it."""
 
-    def __init__(self, inputs: RunInputs, camera: Camera, reference: Reference, limits: Limits) -> None:
+    def __init__(
+        self, inputs: RunInputs, renderer: Renderer, camera: Camera, reference: Reference, limits: Limits
+    ) -> None:
         prior, self.device = inputs.fitted(), inputs.device
         self.decoder = prior.decoder.to(self.device).requires_grad_(False)
         self.code = prior.codes[0].detach().clone().to(self.device).requires_grad_(True)
-        self.renderer, self.camera, self.reference, self.limits = inputs.renderer, camera, reference, limits
+        self.renderer, self.camera, self.reference, self.limits = renderer, camera, reference, limits
         self.rays = camera.rays().to(self.device)
         self.mask = reference.hit.to(self.device)
         self.rendering: Rendering | None = None
@@ -246,15 +265,18 @@ class Workbench:
         """Times the same work `repeats` times, or until all took a quarter of the values that one may take."""
         seconds: list[float] = []
         second: list[float] = []
+        cpu: list[float] = []
         counts, memory, spent = Counts(), None, 0
         while len(seconds) < repeats and spent < self.limits.values / 4:
             counts = Counts()
             field = self.limits.watch(self.decoder.at(self.code), self.device, name)
             synchronise(self.device)
-            start = time.perf_counter()
+            start, ran = time.perf_counter(), time.process_time()
             second.append(work(Meter(field, counts)))
             synchronise(self.device)
             seconds.append(time.perf_counter() - start)
+            cpu.append(time.process_time() - ran)
             spent += field.spent
             memory = field.memory.growth() if memory is None else max(memory, field.memory.growth() or 0)
-        return Clocked(seconds, second, counts, memory, counts.flops(self.decoder.at(self.code)))
+        shape = self.decoder.at(self.code)
+        return Clocked(seconds, second, cpu, counts, memory, counts.flops(shape), counts.coarse_flops(shape))

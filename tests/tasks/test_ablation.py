@@ -144,13 +144,15 @@ def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(
 
 
 def test_costs_are_medians_with_least_and_largest():
-    clocked = ablation.Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], ablation.Counts(10, 4), 77, 600)
-    forward = ablation.Clocked([2.0], [0.0], ablation.Counts(5, 0), None, None)
-    costs = ablation.Measured(None, forward, clocked).costs(100.0)  # type: ignore[arg-type]
-    assert costs == {
-        "queries": 5, "step_queries": 10, "step_gradients": 4, "repeats": 3, "peak_memory_bytes": 77,
+    clocked = ablation.Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], ablation.Counts(10, 4, coarse=7), 77, 600, 80)
+    forward = ablation.Clocked([2.0], [0.0], [0.0], ablation.Counts(5, 0), None, None)
+    measured = ablation.Measured(None, forward, clocked)  # type: ignore[arg-type]
+    assert measured.costs({"gemm_peak_flops": 100.0, "bfloat16_peak_flops": 400.0}) == {
+        "queries": 5, "coarse_queries": 0, "step_queries": 10, "step_coarse_queries": 7, "step_gradients": 4,
+        "repeats": 3, "peak_memory_bytes": 77,
         "forward_seconds": 2.0, "forward_seconds_low": 2.0, "forward_seconds_high": 2.0,
-        "step_seconds": 3.0, "step_seconds_low": 1.0, "step_seconds_high": 8.0, "step_gemm": 600 / 3.0 / 100.0,
+        "step_seconds": 3.0, "step_seconds_low": 1.0, "step_seconds_high": 8.0,
+        "step_gemm": (600 / 100.0 + 80 / 400.0) / 3.0,
         "backward_seconds": 0.5, "backward_seconds_low": 0.25, "backward_seconds_high": 0.75,
     }  # fmt: skip
     assert median([3.0, 1.0, 8.0]) == 3.0

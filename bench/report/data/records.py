@@ -95,8 +95,9 @@ def loop_seconds(record: Record) -> float | None:
 
 
 def value_evaluations(record: Record) -> float | None:
-    """The number of field values computed in the loop; None where the record does not have it."""
-    return record["evaluations"].get("value")
+    """The number of field values computed in the loop, coarse ones included; None where the record does not have it."""
+    value = record["evaluations"].get("value")
+    return None if value is None else value + record["evaluations"].get("coarse", 0)
 
 
 def median_of_known(values: Iterable[float | None]) -> float | None:

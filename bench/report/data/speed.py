@@ -53,13 +53,21 @@ COMPLETION = Trial(
     loop_seconds,
     value_evaluations,
 )
+
+
+def _queries(record: Record) -> float | None:
+    """The number of field values of one rendering, coarse ones included; None where the record does not have it."""
+    queries = measured(record, "queries")
+    return None if queries is None else queries + (measured(record, "coarse_queries") or 0)
+
+
 RENDERING = Trial(
     Selection("speed_rendering", ("ablation",), VARIES, former="speed_accuracy"),
     "rendering an image",
     "error_p95",
     "depth error, 95th percentile × 1000 (scene units)",
     lambda record: measured(record, "forward_seconds"),  # of one rendering without gradient
-    lambda record: measured(record, "queries"),
+    _queries,
 )
 TRIALS = (COMPLETION, RENDERING)
 MAIN = {"dvr": "dvr_early_stop"}  # presets that stand for a renderer whose own preset is not among the settings

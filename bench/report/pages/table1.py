@@ -25,6 +25,7 @@ PUBLISHED = {
 }
 DEFINED = {
     "queries": "Queries",
+    "coarse_queries": "Coarse",
     "forward_seconds": "Forward",
     "backward_seconds": "Backward",
     "step_seconds": "Step",
@@ -112,6 +113,12 @@ def _together(show: Show, *names: str) -> Callable[[Record], str]:
     return shown_together
 
 
+def _queries(record: Record) -> str:
+    """The field values of a rendering, and how many more of them were coarse."""
+    text, coarse = format.count(measured(record, "queries")), measured(record, "coarse_queries")
+    return f"{text} + {format.count(coarse)} coarse" if coarse else text
+
+
 def _step(record: Record) -> str:
     """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
     middle, low, high = (measured(record, f"step_seconds{end}") for end in ("", "_low", "_high"))
@@ -129,8 +136,8 @@ COLUMNS = (
     *IDENTITY,
     Column("size", "Size", _requested, words=_size),
     configured("steps", "renderer", "steps", heading="Steps"),
-    _cost("queries", "Queries", format.count),
-    *(_cost("step_queries"), _cost("step_gradients")),
+    replace(_cost("queries", "Queries"), words=_queries),
+    *(_cost(name) for name in ("coarse_queries", "step_queries", "step_coarse_queries", "step_gradients")),
     _cost("forward_seconds", "Forward", format.seconds, key="forward_s"),
     _cost("backward_seconds", "Backward", format.seconds, key="backward_s"),
     replace(_cost("step_seconds", "Step", key="step_s"), words=_step),

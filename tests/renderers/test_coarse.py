@@ -1,0 +1,230 @@
+"""Coarse values: what a renderer that marches on them may miss, what they cost, and those of a network."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from bench.machine.limits import LimitReached, Limits
+from renderers.boundary import rendered
+from renderers.camera import Rays
+from renderers.field import Coarse, Counts, Field, Flops, Meter, Wrapper, coarse_of
+from renderers.fields import bfloat16
+from renderers.fields.analytic import box, capsule, plane, sphere, torus
+from renderers.fields.mlp import Decoder
+from renderers.packed_march import Stop
+from renderers.rendering import Status
+from tests.renderers.test_newton import camera, exact
+
+NEWTON = load("renderer", "newton")
+ERROR = 5e-3  # of the coarse values below, a third of a pixel
+SHAPES = {"ball": sphere(0.6), "ring": torus(0.5, 0.2), "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1)}
+ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
+    "too large": lambda points: torch.full_like(points[..., 0], ERROR),
+    "too small": lambda points: torch.full_like(points[..., 0], -ERROR),
+    "rippled": lambda points: ERROR * (200.0 * points.sum(-1)).sin(),
+    "not a number": lambda points: torch.where(points[..., 0] > 0, torch.nan, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Offering(Wrapper):
+    """A shape that offers coarse values, which are off as `off` says."""
+
+    inner: Field
+    off: Callable[[Tensor], Tensor]
+
+    def __call__(self, points: Tensor) -> Tensor:
+        return self.inner(points)
+
+    @property
+    def coarse(self) -> Coarse:
+        """The coarse values."""
+        return Coarse(lambda points: self.inner(points) + self.off(points), ERROR)
+
+
+@pytest.mark.parametrize("off", ERRORS.values(), ids=ERRORS)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_a_surface_is_found_where_it_is_whatever_coarse_values_say(shape, off):
+    truth = exact(shape)
+    with torch.no_grad():
+        found = NEWTON.render(Offering(shape, off), camera().rays())
+    error = (found.distance - truth.distance)[truth.hit & found.hit].abs()
+    assert int((truth.hit ^ found.hit).sum()) <= 2
+    assert error.median() < 2e-6
+    assert error.quantile(0.99) < 2e-4
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_the_field_is_asked_near_the_surface_alone(shape):
+    meter, plain = Meter(Offering(shape, ERRORS["rippled"])), Meter(shape)
+    with torch.no_grad():
+        hits = int(rendered(NEWTON, meter, camera().rays()).hit.sum())
+        rendered(NEWTON, plain, camera().rays())
+    assert meter.counts.value < 0.6 * plain.counts.value
+    assert hits <= meter.counts.gradient <= 2 * hits
+    assert meter.counts.coarse <= plain.counts.value
+
+
+@pytest.mark.parametrize(("x", "status"), [(0.0, Status.STARTED_INSIDE), (0.602, Status.MISS)])
+def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status):
+    """Beside the surface, where coarse values say that it is inside, it looks away."""
+    away = camera().rays()
+    origins, directions = (torch.tensor([at, 0.0, 0.0]).expand_as(away.origins) for at in (x, 1.0))
+    away = replace(away, origins=origins, directions=directions)
+    with torch.no_grad():
+        found = NEWTON.render(Offering(sphere(0.6), ERRORS["too small"]), away)
+    assert (found.status == status).all()
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
+    rays = camera().rays()
+    reached, _ = NEWTON.trace(Offering(shape, ERRORS["too large"]), rays)
+    left = reached.stopped(Stop.LEFT) & reached.least.isfinite()
+    there = shape(rays.flat().at(reached.least_distance))
+    assert left.sum() > 1000
+    assert (reached.passed <= there + 1e-5)[left].all()
+
+
+@pytest.mark.parametrize("behind", [2.0, 0.06])
+def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind):
+    """The edge of a small ball, before a wall, so near that coarse rays lie closer than coarse values are exact."""
+    y, x = torch.meshgrid(0.047 + 1e-4 * torch.arange(64), 1e-4 * torch.arange(64), indexing="ij")
+    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
+    near = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand_as(origins), image=True)
+    scene = sphere(0.05) | plane((0.0, 0.0, -1.0), -behind)
+    with torch.no_grad():
+        found = NEWTON.render(Offering(scene, ERRORS["too large"]), near)
+    inside = x.square() + y.square() < 0.05**2
+    on_ball = found.hit & (found.distance < 2.05)
+    assert inside.sum() > 1000
+    assert (on_ball ^ inside).sum() <= 0.02 * inside.sum()
+
+
+def test_coarse_values_can_be_switched_off():
+    meter = Meter(Offering(box((0.5, 0.4, 0.3)), ERRORS["rippled"]))
+    with torch.no_grad():
+        load("renderer", "newton", coarse=False).render(meter, camera().rays())
+    assert meter.counts.coarse == 0
+
+
+def test_a_field_that_wraps_another_offers_no_coarse_values_of_it():
+    class Doubled(Wrapper):
+        inner = Offering(sphere(0.5), ERRORS["rippled"])
+
+        def __call__(self, points):
+            return 2 * self.inner(points)
+
+    assert coarse_of(Doubled()) is None
+
+
+def test_coarse_values_are_counted_apart_and_limited():
+    offering = Offering(sphere(0.5), ERRORS["rippled"])
+    meter = Meter(Limits(values=200, memory=4).watch(offering, torch.device("cpu")))
+    values = coarse_of(meter)
+    assert values is not None and values.error == ERROR
+    values.values(torch.zeros(5, 20, 3))
+    assert meter.counts == Counts(coarse=100)
+    assert meter.counts - Counts(coarse=30) == Counts(coarse=70)
+    with pytest.raises(LimitReached, match="more than 200 field values"):
+        values.values(torch.zeros(101, 3))
+
+
+def test_the_work_of_coarse_values_counts_as_much_as_any():
+    @dataclass(frozen=True)
+    class Stated(Wrapper):
+        inner: Field
+        flops: Flops = Flops(10, 20)  # noqa: RUF009
+
+        def __call__(self, points):
+            return self.inner(points)
+
+    counts = Counts(2, 3, hits=1, coarse=4)
+    assert counts.flops(Stated(sphere(0.5))) == 2 * 10 + 3 * 20
+    assert counts.coarse_flops(Stated(sphere(0.5))) == 4 * 10
+    assert counts.over_bound(Stated(sphere(0.5))) == (6 * 10 + 3 * 20) / 30
+    assert counts.coarse_flops(sphere(0.5)) == 0
+
+
+@pytest.fixture
+def wide(monkeypatch) -> Decoder:
+    """A network that offers coarse values on any machine, slowly where they do not pay."""
+    monkeypatch.setattr(bfloat16, "multiplies_faster", lambda device: True)
+    torch.manual_seed(0)
+    return Decoder(layers=4, width=256, code_length=8, skip=2, narrow=True).requires_grad_(False)
+
+
+def points(count: int = 3000) -> Tensor:
+    return 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 1
+
+
+def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
+    for code in (torch.zeros(8), torch.randn(8, generator=torch.Generator().manual_seed(2))):
+        field = wide.at(code)
+        coarse = coarse_of(field)
+        assert coarse is not None
+        off = (coarse.values(points()) - field(points())).abs()
+        assert 0 < off.max() <= coarse.error
+        assert off.max() > coarse.error / 10
+
+
+def test_their_leading_shape_is_that_of_the_points(wide):
+    values = wide.at(torch.zeros(8)).coarse.values
+    assert values(torch.zeros(2, 5, 3)).shape == (2, 5)
+    assert values(torch.zeros(0, 3)).shape == (0,)
+
+
+def test_their_error_is_measured_once_for_each_state_of_the_weights(wide, monkeypatch):
+    measured = []
+    largest = bfloat16._largest_error
+    monkeypatch.setattr(bfloat16, "_largest_error", lambda *given: measured.append(1) or largest(*given))
+    for code in torch.eye(8)[:3]:
+        assert wide.at(code).coarse
+    assert len(measured) == 1
+    wide.last.weight.mul_(2.0)
+    assert wide.at(torch.zeros(8)).coarse
+    assert len(measured) == 2
+
+
+def test_without_the_private_names_of_torch_they_are_the_same(wide, monkeypatch):
+    packed = wide.at(torch.zeros(8)).coarse.values(points())
+    monkeypatch.setattr(torch.ops, "mkldnn", object())
+    plain = wide.at(torch.zeros(8)).coarse.values(points())
+    assert (packed - plain).abs().max() < 0.3 * wide.at(torch.zeros(8)).coarse.error
+
+
+def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
+    code = torch.zeros(8)
+    narrow = Decoder(layers=4, width=128, code_length=8, skip=2, narrow=False).requires_grad_(False)
+    assert narrow.at(code).coarse is None
+    assert wide.at(torch.zeros(2, 8)).coarse is None
+    assert wide.double().at(code.double()).coarse is None
+    wide.float()
+    wide.last.weight.requires_grad_(True)
+    assert wide.at(code).coarse is None
+    wide.requires_grad_(False)
+    monkeypatch.setattr(bfloat16, "multiplies_faster", lambda device: False)
+    assert wide.at(code).coarse is None
+
+
+def test_the_gradient_of_a_network_is_that_of_its_field(wide):
+    """A network near a ball's distance: with coarse values and without, hits and their gradient towards the code."""
+    from bench.shape_prior.autodecoder import initialise_to_sphere
+
+    initialise_to_sphere(wide, radius=0.5)
+    found = []
+    for use in (True, False):
+        code = torch.zeros(8, requires_grad=True)
+        rendering = load("renderer", "newton", coarse=use).render(wide.at(code), camera().rays())
+        rendering.distance[rendering.hit].sum().backward()
+        found.append((rendering, code.grad))
+    (coarse, its), (plain, other) = found
+    assert int((coarse.hit ^ plain.hit).sum()) <= 1
+    both = coarse.hit & plain.hit
+    assert both.any()
+    assert (coarse.distance - plain.distance)[both].abs().median() < 1e-6
+    assert (its - other).norm() < 0.01 * other.norm()
