@@ -13,7 +13,9 @@ test: .venv/ready-dev ## set up once, then the tests (about 4 minutes on 2 cores
 test-slow: .venv/ready-dev ## the minutes-long tests
 	$(BIN)/python -m pytest -m slow --ignore tests/benchmarks
 
-benchmark: .venv/ready-dev ## speed and memory against the machine's own limits; on a quiet machine
+benchmark: .venv/ready-dev ## renderers in turn, then speed and memory against the machine's own limits; on a quiet machine
+	$(BIN)/python -m bench -m +experiment=benchmark
+	$(BIN)/python -m bench.report
 	$(BIN)/python -m pytest -o addopts="-q -s -p no:dash" tests/benchmarks
 
 mutants: .venv/ready-dev ## plants mistakes one at a time and prints those that no test finds (some minutes)

@@ -1,0 +1,109 @@
+"""Renderers that were timed in turn in one process: their costs over those of the first one, and their errors."""
+
+from typing import Any
+
+from bench.records import format
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import Record, definitions, measured, setting
+from bench.report.write.result import Result
+from bench.report.write.table import Column, shown, text, to_data, to_table, whole
+
+PLACE = 15
+BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.benchmark
+READS = (
+    Selection("benchmark", ("benchmark",), ("task",), ("size", "threads"), setup=("scenes", "network", "machine")),
+)
+COSTS = ("forward", "forward_cpu", "step", "step_cpu")
+DEFINED = {
+    "forward_ratio": "Forward, step, CPU",
+    "coarse_queries": "Values",
+    "work_over_bound": "Work over bound",
+    "peak_memory_bytes": "Memory",
+    "lost": "Missed, spurious",
+    "wrong": "Wrong depth",
+    "depth_error_median": "Depth error",
+}
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per image size, number of threads and renderer."""
+    lines = [line for record in sorted(experiment.named(), key=_place) for line in _lines(record)]
+    rounds = sorted({line["rounds"] for line in lines if line["rounds"]})
+    return Result(
+        experiment,
+        "Speed over that of DIST, in one process.",
+        "Seconds of one rendering and of one step of an optimisation, and their ratios to those of the first renderer "
+        f"of the same round: medians of {' or '.join(map(str, rounds))} rounds, in brackets the least and the largest.",
+        remarks=definitions(experiment.records, DEFINED),
+        data=to_data(COLUMNS, lines),
+        table=to_table(COLUMNS, lines),
+    )
+
+
+def _place(record: Record) -> tuple[int, int]:
+    """The size of the image and the number of threads."""
+    return setting(record["config"], "task", "size"), setting(record["config"], "task", "threads")
+
+
+def _lines(record: Record) -> list[dict[str, Any]]:
+    """A line per renderer of a run; the first has the run's name."""
+    names = dict.fromkeys(name.split(".")[0] for name in record["metrics"] if "." in name)
+    return [_line(record, name) for name in names] or [_line(record, BASE)]
+
+
+def _line(record: Record, name: str) -> dict[str, Any]:
+    numbers = {key.split(".", 1)[1]: measured(record, key) for key in record["metrics"] if key.split(".")[0] == name}
+    size, threads = _place(record)
+    return {
+        "size": size,
+        "threads": threads,
+        "renderer": record["name"] if name == BASE else name,
+        "first": name == BASE,
+        "rounds": record["metrics"].get("rounds"),
+        **{key: record[key] for key in ("status", "reason", "folder")},
+        **numbers,
+    }
+
+
+def _ratio(cost: str) -> Column:
+    """The median of a ratio, and between which ends it lay."""
+
+    def words(line: dict[str, Any]) -> str:
+        middle, low, high = (line.get(f"{cost}_ratio{end}") for end in ("", "_low", "_high"))
+        if middle is None:
+            return format.MISSING
+        return "1" if line["first"] else f"{middle:.2f} ({low:.2f}–{high:.2f})"
+
+    heading = {"forward": "Forward, ratio", "forward_cpu": "its CPU", "step": "Step, ratio", "step_cpu": "its CPU "}
+    return Column(f"{cost}_ratio", heading[cost], words=words)
+
+
+def _together(show: Any, *keys: str) -> Any:
+    return lambda line: " / ".join(show(line.get(key)) for key in keys)
+
+
+def _values(line: dict[str, Any]) -> str:
+    coarse = line.get("coarse_queries")
+    return format.count(line.get("queries")) + (f" + {format.count(coarse)} coarse" if coarse else "")
+
+
+COLUMNS = (
+    Column("size", "Size", show=whole),
+    Column("threads", "Threads", show=whole),
+    text("renderer", "Renderer"),
+    *(text(key) for key in ("status", "reason", "folder")),
+    Column("rounds"),
+    Column("queries", "Values", words=_values),
+    Column("coarse_queries"),
+    Column("forward_seconds", "Forward", show=format.seconds),
+    Column("step_seconds", "Step", show=format.seconds),
+    *(Column(key) for key in ("forward_cpu", "step_cpu")),
+    *(_ratio(cost) for cost in COSTS),
+    *(Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
+    Column("peak_memory_bytes", "Memory of a step", show=format.size),
+    Column("work_over_bound", "Work over bound"),
+    *(Column(key) for key in ("rays", "hits", "lost", "false", "wrong")),
+    shown("Missed / spurious / wrong depth", _together(whole, "lost", "false", "wrong")),
+    *(Column(key) for key in ("depth_error_median", "depth_error_p99", "depth_error_max")),
+    shown("Depth error median / p99", _together(format.number, "depth_error_median", "depth_error_p99")),
+)
