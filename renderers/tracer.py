@@ -1,6 +1,7 @@
 """What finds the surface along rays for `newton.Newton`: a loose march, Newton steps, and a search for what is left."""
 
 from dataclasses import dataclass, fields, replace
+from math import inf
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +10,7 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, carries_gradient, coarse_of
+from renderers.field import Coarse, Field, carries_gradient, coarse_of
 from renderers.gradients import crossing
 from renderers.march import Stepping
 from renderers.packed_march import CLEAR, Reached, Stop, approach, march
@@ -68,15 +69,27 @@ class Tracer:
     def trace(self, field: Field, rays: Rays) -> tuple[Reached, "Solved"]:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
-            coarse = coarse_of(field) if self.coarse else None
-            if coarse is None:
-                reached = approach(field, rays, self.stepping, steps=self.steps, radius=self.sphere_radius)
-            else:
-                settings = {"steps": PATIENT * self.steps, "radius": self.sphere_radius, "hidden": coarse.error}
-                reached = approach(coarse.values, rays, self.stepping, **settings)
+            coarse = self._coarse(field)
+            values, hidden = (coarse.values, coarse.error) if coarse else (field, -inf)
+            steps = PATIENT * self.steps if coarse else self.steps
+            reached = approach(values, rays, self.stepping, steps=steps, radius=self.sphere_radius, hidden=hidden)
+        return reached, self._crossings(field, rays.flat(), reached, coarse)
+
+    def resume(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
+        """Marches flat rays on from where they are, in place, and gives their crossings, which carry the gradient."""
+        with torch.no_grad():
+            coarse = self._coarse(field)
+            march(coarse.values if coarse else field, rays, reached, self.stepping, self.steps)
+        return self._crossings(field, rays, reached, coarse)
+
+    def _coarse(self, field: Field) -> Coarse | None:
+        return coarse_of(field) if self.coarse else None
+
+    def _crossings(self, field: Field, rays: Rays, reached: Reached, coarse: Coarse | None) -> "Solved":
+        """The crossings of flat rays that were marched on the field, or on its coarse values."""
         if coarse is None:
-            return reached, self.crossings(field, rays.flat(), reached)
-        return reached, self._decided(field, rays.flat(), reached, coarse.error)
+            return self.crossings(field, rays, reached)
+        return self._decided(field, rays, reached, coarse.error)
 
     def _decided(self, field: Field, rays: Rays, reached: Reached, error: float) -> "Solved":
         """The crossings of flat rays that were marched on coarse values, which are off by at most `error`.

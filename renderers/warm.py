@@ -21,7 +21,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.packed_march import CLEAR, Reached, march
+from renderers.packed_march import CLEAR, Reached
 from renderers.rendering import Rendering
 from renderers.tracer import Solved, Tracer
 
@@ -190,8 +190,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
             return None
         anchored = up_to_anchor & ~audited
         moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
-        march(field, rays[index], moving, tracer.stepping, tracer.steps)
-    found = tracer.crossings(field, rays[index], moving).among(index)
+    found = tracer.resume(field, rays[index], moving).among(index)
     with torch.no_grad():
         differing = _differing(tracer, solved, found, certain & audited)
         if memory.audit(int((certain & audited).sum()), differing):

@@ -16,7 +16,7 @@ from renderers.fields import bfloat16
 from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.packed_march import Stop
-from renderers.rendering import Status
+from renderers.rendering import Status, at_iteration, fresh
 from tests.renderers.test_newton import camera, exact
 
 NEWTON = load("renderer", "newton")
@@ -78,6 +78,20 @@ def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status):
     with torch.no_grad():
         found = NEWTON.render(Offering(sphere(0.6), ERRORS["too small"]), away)
     assert (found.status == status).all()
+
+
+@pytest.mark.parametrize("off", [ERRORS["too large"], ERRORS["rippled"]], ids=["too large", "rippled"])
+def test_an_optimisation_begins_warm_on_coarse_values_too(off):
+    """A ball grows, and another one enters from the side."""
+    rays, warm = camera().rays(), fresh(NEWTON)
+    for iteration in range(16):
+        shape = sphere(0.4 + 0.002 * iteration) | sphere(0.2, (1.3 - 0.03 * iteration, 0.0, 0.0))
+        meter = Meter(Offering(shape, off))
+        found = rendered(at_iteration(warm, iteration), meter, rays)
+        cold = load("renderer", "newton", warm=False).render(shape, rays)
+        apart = (found.distance - cold.distance).abs() > 5e-4
+        assert int(((found.hit != cold.hit) | (cold.hit & apart)).sum()) <= 2
+        assert meter.counts.coarse > 0
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
