@@ -43,8 +43,8 @@ def test_there_is_a_line_for_each_size_number_of_threads_and_renderer(tmp_path):
     assert set(data["renderer"][1::2]) == {"newton"}
     line = made.table.iloc[1]
     assert line["Values"] == "1.00k + 3.00k coarse"
-    assert line["Forward, ratio"] == "0.75 (0.50–1.00)"
-    assert made.table.iloc[0]["Forward, ratio"] == "1"
+    assert line["Forward ratio"] == "0.75 (0.50–1.00)"
+    assert made.table.iloc[0]["Forward ratio"] == "1"
     assert line["Missed / spurious / wrong depth"] == "1 / 2 / 3"
     assert "medians of 5 rounds" in told(made)
     assert "over the first renderer's" in told(made)
@@ -54,5 +54,5 @@ def test_a_run_that_failed_has_a_line_without_numbers(tmp_path):
     write(tmp_path, 128, 1, metrics={}, status="timeout", reason="dvr: more than 9 field values")
     made = page(tmp_path)
     assert len(made.table) == 1
-    assert made.table.iloc[0]["Forward, ratio"] == "–"
+    assert made.table.iloc[0]["Forward ratio"] == "–"
     assert "timeout" in told(made)

@@ -1,5 +1,6 @@
 """Renderers that were timed in turn in one process: their costs over those of the first one, and their errors."""
 
+from dataclasses import replace
 from typing import Any
 
 from bench.records import format
@@ -13,7 +14,13 @@ BASE = "base"  # the run's own renderer among the numbers of a record, as in ben
 READS = (
     Selection("benchmark", ("benchmark",), ("task",), ("size", "threads"), setup=("scenes", "network", "machine")),
 )
-COSTS = ("forward", "forward_cpu", "step", "step_cpu")
+HEADINGS = {
+    "forward": "Forward ratio",
+    "forward_cpu": "Forward ratio, CPU",
+    "step": "Step ratio",
+    "step_cpu": "Step ratio, CPU",
+}
+COSTS = tuple(HEADINGS)
 DEFINED = {
     "forward_ratio": "Forward, step, CPU",
     "coarse_queries": "Values",
@@ -27,11 +34,12 @@ DEFINED = {
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per image size, number of threads and renderer."""
-    lines = [line for record in sorted(experiment.named(), key=_place) for line in _lines(record)]
+    experiment = replace(experiment, records=[_of_any_threads(record) for record in experiment.records])
+    lines = [line for record in sorted(experiment.records, key=_place) for line in _lines(record)]
     rounds = sorted({line["rounds"] for line in lines if line["rounds"]})
     return Result(
         experiment,
-        "Speed over that of DIST, in one process.",
+        "Renderers timed in turn, in one process.",
         "Seconds of one rendering and of one step of an optimisation, and their ratios to those of the first renderer "
         f"of the same round: medians of {' or '.join(map(str, rounds))} rounds, in brackets the least and the largest.",
         remarks=definitions(experiment.records, DEFINED),
@@ -40,13 +48,18 @@ def make(experiment: Experiment) -> Result:
     )
 
 
+def _of_any_threads(record: Record) -> Record:
+    """The record without the run's threads, since the task sets its own: a column has them, and no caption."""
+    return record | {"environment": record["environment"] | {"threads": None}}
+
+
 def _place(record: Record) -> tuple[int, int]:
     """The size of the image and the number of threads."""
     return setting(record["config"], "task", "size"), setting(record["config"], "task", "threads")
 
 
 def _lines(record: Record) -> list[dict[str, Any]]:
-    """A line per renderer of a run; the first has the run's name."""
+    """A line per renderer of a run."""
     names = dict.fromkeys(name.split(".")[0] for name in record["metrics"] if "." in name)
     return [_line(record, name) for name in names] or [_line(record, BASE)]
 
@@ -57,7 +70,7 @@ def _line(record: Record, name: str) -> dict[str, Any]:
     return {
         "size": size,
         "threads": threads,
-        "renderer": record["name"] if name == BASE else name,
+        "renderer": record["renderer"] if name == BASE else name,
         "first": name == BASE,
         "rounds": record["metrics"].get("rounds"),
         **{key: record[key] for key in ("status", "reason", "folder")},
@@ -74,8 +87,7 @@ def _ratio(cost: str) -> Column:
             return format.MISSING
         return "1" if line["first"] else f"{middle:.2f} ({low:.2f}–{high:.2f})"
 
-    heading = {"forward": "Forward, ratio", "forward_cpu": "its CPU", "step": "Step, ratio", "step_cpu": "its CPU "}
-    return Column(f"{cost}_ratio", heading[cost], words=words)
+    return Column(f"{cost}_ratio", HEADINGS[cost], words=words)
 
 
 def _together(show: Any, *keys: str) -> Any:
