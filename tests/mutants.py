@@ -27,6 +27,8 @@ class Mutant:
 
 
 M = Mutant
+COARSE = "tests/renderers/test_coarse.py"
+TRACED = "tests/renderers/test_newton.py tests/renderers/test_coarse.py tests/renderers/test_warm.py"
 MUTANTS = (
     # Renderers: the march, the brackets, the gradients.
     M("renderers/march.py", "value.abs() < stepping.epsilon", "value.abs() < 2 * stepping.epsilon", "tests/renderers"),
@@ -57,24 +59,24 @@ MUTANTS = (
     M("renderers/tracer.py", "torch.where(known.free_value.isfinite(), known.free, known.entry)",
       "known.distance", "tests/renderers/test_newton.py"),
     M("renderers/tracer.py", "solved.index, solved.settled", "solved.index, solved.value.isfinite()",
-      "tests/renderers"),
-    M("renderers/tracer.py", "at + step - found.change / slope", "at - found.change / slope", "tests/renderers"),
-    M("renderers/tracer.py", "(reached.grazed > error)", "(reached.grazed > 0)", "tests/renderers"),
+      TRACED),
+    M("renderers/tracer.py", "at + step - found.change / slope", "at - found.change / slope", TRACED),
+    M("renderers/tracer.py", "(reached.grazed > error)", "(reached.grazed > 0)", TRACED),
     M("renderers/tracer.py", "reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & ", "",
-      "tests/renderers"),
+      TRACED),
     M("renderers/tracer.py", "self._close(field, rays, reached, furthest=CLEAR)", "self._close(field, rays, reached)",
-      "tests/renderers"),
-    M("renderers/tracer.py", "~anew[index]", "anew[index] | True", "tests/renderers"),
-    M("renderers/tracer.py", "first.some(certain[first.index])", "first.some(first.settled)", "tests/renderers"),
+      TRACED),
+    M("renderers/tracer.py", "~anew[index]", "anew[index] | True", TRACED),
+    M("renderers/tracer.py", "first.some(certain[first.index])", "first.some(first.settled)", TRACED),
     M("renderers/packed_march.py", "rises | left, torch.minimum(least, before)", "rises, torch.minimum(least, before)",
-      "tests/renderers"),
-    M("renderers/packed_march.py", "(ended | (known.least > hidden))", "True", "tests/renderers"),
-    M("renderers/tracer.py", "reached.table[:, Reached.PASSED] -= error", "pass", "tests/renderers"),
-    M("renderers/fields/bfloat16.py", "MARGIN * _largest_error", "0.5 * _largest_error", "tests/renderers"),
-    M("renderers/fields/bfloat16.py", "if at == skip else", "if at == skip + 1 else", "tests/renderers"),
-    M("renderers/field.py", "self.counts.coarse += points", "self.counts.value += points", "tests/renderers"),
-    M("renderers/field.py", "(self.value + self.coarse)", "self.value", "tests/renderers"),
-    M("bench/machine/limits.py", "offered.noted(self._spend)", "offered", "tests/renderers"),
+      TRACED),
+    M("renderers/packed_march.py", "(ended | (known.least > hidden))", "True", TRACED),
+    M("renderers/tracer.py", "reached.table[:, Reached.PASSED] -= error", "pass", TRACED),
+    M("renderers/fields/bfloat16.py", "MARGIN * _largest_error", "0.5 * _largest_error", COARSE),
+    M("renderers/fields/bfloat16.py", "if at == skip else", "if at == skip + 1 else", COARSE),
+    M("renderers/field.py", "self.counts.coarse += points", "self.counts.value += points", COARSE),
+    M("renderers/field.py", "(self.value + self.coarse)", "self.value", COARSE),
+    M("bench/machine/limits.py", "offered.noted(self._spend)", "offered", COARSE),
     M("renderers/warm.py", "margin = 2 * (moved - self.marched)", "margin = 0 * (moved - self.marched)",
       "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "return bool((~free).sum() <= MOST * len(free))", "return True",

@@ -1,5 +1,6 @@
 """Pieces that the figures share: a sheet with axes, a grid of panels, the line of a row."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +16,9 @@ from bench.report.data.statistics import Interval
 # Places of a name relative to its point: offsets in points, and the alignment.
 SIDES = ((0, 9, "center"), (0, -9, "center"), (6, 0, "left"), (-6, 0, "right"), (3, 9, "left"), (-3, 9, "right"))
 SIDES += ((3, -9, "left"), (-3, -9, "right"), (0, 18, "center"), (0, -18, "center"), (0, 27, "center"))
+SIDES += tuple((side * dx, dy, ("right", "left")[side > 0]) for dx, dy in ((12, 18), (12, -18)) for side in (1, -1))
+SIDES += tuple((side * 20, dy, ("right", "left")[side > 0]) for dy in (27, -27, 36, -36, 45) for side in (1, -1))
+FAR = 16  # points from which on a line leads from a name to its point
 LETTER, LINE = 0.6, 1.14  # approximate width of a letter, and height of a line, in sizes of the type
 
 
@@ -105,12 +109,18 @@ def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: floa
             continue
         boxes = [_box(at, side, len(name), size) for side in SIDES]
         others = [box for box in taken if box is not this]
-        free = [inside.x0 <= box.x0 and box.x1 <= inside.x1 and not any(map(box.overlaps, others)) for box in boxes]
+        free = [_within(box, inside) and not any(map(box.overlaps, others)) for box in boxes]
         place = free.index(True) if True in free else 0
         dx, dy, side = SIDES[place]
         how = {"ha": side, "va": "center", "fontsize": size, "textcoords": "offset points"}
+        if math.hypot(dx, dy) > FAR:
+            how["arrowprops"] = {"arrowstyle": "-", "color": "#999999", "lw": 0.5, "shrinkA": 0, "shrinkB": 3}
         axes.annotate(name, where, (dx, dy), path_effects=[withStroke(linewidth=2, foreground="white")], **how)
         taken.append(boxes[place])
+
+
+def _within(box: Bbox, outer: Bbox) -> bool:
+    return bool(outer.x0 <= box.x0 and box.x1 <= outer.x1 and outer.y0 <= box.y0 and box.y1 <= outer.y1)
 
 
 def _box(at: np.ndarray, side: tuple[int, int, str], letters: int, size: float) -> Bbox:
