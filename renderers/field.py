@@ -56,7 +56,7 @@ class Coarse:
 
     Args:
         values: without a gradient.
-        error: most that one of them is off where it is small, in field units, stated or measured.
+        error: most that one of them is off, in field units, stated or measured; near the surface, where it matters.
     """
 
     values: Values

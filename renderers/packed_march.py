@@ -97,7 +97,10 @@ class Reached:
 
     @property
     def passed(self) -> Float[Tensor, " n"]:
-        """What the field is at least at the samples of each ray and of its coarse rays; infinite before the first."""
+        """The least value from which each ray rose again, or its coarse ray, less how far apart these are.
+
+        That is what the field is at least on the way to where the ray stopped, but for the descent there.
+        """
         return self.table[:, self.PASSED]
 
     @property
@@ -112,7 +115,7 @@ class Reached:
 
     @property
     def grazed(self) -> Float[Tensor, " n"]:
-        """The least of each ray's own values behind which they rose, or it left the sphere; infinite without any."""
+        """The same of each ray's own values alone; infinite before the first."""
         return self.table[:, self.GRAZED]
 
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
@@ -136,8 +139,8 @@ class Reached:
         start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
         return start
 
-    def replace(self, index: Int[Tensor, " m"], others: "Reached") -> None:
-        """Has m of the rays as `others` are now; they still leave the sphere where they did."""
+    def put_back(self, index: Int[Tensor, " m"], others: "Reached") -> None:
+        """Has m of the rays as `others` are now; both leave the sphere where these rays did."""
         others.table[:, self.LEAVE] = self.leave[index]
         self.table[index] = others.table
 
@@ -185,7 +188,7 @@ class Reached:
         return goes_on & finite
 
     def split(
-        self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, hidden: float = -inf
+        self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, error: float = -inf
     ) -> "Reached":
         """The same of finer rays, each of which continues from its coarse `parent`.
 
@@ -193,8 +196,8 @@ class Reached:
         closest sample. One whose coarse ray met nothing keeps its closest sample, if that is free.
 
         Args:
-            hidden: largest value at which the coarse ray may have met a surface: rays below one that passed such a
-                value begin anew.
+            error: most that the values of the coarse ray are off; -inf for the field itself. Rays below one that came
+                that close to a surface, and did not stop, begin anew.
         """
         child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
@@ -204,7 +207,7 @@ class Reached:
             coarse.origins[parent] + at * coarse.directions[parent] - rays.origins - at * rays.directions, dim=-1
         )
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
-        inherits &= (known.grazed > hidden) & (ended | (known.least > hidden))
+        inherits &= (known.grazed > error) & (ended | (known.least > error))
         close = ended | (known.least.abs() <= CAREFUL * apart)
         start = torch.where(close, known.least_distance - SET_BACK * apart, known.distance)
         gone = inherits & ~ended & (start >= child.leave)
@@ -222,7 +225,7 @@ class Reached:
 
 
 def approach(
-    field: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, hidden: float = -inf
+    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, error: float = -inf
 ) -> Reached:
     """Marches all rays; those of an image coarse to fine, as in `march.march_coarse_to_fine`.
 
@@ -231,26 +234,26 @@ def approach(
         stepping: its epsilon, alpha, extra_step_cap and step_clamp.
         steps: most steps per ray, those of its coarse rays included.
         radius: of the sphere about the origin that holds the shape.
-        hidden: see `Reached.split`.
+        error: see `Reached.split`.
     """
     levels = pyramid(rays) if rays.image else []
     reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
-        march(field, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
+        march(values, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
-        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius, hidden=hidden)
-    march(field, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
+        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius, error=error)
+    march(values, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
 
 
-def march(field: Values, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
+def march(values: Values, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
     origins, directions, moving = rays.origins[index], rays.directions[index], reached.some(index)
     for _ in range(steps):
         if index.numel() == 0:
             return
-        goes_on = moving.advance(field(origins + moving.distance[:, None] * directions), stepping)
+        goes_on = moving.advance(values(origins + moving.distance[:, None] * directions), stepping)
         stopped, going = (~goes_on).nonzero().squeeze(-1), goes_on.nonzero().squeeze(-1)
         reached.table[index[stopped]] = moving.table[stopped]
         index, origins, directions, moving = index[going], origins[going], directions[going], moving.some(going)

@@ -17,7 +17,7 @@ from renderers.packed_march import CLEAR, Reached, Stop, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
 LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
-PATIENT = 2  # times as many steps on coarse values: they cost less than the search
+PATIENT = 2  # times `steps`, where the field offers coarse values: first on these, then on the field for rays in doubt
 SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
 
 
@@ -27,6 +27,7 @@ class Tracer:
 
     Args:
         steps: most marching steps per ray, those of its coarse rays included; rays that are left are searched densely.
+            See `PATIENT`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
             the rest.
         alpha, extra_step_cap: see `march.Stepping`.
@@ -70,9 +71,9 @@ class Tracer:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
             coarse = self._coarse(field)
-            values, hidden = (coarse.values, coarse.error) if coarse else (field, -inf)
+            values, error = (coarse.values, coarse.error) if coarse else (field, -inf)
             steps = PATIENT * self.steps if coarse else self.steps
-            reached = approach(values, rays, self.stepping, steps=steps, radius=self.sphere_radius, hidden=hidden)
+            reached = approach(values, rays, self.stepping, steps=steps, radius=self.sphere_radius, error=error)
         return reached, self._crossings(field, rays.flat(), reached, coarse)
 
     def resume(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
@@ -94,19 +95,18 @@ class Tracer:
     def _decided(self, field: Field, rays: Rays, reached: Reached, error: float) -> "Solved":
         """The crossings of flat rays that were marched on coarse values, which are off by at most `error`.
 
-        A ray is certain where it left the sphere, or where a Newton step finds the surface; if it came close to no
-        other one on its way. Others are marched again, on the field itself, from where they came near.
+        A ray is certain if it left the sphere, or a Newton step on the field settled; and if it rose from no value
+        within `error` before. The others are marched again from their anchors, on the field itself.
         """
         first = self._close(field, rays, reached, furthest=CLEAR)
         with torch.no_grad():
-            reached.table[:, Reached.PASSED] -= error
             certain = reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & (reached.grazed > error)
-            anew = reached.stopped(Stop.INSIDE) | reached.stopped(Stop.NOT_FINITE)
             index = (~certain).nonzero().squeeze(-1)
-            again = reached.some(index).begun_again(rays[index], ~anew[index], radius=self.sphere_radius)
+            again = reached.some(index).begun_again(rays[index], ~certain[index], radius=self.sphere_radius)
             march(field, rays[index], again, self.stepping, PATIENT * self.steps)
         second = self.crossings(field, rays[index], again).among(index)
-        reached.replace(index, again)
+        reached.put_back(index, again)
+        reached.table[:, Reached.PASSED] -= error
         return first.some(certain[first.index]).joined(second)
 
     def _close(self, field: Field, rays: Rays, reached: Reached, *, furthest: float = 0.0) -> "Solved":
@@ -262,7 +262,7 @@ class Solved:
         return Solved(*(column[which] for column in self.columns))
 
     def among(self, index: Int[Tensor, " n"]) -> "Solved":
-        """The same of rays that are those at `index` of more rays."""
+        """The same, numbered among n rays, of which these were those at `index`."""
         return replace(self, index=index[self.index])
 
     def joined(self, other: "Solved") -> "Solved":

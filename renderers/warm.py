@@ -195,7 +195,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         differing = _differing(tracer, solved, found, certain & audited)
         if memory.audit(int((certain & audited).sum()), differing):
             return None
-        reached.replace(index, moving)
+        reached.put_back(index, moving)
         image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
     return solved.some((certain & ~audited)[solved.index]).joined(found)
 

@@ -9,10 +9,13 @@ from bench.machine.environment import using_threads
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
+from bench.tasks import ablation
 from bench.tasks.ablation import Clocked, Workbench
 from renderers.checks import check_at_least, check_positive
 
 BASE = "base"  # the run's renderer among the numbers of the record
+SHARED = ("queries", "coarse_queries, step_coarse_queries", "peak_memory_bytes", "lost, false", "rays, hits", "wrong")
+SHARED += ("error_p95", "depth_error")  # what is measured as in the other task
 DEFINITIONS = {
     "rounds": "how often each renderer was timed, in turn, each round in the opposite order of the last one",
     "forward_seconds, step_seconds": "a rendering without gradient; a step of an optimisation: rendering, losses, "
@@ -20,14 +23,8 @@ DEFINITIONS = {
     "forward_cpu, step_cpu": "the same in seconds of all threads together",
     "forward_ratio, step_ratio, forward_cpu_ratio, step_cpu_ratio": "over the first renderer's of the same round: "
     "median; _low and _high: least and largest",
-    "queries, coarse_queries": "points whose field value was computed in a rendering; beside these, more cheaply, in "
-    "bfloat16, where it decides nothing",
     "work_over_bound": "the operations of a step, divided by those of one value and one gradient per hit",
-    "peak_memory_bytes": "largest growth of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
-    "hits": "pixels that the float64 reference hits",
-    "lost, false": "missed pixels, which only the reference hits; spurious ones, which only the renderer hits",
-    "wrong": "pixels that both hit, at depths that differ by more than task.wrong",
-    "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
+    **{key: ablation.DEFINITIONS[key] for key in SHARED},
 }
 
 

@@ -66,7 +66,7 @@ class _Network:
 
     @staticmethod
     def of(hidden: tuple[Layer, ...], last: Layer, skip: int) -> "_Network":
-        layers = [_again(*layer) if at == skip else _plain(*layer) for at, layer in enumerate(hidden)][1:]
+        layers = [_again(*layer) if at == skip else _plain(*layer) for at, layer in enumerate(hidden[1:], start=1)]
         return _Network(hidden[0], tuple(layers), last)
 
     def __call__(self, points: Tensor) -> Tensor:

@@ -31,6 +31,8 @@ def test_every_renderer_has_its_costs_and_errors_under_its_name(done):
     names = {key.split(".")[0] for key in metrics if "." in key}
     assert names == {BASE, "newton", "dvr"}
     assert metrics["rounds"] == 2
+    defined = [part.strip() for key in done.record.definitions for part in key.split(",")]
+    assert [key for key in metrics if not any(key.split(".")[-1].startswith(part) for part in defined)] == []
     for name in names:
         assert metrics[f"{name}.rays"] == 16**2
         assert metrics[f"{name}.hits"] > 20

@@ -14,11 +14,11 @@ from bench.pictures import style
 from bench.report.data.statistics import Interval
 
 # Places of a name relative to its point: offsets in points, and the alignment.
-SIDES = ((0, 9, "center"), (0, -9, "center"), (6, 0, "left"), (-6, 0, "right"), (3, 9, "left"), (-3, 9, "right"))
-SIDES += ((3, -9, "left"), (-3, -9, "right"), (0, 18, "center"), (0, -18, "center"), (0, 27, "center"))
-SIDES += tuple((side * dx, dy, ("right", "left")[side > 0]) for dx, dy in ((12, 18), (12, -18)) for side in (1, -1))
-SIDES += tuple((side * 20, dy, ("right", "left")[side > 0]) for dy in (27, -27, 36, -36, 45) for side in (1, -1))
-FAR = 16  # points from which on a line leads from a name to its point
+# Where a name may stand, from its point, in points of type: the first that is free.
+OFFSETS = ((0, 9), (0, -9), (6, 0), (-6, 0), (3, 9), (-3, 9), (3, -9), (-3, -9), (0, 18), (0, -18), (0, 27))
+OFFSETS += ((12, 18), (-12, 18), (12, -18), (-12, -18), (20, 27), (-20, 27), (20, -27), (-20, -27))
+OFFSETS += ((20, 36), (-20, 36), (20, -36), (-20, -36), (20, 45), (-20, 45))
+FAR = 16  # from a name that is further off, in points of type, a line leads to its point
 LETTER, LINE = 0.6, 1.14  # approximate width of a letter, and height of a line, in sizes of the type
 
 
@@ -93,6 +93,8 @@ def reference(draw: Callable[..., Any], value: float, times: float, label: str) 
 def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: float = 7) -> None:
     """Writes a name next to each point, on the first side where it covers no point, name or edge of the axes.
 
+    Above it, where there is no such side.
+
     Args:
         axes: axes with their final limits.
         named: name and position of each point; an empty name is not written.
@@ -107,12 +109,12 @@ def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: floa
     for (name, *where), at, this in zip(named, points, list(taken), strict=True):
         if not name:
             continue
-        boxes = [_box(at, side, len(name), size) for side in SIDES]
+        boxes = [_box(at, offset, len(name), size) for offset in OFFSETS]
         others = [box for box in taken if box is not this]
         free = [_within(box, inside) and not any(map(box.overlaps, others)) for box in boxes]
         place = free.index(True) if True in free else 0
-        dx, dy, side = SIDES[place]
-        how = {"ha": side, "va": "center", "fontsize": size, "textcoords": "offset points"}
+        dx, dy = OFFSETS[place]
+        how = {"ha": _align(dx), "va": "center", "fontsize": size, "textcoords": "offset points"}
         if math.hypot(dx, dy) > FAR:
             how["arrowprops"] = {"arrowstyle": "-", "color": "#999999", "lw": 0.5, "shrinkA": 0, "shrinkB": 3}
         axes.annotate(name, where, (dx, dy), path_effects=[withStroke(linewidth=2, foreground="white")], **how)
@@ -123,9 +125,13 @@ def _within(box: Bbox, outer: Bbox) -> bool:
     return bool(outer.x0 <= box.x0 and box.x1 <= outer.x1 and outer.y0 <= box.y0 and box.y1 <= outer.y1)
 
 
-def _box(at: np.ndarray, side: tuple[int, int, str], letters: int, size: float) -> Bbox:
+def _align(dx: float) -> str:
+    return "center" if dx == 0 else "left" if dx > 0 else "right"
+
+
+def _box(at: np.ndarray, offset: tuple[int, int], letters: int, size: float) -> Bbox:
     """The approximate box of a name of so many letters of a size, in points."""
-    dx, dy, align = side
+    dx, dy = offset
     width, height = LETTER * size * letters, LINE * size
-    left = at[0] + dx - {"left": 0.0, "center": width / 2, "right": width}[align]
+    left = at[0] + dx - {"left": 0.0, "center": width / 2, "right": width}[_align(dx)]
     return Bbox.from_bounds(left, at[1] + dy - height / 2, width, height)
