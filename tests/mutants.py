@@ -158,7 +158,7 @@ MUTANTS = (
     M("bench/models/held_out.py", "rendering.hit ^ self.mask", "rendering.hit & ~self.mask", "tests/models"),
     M("bench/models/held_out.py", "self.distance)[compared].abs() * cosine)", "self.distance)[compared].abs())",
       "tests/models"),
-    M("bench/models/growth.py", "> new.evidence.error.noise_of_difference(old.evidence.error)", "> 0", "tests/models"),
+    M("bench/models/growth.py", "> new.error.noise_of_difference(old.error)", "> 0", "tests/models"),
     M("bench/models/growth.py", "others + cost(larger, trial, fitter) > kept or ", "", "tests/models"),
     M("bench/models/observations.py", "given.observed | ~given.mask", "given.observed", "tests/models"),
     M("bench/models/observations.py", "(out & view.observed if view.mask is None else out)", "out", "tests/models"),

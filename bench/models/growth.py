@@ -97,7 +97,7 @@ def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) 
         fitted = fitter.begin(larger, now.model, evaluate=False)
         fitter.fit(fitted, trial, checkpoints=False)
         tried.append(fitted.evidence)
-        better = _is_better(fitted, now)
+        better = _is_better(fitted.evidence, now.evidence)
         others += cost(now.candidate if better else larger, trial, fitter)
         without_gain = 0 if better else without_gain + 1
         if better:
@@ -126,7 +126,7 @@ def _load() -> None:
     torch.optim.Adam([torch.zeros(1)])
 
 
-def _is_better(new: Fitted, old: Fitted) -> bool:
-    if new.evidence.error is None or old.evidence.error is None:
-        return old.evidence.error is None and new.evidence.error is not None
-    return old.evidence.mean - new.evidence.mean > new.evidence.error.noise_of_difference(old.evidence.error)
+def _is_better(new: Evidence, old: Evidence) -> bool:
+    if new.error is None or old.error is None:
+        return old.error is None and new.error is not None
+    return old.mean - new.mean > new.error.noise_of_difference(old.error)

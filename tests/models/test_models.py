@@ -13,11 +13,11 @@ from bench.config import load
 from bench.models import candidates as formulas
 from bench.models.candidates import PAPERS, REACH, candidate
 from bench.models.choice import Evidence, choose
-from bench.models.fit import Fitter
-from bench.models.growth import cost, grow
+from bench.models.fit import SCREENING, Fitter, _slope_error
+from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOut, HeldOutError
 from bench.models.model import Model, Seen, Size
-from bench.models.observations import Holdout, hold_out, together
+from bench.models.observations import FREE, Holdout, hold_out, together
 from bench.models.views import Views
 from bench.records.record import RunStatus
 from bench.setup.auto import AutoSettings, epsilon, rays_share
@@ -188,6 +188,8 @@ def test_the_error_is_the_surface_offset_along_its_normal():
     assert off / hits == pytest.approx(0.3 * footprint, rel=0.1)
     radius = 0.6 / (2 * footprint) * 1.5 / 2.5  # of the outline, in pixels: it moves by 0.15 of one, about
     assert alone / either == pytest.approx(2 * 0.15 / radius, rel=0.5)
+    smaller = observations.error(sphere(0.6 - 0.3 * footprint, (0.1, 0.0, -0.1))).sums.sum(0)
+    assert smaller[2] / smaller[3] == pytest.approx(alone / either, rel=0.5)
     exact = observations.error(sphere(0.6, (0.1, 0.0, -0.1)))
     assert exact.mean < 0.2 * footprint
     nothing = observations.error(sphere(0.01, (0.0, 0.0, 0.9)))
@@ -220,6 +222,7 @@ def test_held_out_rays_are_not_given():
     assert found.given.observed.sum() == pytest.approx(0.75 * observed.sum(), abs=1)
     assert box((0.5, 0.3, 0.4))(found.points).abs().max() < 0.01
     assert (box((0.5, 0.3, 0.4))(found.free) > -0.01).all()
+    assert len(found.free) > 1.5 * FREE * found.given.observed.sum()  # on background rays too
     first, again, other = (found.terms(sphere(0.4), iteration, 1.0) for iteration in (0, 0, 1))
     assert first == again != other
 
@@ -311,6 +314,36 @@ def test_growth_ends_with_patience_and_budget():
     two_more = 2.5 * cost(candidate("box"), 3, fitter) / cost(candidate("box"), 10, fitter)
     tight = grow(fitter, candidates, replace(asked, budget=1 + two_more))
     assert len(tight.tried) == 3
+
+
+def test_the_slope_error_is_that_of_the_length_of_the_gradient():
+    ball = sphere(0.5)
+    assert _slope_error(ball, points()).item() == pytest.approx(0, abs=1e-9)
+    assert _slope_error(Shape(lambda p: 3 * ball(p)), points()).item() == pytest.approx(4)
+
+
+def test_each_of_several_starts_is_tried_before_the_best_one_goes_on(monkeypatch):
+    spent = []
+    monkeypatch.setattr(Fitter, "_warm_start", lambda self, fitted, start, iterations: spent.append(iterations))
+    fitter_of("box", warm_iterations=80).begin(candidate("union_3"), None, evaluate=False)
+    assert len(spent) > 3
+    assert spent == [80 // SCREENING] * (len(spent) - 1) + [80]
+
+
+def test_a_candidate_that_would_cost_more_than_the_budget_is_not_tried():
+    fitter = fitter_of("box", warm_iterations=20, iterations=10)
+    small, large = candidate("sphere"), candidate("network_8x256")
+    assert cost(large, 3, fitter) > cost(small, 10, fitter) and cost(small, 3, fitter) < 0.5 * cost(large, 10, fitter)
+    found = grow(fitter, [small, large], replace(GROWTH, budget=1.5))
+    assert [evidence.candidate for evidence in found.tried] == ["sphere"]
+    assert "larger ones would exceed models.growth.budget" in found.summary("auto")[0]
+
+
+@pytest.mark.parametrize(("spread", "better"), [(0.002, True), (-0.002, False)])
+def test_a_candidate_is_better_beyond_the_noise_of_the_difference(spread, better):
+    """Both differ by as much; in one case all groups agree on it, in the other they contradict each other."""
+    old, new = (evidence_of("box", 9, one) for one in (an_error(0.01, 0.002), an_error(0.0095, spread)))
+    assert _is_better(new, old) is better
 
 
 def test_a_candidate_that_the_renderer_does_not_support_has_no_error():
