@@ -50,8 +50,6 @@ MUTANTS = (
     M("renderers/gradients.py", "total = table.sum(dim=1)", "total = table.mean(dim=1)", "tests/renderers"),
     M("renderers/packed_march.py", "back = behind & ~own & ~begins", "back = behind & ~behind",
       "tests/renderers/test_newton.py"),
-    M("renderers/packed_march.py", "torch.maximum(at + stepping.length(value), self.entry)",
-      "at + stepping.length(value)", "tests/renderers/test_newton.py"),
     M("renderers/packed_march.py", "(at + value > self.leave)", "(at + stepping.length(value) > self.leave)",
       "tests/renderers/test_newton.py"),
     M("renderers/packed_march.py", "begins & (value < 0) & ~own", "begins & behind & ~own",

@@ -276,3 +276,21 @@ def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
     shares = torch.linspace(0, 1, 200)
     behind = field(rays.flat()[left].at_each(cleared[:, None] + shares * (reached.leave[left] - cleared)[:, None]))
     assert behind.min() > CLEAR - NEWTON.extra_step_cap
+
+
+def test_rays_that_begin_inside_do_so_beside_rays_that_do_not():
+    """Parallel rays that begin on a plane, which the surface cuts: nothing behind their beginnings is met."""
+    x, y = torch.meshgrid(0.01 * torch.arange(-32, 32) + 0.005, 0.01 * torch.arange(-32, 32), indexing="xy")
+    origins = torch.stack([x, y, torch.full_like(x, -0.5)], dim=-1)
+    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand_as(origins), image=True)
+    with torch.no_grad():
+        found = NEWTON.render(plane((0.3, 0.0, -1.0), 0.5 / 1.0), rays)
+    within = x < -0.004  # else the first value is below the march's threshold
+    assert (found.status == torch.where(within, Status.STARTED_INSIDE, Status.HIT)).all()
+    assert torch.allclose(found.distance[~within], 0.3 * x[~within], atol=1e-4)
+
+
+def test_a_surface_just_before_the_end_of_the_sphere_is_met():
+    rendering = NEWTON.render(plane((0.0, 0.0, -1.0), -0.995), beam((0.0, 0.0, -2.0)))
+    assert rendering.hit.all()
+    assert rendering.distance.item() == pytest.approx(2.995, abs=1e-6)
