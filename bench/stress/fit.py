@@ -4,7 +4,6 @@ Its four parameters are the centre and the logarithm of the radius. The observat
 optimiser is made worse.
 """
 
-import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,7 +37,7 @@ def judge_fit(trial: "FitTrial", renderer: Renderer, conditions: Conditions) -> 
 
     Raises:
         Unsupported: where the renderer has no gradient towards the field.
-        LimitReached: where the fit exceeds its time or memory.
+        LimitReached: where the fit exceeds its values or memory.
     """
     check_field_gradient(renderer)
     fit, draw = trial.settings(), trial.draw
@@ -87,7 +86,9 @@ class SphereProblem:
     given: GivenView
     limits: Limits
     counts: Counts = field(default_factory=Counts)
-    started: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        self.watched = self.limits.watch(self.field(), self.free.device)  # the limit is on the whole fit
 
     @property
     def parameters(self) -> list[Tensor]:
@@ -101,9 +102,8 @@ class SphereProblem:
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The terms and their sum."""
-        shape = self.limits.watch(_sphere(self.free).field, self.free.device)
-        shape.started = self.started  # the limit is on the whole fit
-        terms = self.given.compare(Meter(shape, self.counts), iteration)
+        self.watched.inner = _sphere(self.free).field
+        terms = self.given.compare(Meter(self.watched, self.counts), iteration)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
     def field(self) -> Field:

@@ -8,10 +8,12 @@ import torch
 from omegaconf import OmegaConf
 
 from bench.config import CONF, build, load
-from bench.machine.limits import Limits
+from bench.machine.limits import LimitReached, Limits
+from bench.records.record import RunStatus
+from bench.solve.optimise import History
 from bench.solve.problem import Unsupported
 from bench.stress.axes import Stress, Sweep
-from bench.stress.fit import FITS, FitTrial, judge_fit
+from bench.stress.fit import FITS, FitTrial, _failure, judge_fit
 from bench.stress.gradient import judge_gradient
 from bench.stress.rendering import judge_rendering, truth
 from bench.stress.theory import FLATTEST
@@ -256,6 +258,21 @@ def test_a_disturbed_fit_ends_further_off(scene):
 def test_a_trial_that_takes_too_many_values_is_a_failure_of_that_kind():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
+
+
+def test_the_values_of_a_fit_are_limited_over_all_its_iterations():
+    renderer, trial = load("renderer", "dist"), FitTrial("a_ball", FIT, 0.0, drawn())
+    spent = judge_fit(trial, renderer, conditions()).numbers["evaluations_per_ray"] * FIT.resolution**2
+    one_in_five = Limits(int(spent * FIT.iterations / 5), 8)
+    with pytest.raises(LimitReached, match="field values"):
+        judge_fit(replace(trial, draw=drawn()), renderer, replace(conditions(), limits=one_in_five))
+
+
+def test_a_fit_fails_where_its_error_is_above_the_largest():
+    assert _failure(History(), 0.05, 0.05) is Failure.NONE
+    assert _failure(History(), 0.051, 0.05) is Failure.NOT_REACHED
+    assert _failure(History(), float("nan"), 0.05) is Failure.NAN
+    assert _failure(History(status=RunStatus.DIVERGED), 0.01, 0.05) is Failure.DIVERGED
 
 
 def test_sweeps_and_stresses_are_checked():
