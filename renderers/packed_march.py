@@ -208,7 +208,7 @@ class Reached:
         )
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
         inherits &= (known.grazed > error) & (ended | (known.least > error))
-        close = ended | (known.least.abs() <= CAREFUL * apart)
+        close = ended | (known.least.abs() - max(error, 0.0) <= CAREFUL * apart)
         start = torch.where(close, known.least_distance - SET_BACK * apart, known.distance)
         gone = inherits & ~ended & (start >= child.leave)
         start = torch.where(inherits & (start < child.leave), torch.maximum(start, child.entry), child.entry)

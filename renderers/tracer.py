@@ -13,7 +13,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Coarse, Field, carries_gradient, coarse_of
 from renderers.gradients import crossing
 from renderers.march import Stepping
-from renderers.packed_march import CLEAR, Reached, Stop, approach, march
+from renderers.packed_march import Reached, Stop, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
 LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
@@ -98,7 +98,7 @@ class Tracer:
         A ray is certain if it left the sphere, or a Newton step on the field settled; and if it rose from no value
         within `error` before. The others are marched again from their anchors, on the field itself.
         """
-        first = self._close(field, rays, reached, furthest=CLEAR)
+        first = self._close(field, rays, reached)
         with torch.no_grad():
             certain = reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & (reached.grazed > error)
             index = (~certain).nonzero().squeeze(-1)
@@ -109,13 +109,13 @@ class Tracer:
         reached.table[:, Reached.PASSED] -= error
         return first.some(certain[first.index]).joined(second)
 
-    def _close(self, field: Field, rays: Rays, reached: Reached, *, furthest: float = 0.0) -> "Solved":
-        """The crossings of those flat rays that stopped close to a surface; `furthest` as in `solve`."""
+    def _close(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
+        """The crossings of those flat rays that stopped close to a surface."""
         with torch.no_grad():
             crossed = reached.stopped(Stop.CROSSED)
             close = (crossed | reached.stopped(Stop.NEAR)).nonzero().squeeze(-1)
             guess = torch.where(crossed, reached.bracket().secant(), reached.distance)[close]
-        return self.solve(field, rays, reached, close, guess, furthest=furthest)
+        return self.solve(field, rays, reached, close, guess)
 
     def crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
         """Where flat rays cross the surface, from where the march left them; in `reached`, also what a search saw."""

@@ -62,8 +62,6 @@ MUTANTS = (
     M("renderers/tracer.py", "(reached.grazed > error)", "(reached.grazed > 0)", TRACED),
     M("renderers/tracer.py", "reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & ", "",
       TRACED),
-    M("renderers/tracer.py", "self._close(field, rays, reached, furthest=CLEAR)", "self._close(field, rays, reached)",
-      TRACED),
     M("renderers/tracer.py", "first.some(certain[first.index])", "first.some(first.settled)", TRACED),
     M("renderers/packed_march.py", "rises | left, torch.minimum(least, before)", "rises, torch.minimum(least, before)",
       TRACED),

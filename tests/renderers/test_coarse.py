@@ -20,7 +20,7 @@ from renderers.rendering import Status, at_iteration, fresh
 from tests.renderers.test_newton import camera, exact
 
 NEWTON = load("renderer", "newton")
-ERROR = 5e-3  # of the coarse values below, a third of a pixel
+ERROR = 2.5e-3  # of the coarse values below, as of a network of 8 layers of 512; a sixth of a pixel
 SHAPES = {"ball": sphere(0.6), "ring": torus(0.5, 0.2), "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1)}
 ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
     "too large": lambda points: torch.full_like(points[..., 0], ERROR),
@@ -54,7 +54,7 @@ def test_a_surface_is_found_where_it_is_whatever_coarse_values_say(shape, off):
         found = NEWTON.render(Offering(shape, off), camera().rays())
     error = (found.distance - truth.distance)[truth.hit & found.hit].abs()
     assert int((truth.hit ^ found.hit).sum()) <= 2
-    assert error.median() < 2e-6
+    assert error.median() < 5e-6  # 5e-7 without coarse values: the last Newton steps are longer
     assert error.quantile(0.99) < 2e-4
 
 
