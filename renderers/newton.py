@@ -24,17 +24,16 @@ class Newton(Tracer):
 
     Source: ours. The march follows DIST, Sec. 3.2; the search DVR, Sec. 3.3; the gradient DVR, Eqs. 8 and 11.
     Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step: off by
-        that step times the surface's curvature, at most 3 `march_epsilon` over the cosine of incidence. What comes into
-        view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a fixed sample, and
-        left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
+        that step times the surface's curvature; the step is at most 6 `march_epsilon` times the cosine of incidence.
+        What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
+        fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
         points by automatic differentiation, also where no gradient is wanted.
-    Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; in an
-        image also those that a coarse ray passed on its way to a surface behind, as with DIST; on the rays of the dense
-        search, what is thinner than the spacing of its samples, unless it is next to the least one. A ray that passes
-        an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. Where the field
-        offers coarse values, a step may be longer by their error, and a miss's `closest` is off by it: rays that came
-        within that error of the surface are marched again, on the field itself.
+    Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; on the
+        rays of the dense search, what is thinner than the spacing of its samples, unless it is next to the least one.
+        `residual` is the value before the last step. Where the field offers coarse values, a step may be longer by
+        their error, and a miss's `closest` is off by it: rays that came within that error of the surface are marched
+        again, on the field itself.
 
     Args:
         coarse: see `tracer.Tracer` and `field.Coarse`.

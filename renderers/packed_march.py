@@ -4,9 +4,8 @@ The rays that go on are rows of one table, so that a step costs few operations. 
 `newton.py` finds the surface from where the rays stopped.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from math import inf
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,10 +14,10 @@ from torch import Tensor
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Values
-from renderers.march import CAREFUL, PYRAMID_STEPS, Stepping, pyramid
+from renderers.march import CAREFUL, Stepping, pyramid
 
-# Of the way between a ray and its coarse ray, where that stopped: with less, more begin behind the surface.
-SET_BACK = 0.5
+LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
+FORETOLD = 3.0  # times what alpha adds to a step: most that is added where the last two values foretell zero further on
 CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
 
 
@@ -57,7 +56,7 @@ class Reached:
 
     @property
     def distance(self) -> Float[Tensor, " n"]:
-        """Along each ray to where it stopped, or is to be evaluated next."""
+        """Along each ray to where it stopped, or is to be evaluated next; beyond its end where it has LEFT."""
         return self.table[:, self.DISTANCE]
 
     @property
@@ -77,7 +76,7 @@ class Reached:
 
     @property
     def free(self) -> Float[Tensor, " n"]:
-        """Along each ray to its own last positive value; to where it begins before the first."""
+        """Along each ray to its own last value above the threshold; to where it begins before the first."""
         return self.table[:, self.FREE]
 
     @property
@@ -145,7 +144,7 @@ class Reached:
         self.table[index] = others.table
 
     def bracket(self) -> Bracket:
-        """Between the last positive value of each ray and its last value; meant for rays that have CROSSED."""
+        """Between `free` and where each ray stopped; meant for rays that have CROSSED."""
         return Bracket(self.free, self.distance, self.free_value, self.value)
 
     def keep_least(self, distance: Float[Tensor, " n"], value: Float[Tensor, " n"]) -> None:
@@ -172,13 +171,13 @@ class Reached:
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
         finite = value.isfinite()
-        moved = torch.minimum(torch.maximum(at + stepping.length(value), self.entry), self.leave)
+        moved = torch.minimum(torch.maximum(at + self._length(value, stepping), self.entry), self.leave)
         self.table[:, self.STOP] = torch.where(finite, stop, Stop.NOT_FINITE).to(value.dtype)
         self.table[:, self.VALUE] = torch.where(finite, value, 0.0)
-        self.table[:, self.DISTANCE] = torch.where(goes_on & finite, moved, torch.where(left, self.leave, at))
+        self.table[:, self.DISTANCE] = torch.where(goes_on & finite, moved, torch.where(left, at + value, at))
         cleared = torch.where(left & (value <= CLEAR), self.leave, at)
         self.table[:, self.CLEARED] = torch.where(before <= CLEAR, cleared, self.cleared)
-        positive = (value > 0) & finite
+        positive = (value > epsilon) & finite
         self.table[:, self.FREE] = torch.where(positive, at, self.free)
         self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
         self.table[:, self.ANCHOR] = torch.where(closest > CLEAR, at, self.anchor)
@@ -187,60 +186,64 @@ class Reached:
             self.table[:, column] = torch.where(rises | left, torch.minimum(least, before), least)
         return goes_on & finite
 
-    def split(
-        self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, error: float = -inf
-    ) -> "Reached":
-        """The same of finer rays, each of which continues from its coarse `parent`.
+    def _length(self, value: Float[Tensor, " n"], stepping: Stepping) -> Float[Tensor, " n"]:
+        """The step for the field's values where all rays are.
 
-        Where that stopped at a surface, or one is about as close as the two rays are apart, a ray begins before its
-        closest sample. One whose coarse ray met nothing keeps its closest sample, if that is free.
+        Where a ray descends slowly, it is as long as the slope between its last two values foretells, in bounds.
+        """
+        slope = (self.free_value - value) / (self.distance - self.free)
+        most = replace(stepping, alpha=1 + FORETOLD * (stepping.alpha - 1)).length(value)
+        return torch.maximum(stepping.length(value), torch.minimum(value / slope, most))
+
+    def split(self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, error: float) -> "Reached":
+        """The same of finer rays, each of which continues from its coarse `parent`: as far as that one's spheres reach.
+
+        One whose coarse ray came close to nothing keeps its closest sample.
 
         Args:
-            error: most that the values of the coarse ray are off; -inf for the field itself. Rays below one that came
-                that close to a surface, and did not stop, begin anew.
+            error: most that the values of the coarse ray are off.
         """
         child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
         inherits &= child.stopped(Stop.ON_THE_WAY)
-        at = known.least_distance[:, None]
-        apart = torch.linalg.vector_norm(
-            coarse.origins[parent] + at * coarse.directions[parent] - rays.origins - at * rays.directions, dim=-1
-        )
+        reach = torch.where(known.stopped(Stop.CROSSED), known.free + known.free_value, known.distance)
+        apart = _apart(coarse[parent], rays, reach)
+        start = torch.where(inherits, torch.maximum(reach - apart - error, child.entry), child.entry)
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
-        inherits &= (known.grazed > error) & (ended | (known.least > error))
-        close = ended | (known.least.abs() - max(error, 0.0) <= CAREFUL * apart)
-        start = torch.where(close, known.least_distance - SET_BACK * apart, known.distance)
-        gone = inherits & ~ended & (start >= child.leave)
-        start = torch.where(inherits & (start < child.leave), torch.maximum(start, child.entry), child.entry)
-        child.table[:, self.DISTANCE] = torch.where(gone, child.leave, start)
+        gone = inherits & (start >= child.leave)
+        child.table[:, self.DISTANCE] = start
         child.table[:, self.STOP] = torch.where(gone, float(Stop.LEFT), child.table[:, self.STOP])
         keeps = inherits & ~ended & (known.least > 0)
         for column in (self.VALUE, self.LEAST_DISTANCE, self.LEAST):
             child.table[:, column] = torch.where(keeps, known.table[:, column], child.table[:, column])
         passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
         child.table[:, self.PASSED] = torch.where(inherits, passed - apart, child.passed)
-        child.table[:, self.ANCHOR] = torch.where(child.passed > CLEAR, child.distance, child.entry)
-        child.table[:, self.CLEARED] = child.distance
+        begins = torch.minimum(start, child.leave)
+        child.table[:, self.ANCHOR] = torch.where(child.passed > CLEAR, begins, child.entry)
+        child.table[:, self.CLEARED] = begins
         return child
 
 
 def approach(
-    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, error: float = -inf
+    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, error: float = 0.0
 ) -> Reached:
-    """Marches all rays; those of an image coarse to fine, as in `march.march_coarse_to_fine`.
+    """Marches all rays; those of an image coarse to fine (DIST, Sec. 3.2).
+
+    A coarse ray stops before its empty sphere is too small to hold the finer rays next to it.
 
     Args:
         rays: of any leading shape; the answer has them in one row.
         stepping: its epsilon, alpha, extra_step_cap and step_clamp.
-        steps: most steps per ray, those of its coarse rays included.
+        steps: most steps per ray, beside those of its coarse rays.
         radius: of the sphere about the origin that holds the shape.
-        error: see `Reached.split`.
+        error: most that one of the values is off.
     """
     levels = pyramid(rays) if rays.image else []
     reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
-        march(values, level.coarse, reached, stepping, min(PYRAMID_STEPS, steps))
-        steps = max(steps - PYRAMID_STEPS, 0)
+        apart = _apart(level.coarse[level.parent], level.fine, reached.leave[level.parent])
+        careful = replace(stepping, epsilon=CAREFUL * (float(apart.max()) if apart.numel() else 0.0) + error)
+        march(values, level.coarse, reached, careful, LEVEL_STEPS)
         reached = reached.split(level.parent, level.coarse, level.fine, radius=radius, error=error)
     march(values, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
@@ -258,3 +261,8 @@ def march(values: Values, rays: Rays, reached: Reached, stepping: Stepping, step
         reached.table[index[stopped]] = moving.table[stopped]
         index, origins, directions, moving = index[going], origins[going], directions[going], moving.some(going)
     reached.table[index] = moving.table
+
+
+def _apart(first: Rays, second: Rays, distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """How far the points at `distance` along two sets of n rays are apart."""
+    return torch.linalg.vector_norm(first.at(distance) - second.at(distance), dim=-1)

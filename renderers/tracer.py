@@ -1,7 +1,6 @@
 """What finds the surface along rays for `newton.Newton`: a loose march, Newton steps, and a search for what is left."""
 
 from dataclasses import dataclass, fields, replace
-from math import inf
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,9 +15,11 @@ from renderers.march import Stepping
 from renderers.packed_march import Reached, Stop, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
-LONGEST = 3.0  # times march_epsilon: after a longer Newton step the field is asked again, as it may not be straight
+# Times march_epsilon and the slope along the ray: after a longer Newton step the field is asked again, since a step is
+# off by its square over the slope, times half the field's curvature.
+LONGEST = 6.0
 PATIENT = 2  # times `steps`, where the field offers coarse values: first on these, then on the field for rays in doubt
-SETTLED = 0.1  # times march_epsilon: a value below it is a hit, whatever its slope
+SETTLED = 0.1  # times march_epsilon: a value so little behind the surface is a hit, whatever its slope
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class Tracer:
     """Marches coarse to fine to a loose threshold, solves for the crossings by Newton steps, searches for the rest.
 
     Args:
-        steps: most marching steps per ray, those of its coarse rays included; rays that are left are searched densely.
+        steps: most marching steps per ray, beside those of its coarse rays; rays that are left are searched densely.
             See `PATIENT`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
             the rest.
         alpha, extra_step_cap: see `march.Stepping`.
         newton_steps: most evaluations of value and slope per root; a second one only where the first step is long.
-        search_samples: of the dense search, between a ray's last positive value and where it leaves the sphere, and as
-            many again about the least of these.
+        search_samples: of the dense search, from a ray's last value above the threshold to where it leaves the sphere,
+            and as many again about the least of these.
         search_steps: values per hit that narrow the interval found there.
         least_slope: see `gradients.implicit`.
         sphere_radius: of the sphere about the origin that holds the shape.
@@ -52,7 +53,7 @@ class Tracer:
     coarse: bool
 
     def __post_init__(self) -> None:
-        check_at_least("steps", self.steps, 1, "22 leave one ray in 200 to the search")
+        check_at_least("steps", self.steps, 1, "20 leave one ray in 300 to the search")
         check_positive("march_epsilon", self.march_epsilon, "1e-3 is a twentieth of a pixel at 64 x 64")
         check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, 1.7 is aggressive marching")
         check_positive("extra_step_cap", self.extra_step_cap, "0.01 keeps parts of that thickness")
@@ -71,7 +72,7 @@ class Tracer:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
             coarse = self._coarse(field)
-            values, error = (coarse.values, coarse.error) if coarse else (field, -inf)
+            values, error = (coarse.values, coarse.error) if coarse else (field, 0.0)
             steps = PATIENT * self.steps if coarse else self.steps
             reached = approach(values, rays, self.stepping, steps=steps, radius=self.sphere_radius, error=error)
         return reached, self._crossings(field, rays.flat(), reached, coarse)
@@ -141,29 +142,29 @@ class Tracer:
         index: Int[Tensor, " m"],
         guess: Float[Tensor, " m"],
         *,
-        furthest: float = 0.0,
+        furthest: float | None = None,
     ) -> "Solved":
         """Newton steps from `guess` along m of the rays; more than one only where the step is long.
 
-        A root is settled where the step is short and stays on the ray, or the value is small. It lies at the ray's
-        beginning where the step leads behind that.
+        A root is settled where the step is short and stays on the ray, or the value is hardly negative. It lies at the
+        ray's beginning where the step leads behind that.
 
         Args:
-            furthest: longest step, in scene units, where that is more than `LONGEST` times the march's threshold.
+            furthest: longest step, in scene units; None for `extra_step_cap`, by which the march may go too far.
         """
         towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
         nothing = torch.zeros_like(guess)
         solved = Solved(index, guess, nothing, nothing, nothing, nothing, torch.zeros_like(index).bool())
         asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.march_epsilon
-        furthest = max(furthest, longest)
+        furthest = max(longest, self.extra_step_cap if furthest is None else furthest)
         for _ in range(self.newton_steps):
             ray, at = index[asked], solved.distance.detach()[asked]
             found = crossing(field, rays[ray], at, towards_field=towards_field)
             slope = found.slope.clamp_max(-self.least_slope)
             step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)
-            short = enters & (step.abs() <= longest) & (at + step <= reached.leave[ray])
-            small = found.value.abs() <= SETTLED * self.march_epsilon
+            short = enters & (found.value.abs() <= longest * found.slope.square()) & (at + step <= reached.leave[ray])
+            small = (found.value <= 0) & (found.value >= -SETTLED * self.march_epsilon)
             step = torch.where(enters | small, step.clamp(-furthest, furthest), 0.0)
             step = torch.maximum(step, reached.entry[ray] - at)
             distance = at + step - found.change / slope

@@ -11,7 +11,7 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
-from renderers.packed_march import CLEAR, Stop
+from renderers.packed_march import CLEAR, Reached, Stop, march
 from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, beam
 
@@ -220,6 +220,49 @@ def test_a_thin_sheet_in_front_of_a_wall_is_hit_and_not_the_wall():
     alone, before = NEWTON.render(sheet, rays), NEWTON.render(sheet | plane((0, 0, -1), -0.15), rays)
     assert alone.hit.all()
     torch.testing.assert_close(before.distance, alone.distance, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "thin",
+    [
+        capsule((-0.5, 0.1, -0.3), (0.5, -0.1, 0.4), 0.015),
+        box((0.5, 0.01, 0.3)).translate((0.0, 0.2, 0.0)) | box((0.01, 0.3, 0.5)),
+    ],
+    ids=["wire", "plates"],
+)
+def test_in_an_image_what_is_thin_is_hit_and_not_the_wall_behind(thin):
+    rays = camera(64, torch.float64).rays()
+    wall = plane(tuple(torch.nn.functional.normalize(rays.origins[0, 0], dim=0).tolist()), -0.5)
+    steady = replace(NEWTON, alpha=1.0, steps=100)
+    image, alone = steady.render(thin | wall, rays), steady.render(thin | wall, rays.flat())
+    assert (thin(alone.points) < 1e-3).sum() > 20
+    assert ((image.distance.flatten() - alone.distance).abs() < 0.05).all()
+
+
+def marched(*values: float) -> Reached:
+    """Where a ray is that begins in the sphere's centre and finds these values."""
+    rays, left = beam((0.0, 0.0, 0.0)), iter(values)
+    reached = Reached.on_sphere(rays, 1.0)
+    march(lambda points: points.new_full(points.shape[:-1], next(left)), rays, reached, NEWTON.stepping, len(values))
+    return reached
+
+
+def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
+    coarse, fine = beam((0.0, 0.0, 0.0)), beam((0.03, 0.0, 0.0))
+    for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-4), 0.41), ((0.4, 0.2), 0.62)]:
+        reached = marched(*values)
+        finer = reached.split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+        assert finer.distance.item() == pytest.approx(end - 0.03 - 0.002)
+    gone = marched(0.4, 0.62).split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+    assert gone.distance.item() < 1.0 and gone.stopped(Stop.ON_THE_WAY).item()
+    gone = marched(0.4, 0.7).split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+    assert gone.stopped(Stop.LEFT).item()
+
+
+def test_the_search_begins_at_the_last_value_above_the_threshold():
+    reached = marched(0.4, 0.2, 5e-4)
+    assert reached.stopped(Stop.NEAR).item()
+    assert (reached.free.item(), reached.free_value.item()) == pytest.approx((0.41, 0.2))
 
 
 def test_the_tip_of_a_cone_is_hit_and_spoils_no_gradient():
