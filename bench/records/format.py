@@ -37,6 +37,11 @@ def count(n: int | float | None) -> str:
     return f"{number(n, 1000.0**-power)}{' kMGTP'[power]}"
 
 
+def queries(values: int | float | None, coarse: int | float | None) -> str:
+    """Counts of field values and of coarse ones, such as 39.9k + 123k coarse."""
+    return f"{count(values)} + {count(coarse)} coarse" if coarse else count(values)
+
+
 def size(n: int | float | None) -> str:
     """A number of bytes with its unit, in powers of 1000, such as 512 B or 1.43 GB."""
     if n is None or not math.isfinite(n):

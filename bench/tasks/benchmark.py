@@ -9,13 +9,11 @@ from bench.machine.environment import using_threads
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.tasks import ablation
-from bench.tasks.ablation import Clocked, Workbench
+from bench.tasks import workbench
+from bench.tasks.workbench import Clocked, Workbench
 from renderers.checks import check_at_least, check_positive
 
 BASE = "base"  # the run's renderer among the numbers of the record
-SHARED = ("queries", "coarse_queries, step_coarse_queries", "peak_memory_bytes", "lost, false", "rays, hits", "wrong")
-SHARED += ("error_p95", "depth_error")  # what is measured as in the other task
 DEFINITIONS = {
     "rounds": "how often each renderer was timed, in turn, each round in the opposite order of the last one",
     "forward_seconds, step_seconds": "a rendering without gradient; a step of an optimisation: rendering, losses, "
@@ -24,7 +22,7 @@ DEFINITIONS = {
     "forward_ratio, step_ratio, forward_cpu_ratio, step_cpu_ratio": "over the first renderer's of the same round: "
     "median; _low and _high: least and largest",
     "work_over_bound": "the operations of a step, divided by those of one value and one gradient per hit",
-    **{key: ablation.DEFINITIONS[key] for key in SHARED},
+    **workbench.DEFINITIONS,
 }
 
 

@@ -22,9 +22,10 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.problem import Unsupported
 from bench.tasks import ablation
-from bench.tasks.ablation import DEFINITIONS, SMALLER, WARM_UP, Ablation
+from bench.tasks.ablation import DEFINITIONS, SMALLER, Ablation
+from bench.tasks.workbench import WARM_UP, Clocked, Workbench
 from renderers.camera import Camera, Rays
-from renderers.field import Field, Kind, Meter
+from renderers.field import Counts, Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 from tests.tiny import PEAK, ball_prior, camera_of, phases_of, run_of
 
@@ -144,9 +145,9 @@ def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(
 
 
 def test_costs_are_medians_with_least_and_largest():
-    clocked = ablation.Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], ablation.Counts(10, 4, coarse=7), 77, 600, 80)
-    forward = ablation.Clocked([2.0], [0.0], [0.0], ablation.Counts(5, 0), None, None)
-    measured = ablation.Measured(None, forward, clocked)  # type: ignore[arg-type]
+    clocked = Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], Counts(10, 4, coarse=7), 77, 600, 80)
+    forward = Clocked([2.0], [0.0], [0.0], Counts(5, 0), None, None)
+    measured = ablation.Measured(Workbench.__new__(Workbench), forward, clocked)
     assert measured.costs({"gemm_peak_flops": 100.0, "bfloat16_peak_flops": 400.0}) == {
         "queries": 5, "coarse_queries": 0, "step_queries": 10, "step_coarse_queries": 7, "step_gradients": 4,
         "repeats": 3, "peak_memory_bytes": 77,

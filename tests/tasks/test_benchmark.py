@@ -8,8 +8,8 @@ import torch
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
 from bench.tasks import benchmark
-from bench.tasks.ablation import Clocked
 from bench.tasks.benchmark import BASE, Benchmark
+from bench.tasks.workbench import Clocked
 from renderers.field import Counts
 from tests.tasks.test_ablation import PRIOR, load, run_of, view
 

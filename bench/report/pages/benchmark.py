@@ -7,7 +7,7 @@ from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, definitions, measured, setting
 from bench.report.write.result import Result
-from bench.report.write.table import Column, shown, text, to_data, to_table, whole
+from bench.report.write.table import Column, shown, text, to_data, to_table, together, whole
 
 PLACE = 15
 BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.benchmark
@@ -90,22 +90,13 @@ def _ratio(cost: str) -> Column:
     return Column(f"{cost}_ratio", HEADINGS[cost], words=words)
 
 
-def _together(show: Any, *keys: str) -> Any:
-    return lambda line: " / ".join(show(line.get(key)) for key in keys)
-
-
-def _values(line: dict[str, Any]) -> str:
-    coarse = line.get("coarse_queries")
-    return format.count(line.get("queries")) + (f" + {format.count(coarse)} coarse" if coarse else "")
-
-
 COLUMNS = (
     Column("size", "Size", show=whole),
     Column("threads", "Threads", show=whole),
     text("renderer", "Renderer"),
     *(text(key) for key in ("status", "reason", "folder")),
     Column("rounds"),
-    Column("queries", "Values", words=_values),
+    Column("queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))),
     Column("coarse_queries"),
     Column("forward_seconds", "Forward", show=format.seconds),
     Column("step_seconds", "Step", show=format.seconds),
@@ -115,7 +106,7 @@ COLUMNS = (
     Column("peak_memory_bytes", "Memory of a step", show=format.size),
     Column("work_over_bound", "Work over bound"),
     *(Column(key) for key in ("rays", "hits", "lost", "false", "wrong")),
-    shown("Missed / spurious / wrong depth", _together(whole, "lost", "false", "wrong")),
+    shown("Missed / spurious / wrong depth", together(dict.get, whole, "lost", "false", "wrong")),
     *(Column(key) for key in ("depth_error_median", "depth_error_p99", "depth_error_max")),
-    shown("Depth error median / p99", _together(format.number, "depth_error_median", "depth_error_p99")),
+    shown("Depth error median / p99", together(dict.get, format.number, "depth_error_median", "depth_error_p99")),
 )

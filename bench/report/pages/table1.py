@@ -8,7 +8,7 @@ from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, definitions, measured, repeated, row_of, setting
 from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, configured, shown, to_data, to_table, whole
+from bench.report.write.table import IDENTITY, Column, configured, shown, to_data, to_table, together, whole
 
 PLACE = 10
 READS = (Selection("table1", ("ablation",)),)
@@ -103,22 +103,6 @@ def _size(record: Record) -> str:
     return f"{whole(size)} ({requested}: {status})" if requested else f"{whole(size)} ({status})"
 
 
-def _together(show: Show, *names: str) -> Callable[[Record], str]:
-    """The text of several metrics in one cell."""
-
-    def shown_together(record: Record) -> str:
-        texts = [show(measured(record, name)) for name in names]
-        return format.MISSING if set(texts) == {format.MISSING} else " / ".join(texts)
-
-    return shown_together
-
-
-def _queries(record: Record) -> str:
-    """The field values of a rendering, and how many more of them were coarse."""
-    text, coarse = format.count(measured(record, "queries")), measured(record, "coarse_queries")
-    return f"{text} + {format.count(coarse)} coarse" if coarse else text
-
-
 def _step(record: Record) -> str:
     """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
     middle, low, high = (measured(record, f"step_seconds{end}") for end in ("", "_low", "_high"))
@@ -136,7 +120,10 @@ COLUMNS = (
     *IDENTITY,
     Column("size", "Size", _requested, words=_size),
     configured("steps", "renderer", "steps", heading="Steps"),
-    replace(_cost("queries", "Queries"), words=_queries),
+    replace(
+        _cost("queries", "Queries"),
+        words=lambda r: format.queries(measured(r, "queries"), measured(r, "coarse_queries")),
+    ),
     *(_cost(name) for name in ("coarse_queries", "step_queries", "step_coarse_queries", "step_gradients")),
     _cost("forward_seconds", "Forward", format.seconds, key="forward_s"),
     _cost("backward_seconds", "Backward", format.seconds, key="backward_s"),
@@ -145,11 +132,13 @@ COLUMNS = (
     *(_cost(name) for name in ("repeats", "forward_gemm", "step_gemm", "rays")),
     _cost("peak_memory_bytes", "Peak memory", format.size),
     _cost("hits", "Hits", whole),
-    replace(_cost("lost", "Missed / spurious / wrong depth"), words=_together(whole, "lost", "false", "wrong")),
+    replace(
+        _cost("lost", "Missed / spurious / wrong depth"), words=together(measured, whole, "lost", "false", "wrong")
+    ),
     *(_cost("false"), _cost("wrong"), _cost("depth_error_p99"), _cost("depth_error_max")),
     replace(
         _cost("depth_error_median", "Depth error median / max"),
-        words=_together(format.number, "depth_error_median", "depth_error_max"),
+        words=together(measured, format.number, "depth_error_median", "depth_error_max"),
     ),
     *(Column("published_size", value=_published(0)), Column("published_steps", value=_published(1))),
     Column("published_queries", "Published queries", _published(2), lambda queries: queries or ""),

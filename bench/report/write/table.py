@@ -90,6 +90,16 @@ def shown(heading: str, words: Callable[[Any], str]) -> Column:
     return Column("", heading, words=words)
 
 
+def together(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
+    """The text of several values of a line in one cell; `get` gives the line's value under a key."""
+
+    def words(line: Any) -> str:
+        texts = [show(get(line, key)) for key in keys]
+        return format.MISSING if set(texts) == {format.MISSING} else " / ".join(texts)
+
+    return words
+
+
 def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
     """A column with a metric of each record."""
     return Column(name, heading, lambda record: measured(record, name), show)
