@@ -27,8 +27,8 @@ from renderers.tracer import Solved, Tracer
 
 SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have moved further
 STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
-MOSTLY = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
-MOST = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
+USUAL = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
+MARCHED = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
 LOOKED = 29  # on one of so many rays the field's movement is measured; no part of a usual image's width
 GOLDEN = 0.618034  # of the way along a ray from one of these places to the next: they spread over all of it
 AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
@@ -159,7 +159,7 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
     if before is not None:
         again = solved.some(solved.settled & before.hit[solved.index])
         apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
-        step = SAFETY * apart.quantile(MOSTLY) if len(apart) else step
+        step = SAFETY * apart.quantile(USUAL) if len(apart) else step
     with torch.no_grad():
         image = Image.of(reached, step, _look(field, rays.flat(), reached))
     image.note(solved)
@@ -169,7 +169,7 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
 def _worthwhile(image: Image, tracer: Tracer) -> bool:
     """Whether enough rays will be free, if values move as far as the last time."""
     free, _ = image.free(tracer, image.moved + image.step)
-    return bool((~free).sum() <= MOST * len(free))
+    return bool((~free).sum() <= MARCHED * len(free))
 
 
 def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: Image) -> Solved | None:
@@ -186,7 +186,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         audited = torch.zeros_like(free)
         audited[STRIDE * image.renderings % AUDITED :: AUDITED] = True
         index = (~certain | audited).nonzero().squeeze(-1)
-        if len(index) > MOST * len(free):
+        if len(index) > MARCHED * len(free):
             return None
         anchored = up_to_anchor & ~audited
         moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)

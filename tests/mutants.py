@@ -83,7 +83,7 @@ MUTANTS = (
     M("bench/machine/limits.py", "offered.noted(self._spend)", "offered", COARSE),
     M("renderers/warm.py", "margin = 2 * (moved - self.marched)", "margin = 0 * (moved - self.marched)",
       "tests/renderers/test_warm.py"),
-    M("renderers/warm.py", "return bool((~free).sum() <= MOST * len(free))", "return True",
+    M("renderers/warm.py", "return bool((~free).sum() <= MARCHED * len(free))", "return True",
       "tests/renderers/test_warm.py"),
     M("renderers/warm.py", "torch.maximum(_largest(solved.begun), _largest(looked - image.looked))",
       "_largest(solved.begun)", "tests/renderers/test_warm.py"),

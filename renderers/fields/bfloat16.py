@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from renderers.field import Coarse, Values
+from renderers.field import Coarse, Values, points_in_ball
 
 NARROWEST = 256  # neurons a layer: below it, converting features takes what the products save
 CHUNK = 2048  # points per pass, as in `mlp`
@@ -118,10 +118,7 @@ def _product(weight: Tensor, bias: Tensor | None, activation: str) -> Callable[[
 
 def _largest_error(network: _Network, exact: Values, like: Tensor) -> float:
     """The largest error of the network's values near its surface, at points that are the same each time."""
-    draw = torch.Generator("cpu").manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(DRAWN, 3, generator=draw, device="cpu"), dim=-1)
-    radius = torch.rand(DRAWN, 1, generator=draw, device="cpu") ** (1 / 3)
-    points = (radius * direction).to(like)
+    points = points_in_ball(DRAWN).to(like)
     values = network(points)
     near = values.abs() <= NEAR
     near = near | (near.sum() < FEWEST)
