@@ -177,9 +177,13 @@ def labelled(*axes: Axes) -> dict[str, Any]:
 
 
 def legend_below(figure: Figure | SubFigure, *axes: Axes, columns: int = 4) -> None:
-    """Draws one legend of some axes below them."""
+    """Draws one legend of some axes below them, in so many columns, or in fewer where it is wider than the figure."""
     named = labelled(*axes)
-    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns)
+    for ncols in range(columns, 0, -1):
+        legend = figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=ncols)
+        if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
 
 
 def bare(axis: Any) -> Any:
