@@ -30,10 +30,11 @@ class Newton(Tracer):
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
         points by automatic differentiation, also where no gradient is wanted.
     Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; on the
-        rays of the dense search, what is thinner than the spacing of its samples, unless it is next to the least one.
-        `residual` is the value before the last step. Where the field offers coarse values, a step may be longer by
-        their error, and a miss's `closest` is off by it: rays that came within that error of the surface are marched
-        again, on the field itself.
+        rays of the dense search, what is thinner than the spacing of its samples, unless it is next to the least one;
+        in an image, what rays meet at the rim of the sphere in front of where their coarse ray enters it. A ray that
+        passes an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. Where the
+        field offers coarse values, a step may be longer by their error, and a miss's `closest` is off by it: rays that
+        came within that error of the surface are marched again, on the field itself.
 
     Args:
         coarse: see `tracer.Tracer` and `field.Coarse`.

@@ -165,12 +165,12 @@ class Reached:
         closest = torch.minimum(self.passed, before)
         self.keep_least(at, value)
         behind, own, begins = value < -epsilon, self.free_value.isfinite(), at <= self.entry
-        left = (value > epsilon) & (at + value > self.leave)
+        finite = value.isfinite()
+        left = (value > epsilon) & (at + value > self.leave) & finite
         back = behind & ~own & ~begins
         goes_on = back | ((value > epsilon) & ~left)
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
-        finite = value.isfinite()
         moved = torch.minimum(torch.maximum(at + self._length(value, stepping), self.entry), self.leave)
         self.table[:, self.STOP] = torch.where(finite, stop, Stop.NOT_FINITE).to(value.dtype)
         self.table[:, self.VALUE] = torch.where(finite, value, 0.0)
@@ -193,33 +193,35 @@ class Reached:
         """
         slope = (self.free_value - value) / (self.distance - self.free)
         most = replace(stepping, alpha=1 + FORETOLD * (stepping.alpha - 1)).length(value)
-        return torch.maximum(stepping.length(value), torch.minimum(value / slope, most))
+        foretold = (value / slope).nan_to_num(0.0, torch.inf, -torch.inf)  # a step too short for the dtype has no slope
+        return torch.maximum(stepping.length(value), torch.minimum(foretold, most))
 
-    def split(self, parent: Int[Tensor, " m"], coarse: Rays, rays: Rays, *, radius: float, error: float) -> "Reached":
+    def split(
+        self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], rays: Rays, *, radius: float, error: float
+    ) -> "Reached":
         """The same of finer rays, each of which continues from its coarse `parent`: as far as that one's spheres reach.
 
         One whose coarse ray came close to nothing keeps its closest sample.
 
         Args:
+            apart: how far each of the finer rays is from its coarse one, at most.
             error: most that the values of the coarse ray are off.
         """
         child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
         inherits &= child.stopped(Stop.ON_THE_WAY)
         reach = torch.where(known.stopped(Stop.CROSSED), known.free + known.free_value, known.distance)
-        apart = _apart(coarse[parent], rays, reach)
         start = torch.where(inherits, torch.maximum(reach - apart - error, child.entry), child.entry)
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
-        gone = inherits & (start >= child.leave)
-        child.table[:, self.DISTANCE] = start
-        child.table[:, self.STOP] = torch.where(gone, float(Stop.LEFT), child.table[:, self.STOP])
         keeps = inherits & ~ended & (known.least > 0)
+        gone, begins = keeps & (start >= child.leave), torch.minimum(start, child.leave)
+        child.table[:, self.DISTANCE] = torch.where(gone, start, begins)
+        child.table[:, self.STOP] = torch.where(gone, float(Stop.LEFT), child.table[:, self.STOP])
         for column in (self.VALUE, self.LEAST_DISTANCE, self.LEAST):
             child.table[:, column] = torch.where(keeps, known.table[:, column], child.table[:, column])
         passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
         child.table[:, self.PASSED] = torch.where(inherits, passed - apart, child.passed)
-        begins = torch.minimum(start, child.leave)
-        child.table[:, self.ANCHOR] = torch.where(child.passed > CLEAR, begins, child.entry)
+        child.table[:, self.ANCHOR] = torch.where(~ended & (child.passed > CLEAR), begins, child.entry)
         child.table[:, self.CLEARED] = begins
         return child
 
@@ -241,10 +243,11 @@ def approach(
     levels = pyramid(rays) if rays.image else []
     reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
-        apart = _apart(level.coarse[level.parent], level.fine, reached.leave[level.parent])
-        careful = replace(stepping, epsilon=CAREFUL * (float(apart.max()) if apart.numel() else 0.0) + error)
-        march(values, level.coarse, reached, careful, LEVEL_STEPS)
-        reached = reached.split(level.parent, level.coarse, level.fine, radius=radius, error=error)
+        coarse, parent = level.coarse[level.parent], level.parent
+        apart = _apart(coarse, level.fine, reached.entry[parent], reached.leave[parent])
+        clear = CAREFUL * (float(apart.max()) if apart.numel() else 0.0) + error
+        march(values, level.coarse, reached, replace(stepping, epsilon=max(clear, stepping.epsilon)), LEVEL_STEPS)
+        reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
     march(values, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
     return reached
 
@@ -263,6 +266,7 @@ def march(values: Values, rays: Rays, reached: Reached, stepping: Stepping, step
     reached.table[index] = moving.table
 
 
-def _apart(first: Rays, second: Rays, distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """How far the points at `distance` along two sets of n rays are apart."""
-    return torch.linalg.vector_norm(first.at(distance) - second.at(distance), dim=-1)
+def _apart(first: Rays, second: Rays, begin: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """How far two sets of n rays are apart at the same distance between `begin` and `end`, at most."""
+    ends = (torch.linalg.vector_norm(first.at(distance) - second.at(distance), dim=-1) for distance in (begin, end))
+    return torch.maximum(*ends)

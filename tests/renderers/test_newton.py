@@ -233,10 +233,78 @@ def test_a_thin_sheet_in_front_of_a_wall_is_hit_and_not_the_wall():
 def test_in_an_image_what_is_thin_is_hit_and_not_the_wall_behind(thin):
     rays = camera(64, torch.float64).rays()
     wall = plane(tuple(torch.nn.functional.normalize(rays.origins[0, 0], dim=0).tolist()), -0.5)
-    steady = replace(NEWTON, alpha=1.0, steps=100)
-    image, alone = steady.render(thin | wall, rays), steady.render(thin | wall, rays.flat())
-    assert (thin(alone.points) < 1e-3).sum() > 20
-    assert ((image.distance.flatten() - alone.distance).abs() < 0.05).all()
+    image, truth = replace(NEWTON, alpha=1.0, steps=100).render(thin | wall, rays), exact(thin | wall)
+    in_front = thin(truth.points) < 1e-9
+    assert in_front.sum() > 20
+    assert ((image.distance - truth.distance).abs()[in_front] < 0.05).all()
+
+
+def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
+    y, x = torch.meshgrid(*[torch.linspace(-0.8, 0.8, 16, dtype=torch.float64)] * 2, indexing="ij")
+    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
+    focus = torch.tensor([0.0, 0.0, 0.98], dtype=torch.float64)
+    rays = Rays(origins, torch.nn.functional.normalize(focus - origins, dim=-1), image=True)
+    hits = 0
+    for x, y, z in [
+        (-0.3, 0.2, -0.6),
+        (-0.1, -0.26, -0.5),
+        (0.05, 0.17, -0.65),
+        (0.28, -0.12, -0.45),
+        (0.1, 0.1, -0.4),
+    ]:
+        image, alone = (NEWTON.render(sphere(0.05, (x, y, z)), some) for some in (rays, rays.flat()))
+        assert torch.equal(image.hit.flatten(), alone.hit)
+        hits += int(alone.hit.sum())
+    assert hits > 5
+
+
+def test_a_field_that_is_infinite_somewhere_gives_finite_distances():
+    infinite = Shape(lambda p: torch.where(p.norm(dim=-1) > 0.8, torch.inf, sphere(0.6)(p)), Kind.BOUND)
+    for rays in (camera(48).rays(), camera(48).rays().flat()):
+        rendering = NEWTON.render(infinite, rays)
+        assert rendering.distance.isfinite().all() and rendering.points.isfinite().all()
+
+
+def test_steps_too_short_for_the_dtype_end_a_march_at_a_finite_distance():
+    rays = ViewSampler(2.5, 5.0, (0.0, 360.0), (15.0, 35.0), 4).camera(68.4, 25.0).resized(1, 1).rays()
+    plain = replace(NEWTON, alpha=1.0)
+    image, alone = (plain.render(box((0.4, 0.3, 0.5)), some) for some in (rays, rays.flat()))
+    assert image.distance.item() == pytest.approx(alone.distance.item(), abs=1e-5)
+    assert replace(NEWTON, march_epsilon=1e-8, steps=60).render(sphere(0.6), camera().rays()).distance.isfinite().all()
+
+
+def test_a_miss_beside_a_surface_at_the_rim_of_the_sphere_has_a_closest_sample():
+    at_the_rim, mask = sphere(0.1, (0.82, 0.042, -0.369)), torch.zeros(64, 64, dtype=torch.bool)
+    image = NEWTON.render(at_the_rim, camera().rays())
+    assert (image.closest[image.status == Status.MISS] > 0).all()
+    alone = NEWTON.render(at_the_rim, camera().rays().flat())
+    losses = [
+        NEWTON.silhouette_loss(at_the_rim, rays, found, wanted).item()
+        for rays, found, wanted in ((camera().rays(), image, mask), (camera().rays().flat(), alone, mask.flatten()))
+    ]
+    assert losses[0] == pytest.approx(losses[1], rel=0.01)
+
+
+@by_shape
+def test_up_to_its_anchor_the_field_is_large(shape):
+    rays = camera().rays()
+    reached, _ = NEWTON.trace(shape, rays)
+    assert ((reached.anchor >= reached.entry) & (reached.anchor <= reached.leave)).all()
+    assert (reached.anchor > reached.entry).sum() > 300
+    shares = torch.linspace(0, 1, 100)
+    before = rays.flat().at_each(reached.entry[:, None] + shares * (reached.anchor - reached.entry)[:, None])
+    assert shape(before).min() > CLEAR - NEWTON.extra_step_cap
+
+
+def test_a_root_lies_between_where_its_ray_begins_and_ends():
+    rays = beam((0.0, 0.0, -2.0))
+    reached, guess = Reached.on_sphere(rays, 1.0), torch.tensor([2.0]).double()
+    for offset, place, settled in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
+        wall = plane((0.0, 0.0, -1.0), offset)
+        start = guess - (1.0 if offset > 0 else -0.9995)
+        solved = NEWTON.solve(wall, rays, reached, torch.tensor([0]), start)
+        assert solved.settled.item() == settled
+        assert place is None or solved.distance.item() == pytest.approx(place)
 
 
 def marched(*values: float) -> Reached:
@@ -248,14 +316,14 @@ def marched(*values: float) -> Reached:
 
 
 def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
-    coarse, fine = beam((0.0, 0.0, 0.0)), beam((0.03, 0.0, 0.0))
+    parent, apart, fine = torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0))
     for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-4), 0.41), ((0.4, 0.2), 0.62)]:
         reached = marched(*values)
-        finer = reached.split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+        finer = reached.split(parent, apart, fine, radius=1.0, error=0.002)
         assert finer.distance.item() == pytest.approx(end - 0.03 - 0.002)
-    gone = marched(0.4, 0.62).split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+    gone = marched(0.4, 0.62).split(parent, apart, fine, radius=1.0, error=0.002)
     assert gone.distance.item() < 1.0 and gone.stopped(Stop.ON_THE_WAY).item()
-    gone = marched(0.4, 0.7).split(torch.tensor([0]), coarse, fine, radius=1.0, error=0.002)
+    gone = marched(0.4, 0.7).split(parent, apart, fine, radius=1.0, error=0.002)
     assert gone.stopped(Stop.LEFT).item()
 
 
