@@ -244,18 +244,13 @@ def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
     origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
     focus = torch.tensor([0.0, 0.0, 0.98], dtype=torch.float64)
     rays = Rays(origins, torch.nn.functional.normalize(focus - origins, dim=-1), image=True)
-    hits = 0
-    for x, y, z in [
-        (-0.3, 0.2, -0.6),
-        (-0.1, -0.26, -0.5),
-        (0.05, 0.17, -0.65),
-        (0.28, -0.12, -0.45),
-        (0.1, 0.1, -0.4),
-    ]:
-        image, alone = (NEWTON.render(sphere(0.05, (x, y, z)), some) for some in (rays, rays.flat()))
+    draw, hits = torch.Generator().manual_seed(0), 0
+    places = torch.rand(40, 3, generator=draw) * torch.tensor([0.6, 0.6, 0.3]) - torch.tensor([0.3, 0.3, 0.7])
+    for place in places.tolist():
+        image, alone = (NEWTON.render(sphere(0.04, place), some) for some in (rays, rays.flat()))
         assert torch.equal(image.hit.flatten(), alone.hit)
         hits += int(alone.hit.sum())
-    assert hits > 5
+    assert hits > 40
 
 
 def test_a_field_that_is_infinite_somewhere_gives_finite_distances():
