@@ -55,6 +55,14 @@ def test_readme_shows_the_numbers_of_table_1(line):
         assert cell == theirs[shown[0]][heading.index(name)], (shown[0], name)
 
 
+def test_readme_tells_the_ratios_of_the_benchmark():
+    heading, *lines = rows((PAPER / "benchmark.md").read_text())
+    (line,) = [row for row in lines if row[:3] == ["256", "1", "newton"]]
+    forward, step = (line[heading.index(name)] for name in ("Forward ratio", "Step ratio"))
+    said = f"a rendering of Newton takes {forward} and a step {step} of the time of DIST, our default"
+    assert said in " ".join((ROOT / "README.md").read_text().split())
+
+
 def test_readme_shows_the_numbers_of_the_stability_atlas():
     committed = csv.DictReader((PAPER / "stability.csv").read_text().splitlines())
     lines = {(line["axis"], line["row"]): line for line in committed}
@@ -67,8 +75,9 @@ def test_readme_shows_the_numbers_of_the_stability_atlas():
         )
         assert axis.endswith(line["unit"])
         assert theory == format.number(predicted)
+        low, high = sorted((low, high))
         assert measured == f"{format.number(found)} ({format.number(low)} to {format.number(high)})"
-        inside = min(low, high) <= predicted <= max(low, high)
+        inside = low <= predicted <= high
         share = 100 * (predicted / found - 1)
         assert place == ("inside" if inside else f"outside, {abs(share):.0f} % {'above' if share > 0 else 'below'}")
 

@@ -79,7 +79,7 @@ def test_a_gap_under_own_losses_is_the_renderers_times_the_losses(tmp_path):
     said = "under its own loss: 4.50 [4.50, 4.50] times the error; of it the renderer 1.50 [1.50, 1.50], the loss 3.00"
     assert said in told(result)
     one_loss = (
-        "Under one loss, of 2 ratios over all families 2 have an interval without 1: IDR over DIST under DIST's mask"
+        "Under one loss, the interval excludes 1 for 2 of 2 ratios over all families: IDR over DIST under DIST's mask"
     )
     assert one_loss in told(result)
 

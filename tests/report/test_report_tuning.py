@@ -191,7 +191,7 @@ def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
                 )
     result = tuned_page.make(choose(read_records(tmp_path)[0], tuned_page.READS[0], tmp_path))
     table = result.table.set_index("Method")
-    said = "Of 1 ratios of tuned settings to the defaults, those with an interval without 1: DIST, tuned on sofa, 0.500"
+    said = "The interval excludes 1 for 1 of 1 ratios of tuned settings to the defaults: DIST, tuned on sofa, 0.500"
     assert said in told(result)
     assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
     assert table.loc["DIST", "Ratio to the default"] == ""

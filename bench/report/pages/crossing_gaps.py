@@ -126,6 +126,6 @@ def _verdicts(lines: list[Line], losses: dict[str, str]) -> list[str]:
     sure = [name for name, ratio in under_one.items() if ratio.excludes(1)]
     named = f": {'; '.join(sure)}" if sure else ""
     said = (
-        f"Under one loss, of {len(under_one)} ratios over all families {len(sure)} have an interval without 1{named}."
+        f"Under one loss, the interval excludes 1 for {len(sure)} of {len(under_one)} ratios over all families{named}."
     )
     return [*own, said] if under_one else own

@@ -61,8 +61,9 @@ def verdict(lines: list[dict[str, Any]]) -> list[str]:
     if not tuned:
         return []
     sure = [line for line in tuned if line["gap"].ratio.excludes(1)]
-    found = "; ".join(f"{line['row']} on {line['family']}, {line['gap'].ratio}" for line in sure) or "none"
-    return [f"Of {len(tuned)} ratios of tuned settings to the defaults, those with an interval without 1: {found}."]
+    named = "; ".join(f"{line['row']} on {line['family']}, {line['gap'].ratio}" for line in sure)
+    said = f"The interval excludes 1 for {len(sure)} of {len(tuned)} ratios of tuned settings to the defaults"
+    return [f"{said}: {named}." if sure else f"{said}."]
 
 
 def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:

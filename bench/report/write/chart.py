@@ -17,7 +17,7 @@ from bench.report.data.statistics import Interval
 # Where a name may stand, from its point, in points of type: the first that is free.
 OFFSETS = ((0, 9), (0, -9), (6, 0), (-6, 0), (3, 9), (-3, 9), (3, -9), (-3, -9), (0, 18), (0, -18), (0, 27))
 OFFSETS += ((12, 18), (-12, 18), (12, -18), (-12, -18), (20, 27), (-20, 27), (20, -27), (-20, -27))
-OFFSETS += ((20, 36), (-20, 36), (20, -36), (-20, -36), (20, 45), (-20, 45))
+OFFSETS += ((20, 36), (-20, 36), (20, -36), (-20, -36), (20, 45), (-20, 45), (20, -45), (-20, -45), (30, 63), (30, -63))
 FAR = 16  # from a name that is further off, in points of type, a line leads to its point
 LETTER, LINE = 0.6, 1.14  # approximate width of a letter, and height of a line, in sizes of the type
 
@@ -111,8 +111,8 @@ def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: floa
             continue
         boxes = [_box(at, offset, len(name), size) for offset in OFFSETS]
         others = [box for box in taken if box is not this]
-        free = [_within(box, inside) and not any(map(box.overlaps, others)) for box in boxes]
-        place = free.index(True) if True in free else 0
+        hidden = [sum(map(box.overlaps, others)) + len(others) * (not _within(box, inside)) for box in boxes]
+        place = hidden.index(min(hidden))
         dx, dy = OFFSETS[place]
         how = {"ha": _align(dx), "va": "center", "fontsize": size, "textcoords": "offset points"}
         if math.hypot(dx, dy) > FAR:
