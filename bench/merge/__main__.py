@@ -20,7 +20,7 @@ from bench.records.folder import content_of, put_into, set_aside
 from bench.records.record import read_record
 from bench.report.write.html import write_index
 
-UNFINISHED = ("killed", "crashed")  # these rank below every other status, and ok above
+UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above
 
 
 @dataclass(frozen=True)

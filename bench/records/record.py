@@ -32,6 +32,7 @@ class RunStatus(StrEnum):
     CRASHED = "crashed"
     KILLED = "killed"
     UNSUPPORTED = "unsupported"
+    REFUSED = "refused"
 
 
 NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no record.json

@@ -21,7 +21,7 @@ from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
 from bench.run.process import Ended, Job, Notice, Started, Step
-from bench.setup.inputs import RunContext, set_up
+from bench.setup.inputs import RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
 from bench.tasks.task import TakesField, Task
 
@@ -71,13 +71,7 @@ def execute(
     log = _open_log(folder)
     contention = Contention()
     try:
-        check_top_level(config)
-        task = build(config.task, "task", list(config.packages))
-        if not isinstance(task, Task):
-            raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/task.py")
-        inputs = set_up(config, progress)
-        if not inputs.field.of_prior and not isinstance(task, TakesField):
-            raise ValueError(f"task={record.task} does not take field={config.field}: leave it out")
+        task, inputs = _built(config, record.task, progress)
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         checkpoint(record)
@@ -85,6 +79,9 @@ def execute(
             task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
+    except Refused as error:
+        record.status, record.reason = RunStatus.REFUSED, _one_line(error)
+        log.error(traceback.format_exc())
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
@@ -98,6 +95,29 @@ def execute(
         record.notes += contention.warnings(record)
         log.info("%s %s", record.status, record.reason)
         _close_log(log)
+
+
+class Refused(Exception):
+    """A configuration that cannot be run."""
+
+
+def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunInputs]:
+    """The task of that name and its inputs, before anything slow.
+
+    Raises:
+        Refused: for anything invalid in the configuration.
+    """
+    try:
+        check_top_level(config)
+        task = build(config.task, "task", list(config.packages))
+        if not isinstance(task, Task):
+            raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/task.py")
+        inputs = set_up(config, progress)
+        if not inputs.field.of_prior and not isinstance(task, TakesField):
+            raise ValueError(f"task={name} does not take field={config.field}: leave it out")
+    except (ValueError, OSError) as error:
+        raise Refused(_one_line(error)) from error
+    return task, inputs
 
 
 class _Progress:

@@ -1,5 +1,6 @@
 """Runs one configuration: claims its folder, runs it in a child process, and always writes its record."""
 
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -43,6 +44,7 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
 
     Raises:
         Interrupted: after Ctrl-C or SIGTERM.
+        ValueError: where a single run's configuration cannot be run; its folder is removed.
     """
     register()  # again, since a launcher's worker has not read the command line
     _stay_in_place(config)
@@ -58,6 +60,9 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
         return LOST
     if config.verbose:
         print("\n".join(record.log), file=sys.stderr, flush=True)
+    if single and record.status == RunStatus.REFUSED:
+        shutil.rmtree(folder)
+        raise ValueError(record.reason)
     if single:
         show(folder, record, write_index(folder.parent.parent))
     return record.status
@@ -117,7 +122,7 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
                 record.log = _last_lines(folder / "log.txt")
             release(folder)
             record.write(folder)
-    if tracker is not None and not isinstance(tracker, Nothing):
+    if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:
         raise Interrupted(folder, record)

@@ -155,15 +155,21 @@ def test_a_mask_loss_that_no_task_reads_is_told_before_any_run(bench, tmp_path, 
         ("dataset=mesh", ("dataset.path must be given: set dataset.path=",)),
     ],
 )
-def test_a_value_that_cannot_be_is_told_before_anything_slow(bench, no_prior, argument, words):
+def test_a_value_that_cannot_be_is_told_before_anything_slow(bench, tmp_path, no_prior, argument, words):
     code, out, err = bench(argument)
+    assert code == 2
+    assert_one_line(err, "error: ", *words)
+    assert out == ""
+    assert not list((tmp_path / "r" / "runs").iterdir())
+
+
+def test_in_a_sweep_a_value_that_cannot_be_is_a_record(bench, tmp_path):
+    code, *_ = bench("-m", *TINY, "task.optimiser.iterations=1", "renderer.steps=0,50")
     assert code == 1
-    assert_one_line(err, *words)
-    folder = Path(out.splitlines()[-1])
-    record = json.loads((folder / "record.json").read_text())
-    assert record["status"] == "crashed"
-    assert record["reason"] in err
-    assert folder.name in (folder.parent.parent / "index.html").read_text()
+    records = [json.loads(path.read_text()) for path in (tmp_path / "r" / "runs").glob("*/record.json")]
+    assert sorted(record["status"] for record in records)[1:] == ["refused"]
+    (refused,) = [record for record in records if record["status"] == "refused"]
+    assert refused["reason"].startswith("steps must be at least 1, not 0")
 
 
 def test_more_points_than_pixels_are_told(bench):
@@ -175,7 +181,7 @@ def test_more_points_than_pixels_are_told(bench):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_gpu_that_is_not_there_is_told(bench, no_prior):
     code, _, err = bench("device=cuda")
-    assert code == 1
+    assert code == 2
     assert_one_line(err, "device=cuda", "set device=cpu")
 
 
@@ -216,8 +222,9 @@ def test_a_mesh_that_cannot_be_used_is_told(bench, no_prior, tmp_path, make, wor
     (tmp_path / "my shapes").mkdir()
     path = make(tmp_path / "my shapes")
     code, _, err = bench("dataset=mesh", f"dataset.path={path}")
-    assert code == 1
     assert_one_line(err, *words)
+    assert code == (2 if err.startswith("error: ") else 1)  # a path is refused, a file is read by the run
+    assert len(list((tmp_path / "r" / "runs").iterdir())) == (0 if code == 2 else 1)
 
 
 def test_what_was_repaired_is_told_where_the_run_fails_later(bench, no_prior, tmp_path):
@@ -341,12 +348,12 @@ def test_help_is_there_before_anything_slow_is_loaded():
         assert word in done.out
 
 
-def test_a_real_process_ends_with_one_line_and_its_folder(tmp_path):
+def test_a_real_process_that_is_refused_ends_with_one_line_and_no_folder(tmp_path):
     with driver(tmp_path / "output", "view.resolution=-3", f"results_dir={tmp_path}") as running:
         done = running.ended()
-    assert done.code == 1
-    assert_one_line(done.err, "resolution must be at least 4, not -3")
-    assert (Path(done.out.splitlines()[-1]) / "record.json").is_file()
+    assert (done.code, done.out) == (2, "")
+    assert_one_line(done.err, "error: ", "resolution must be at least 4, not -3")
+    assert not list((tmp_path / "runs").iterdir())
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])

@@ -115,10 +115,10 @@ def test_what_had_not_quite_ended_is_not_reused(isolated, tmp_path):
 
 @pytest.mark.parametrize("damage", ["", "{", '{"schema": 99}', '{"schema": 1, "asked": null}', "[" * 100_000])
 def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path, damage):
-    isolated(*FAILING, "split=tst")  # fails at once
+    isolated(*FAILING, "+renderer.how=raise")
     (path,) = (tmp_path / "r").glob("runs/*/record.json")
     path.write_text(damage)
-    code, out, err = isolated(*FAILING, "split=tst")
+    code, out, err = isolated(*FAILING, "+renderer.how=raise")
     assert code == 1
     assert "Traceback" not in out + err
     assert json.loads(path.read_text())["status"] == "crashed"
