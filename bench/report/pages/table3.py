@@ -148,7 +148,7 @@ def draw(experiment: Experiment, oracle: dict[str, float]) -> Figure:
         if name in oracle:
             chart.reference(axis.axvline, oracle[name], 3, "oracle")
         style.log_axis(axis, "x", [value for record in records for value in (_start(record), _end(record))])
-        axis.set(title=name, xlabel="Chamfer, truth to prediction × 1000 (scene units²)")
+        axis.set(title=name, xlabel="Chamfer, truth to prediction\n× 1000 (scene units²)")
     axes[0].set_yticks(range(len(rows)), [row.name for row in rows])
     axes[0].invert_yaxis()
     style.legend_below(figure, *axes)
