@@ -79,7 +79,7 @@ def execute(
             task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
-    except Refused as error:
+    except Invalid as error:
         record.status, record.reason = RunStatus.REFUSED, _one_line(error)
         log.error(traceback.format_exc())
     except Unsupported as error:
@@ -97,7 +97,7 @@ def execute(
         _close_log(log)
 
 
-class Refused(Exception):
+class Invalid(Exception):
     """A configuration that cannot be run."""
 
 
@@ -105,7 +105,7 @@ def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunIn
     """The task of that name and its inputs, before anything slow.
 
     Raises:
-        Refused: for anything invalid in the configuration.
+        Invalid: for anything invalid in the configuration.
     """
     try:
         check_top_level(config)
@@ -116,7 +116,7 @@ def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunIn
         if not inputs.field.of_prior and not isinstance(task, TakesField):
             raise ValueError(f"task={name} does not take field={config.field}: leave it out")
     except (ValueError, OSError) as error:
-        raise Refused(_one_line(error)) from error
+        raise Invalid(_one_line(error)) from error
     return task, inputs
 
 
