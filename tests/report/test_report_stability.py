@@ -98,6 +98,7 @@ def test_a_prediction_outside_the_interval_is_told_with_its_difference(tmp_path)
         f"Predicted, wires: DIST 0.0700 (outside, 30 % below), measured {measured}; DVR 0.100, measured {measured}."
     )
     assert inside in notes
+    assert "3 of 4 predictions lie outside of the measured interval: 2 of 2 of gap, 1 of 2 of wires." in notes
     beyond = "Predicted, gap (theory does not hold for any row): DIST 0.200 (outside, 100 % above), measured"
     assert any(note.startswith(beyond) and "DVR 0.200 (outside), measured at once" in note for note in notes)
 

@@ -141,7 +141,7 @@ def draw(grid: Atlas) -> Figure:
 
 def _all_about(grid: Atlas) -> list[str]:
     """Notes on each row, on theory, and on moved surfaces."""
-    return [*(_worst(grid, row) for row in grid.rows), *_theory(grid), _moved(grid)]
+    return [*(_worst(grid, row) for row in grid.rows), _agreement(grid), *_theory(grid), _moved(grid)]
 
 
 def _worst(grid: Atlas, row: Row) -> str:
@@ -157,11 +157,25 @@ def _worst(grid: Atlas, row: Row) -> str:
     return f"{row.name}: worst on {'; '.join(axes) or 'no axis'}. Failed trials: {failed or 'none'}."
 
 
+def _predicted(grid: Atlas, axis: str) -> list[tuple[str, Cell, float]]:
+    """The rows of an axis with a theoretical prediction: name, breakdown, predicted severity."""
+    return [(row.name, cell, p) for row, cell in grid.on(axis) if cell.known and (p := cell.number("predicted"))]
+
+
+def _agreement(grid: Atlas) -> str:
+    """A note on how many predictions lie in the measured intervals, and on the axes where others do not; or none."""
+    pairs = [(title(axis), cell.covers(p)) for axis in grid.axes for _, cell, p in _predicted(grid, axis)]
+    of, outside = Counter(axis for axis, _ in pairs), Counter(axis for axis, inside in pairs if not inside)
+    where = ", ".join(f"{count} of {of[axis]} of {axis}" for axis, count in outside.most_common()) or "none"
+    told = f"{outside.total()} of {len(pairs)} predictions lie outside of the measured interval: {where}."
+    return told if pairs else ""
+
+
 def _theory(grid: Atlas) -> list[str]:
     """A note per axis with a theoretical prediction: the predicted and the measured breakdown of each row."""
     lines = []
     for axis in grid.axes:
-        known = [(row.name, cell, p) for row, cell in grid.on(axis) if cell.known and (p := cell.number("predicted"))]
+        known = _predicted(grid, axis)
         rows = [f"{name} {format.number(p)}{_beside(cell, p)}, measured {cell.full()}" for name, cell, p in known]
         beyond = " (theory does not hold for any row)" if not any(cell.covers(p) for _, cell, p in known) else ""
         if rows:
