@@ -14,9 +14,10 @@ from torch import Tensor
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Values
-from renderers.march import CAREFUL, Stepping, pyramid
+from renderers.march import Stepping, pyramid
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
+HOLDS = 2.0  # times the distance to the finer rays: with a smaller empty sphere, finer rays begin behind its boundary
 FORETOLD = 3.0  # times what alpha adds to a step: most that is added where the last two values foretell zero further on
 CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
 
@@ -245,7 +246,7 @@ def approach(
     for level in levels:
         coarse, parent = level.coarse[level.parent], level.parent
         apart = _apart(coarse, level.fine, reached.entry[parent], reached.leave[parent])
-        clear = CAREFUL * (float(apart.max()) if apart.numel() else 0.0) + error
+        clear = HOLDS * (float(apart.max()) if apart.numel() else 0.0) + error
         march(values, level.coarse, reached, replace(stepping, epsilon=max(clear, stepping.epsilon)), LEVEL_STEPS)
         reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
     march(values, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)

@@ -66,7 +66,7 @@ MUTANTS = (
     M("renderers/packed_march.py", "rises | left, torch.minimum(least, before)", "rises, torch.minimum(least, before)",
       TRACED),
     M("renderers/packed_march.py", "reach - apart - error", "reach - error", TRACED),
-    M("renderers/packed_march.py", "clear = CAREFUL * (", "clear = 0.5 * (", TRACED),
+    M("renderers/packed_march.py", "clear = HOLDS * (", "clear = 0.5 * (", TRACED),
     M("renderers/packed_march.py", "> self.leave) & finite", "> self.leave)", TRACED),
     M("renderers/packed_march.py", "(value / slope).nan_to_num(0.0, torch.inf, -torch.inf)", "value / slope", TRACED),
     M("renderers/packed_march.py", "keeps & (start >= child.leave)", "inherits & (start >= child.leave)", TRACED),

@@ -90,8 +90,7 @@ def panels(axes: np.ndarray, candidates: Candidates) -> None:
         name_chosen(axis, candidates, key)
         axis.set_xlabel(AXES[key])
     axes[0].set_ylabel("held-out error (scene units)")
-    handles, labels = axes[-1].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    style.legend_below(axes[0].figure, axes[-1])
 
 
 def panel(axis: Axes, candidates: Candidates, key: str) -> None:

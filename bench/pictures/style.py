@@ -178,9 +178,13 @@ def labelled(*axes: Axes) -> dict[str, Any]:
 
 def legend_below(figure: Figure | SubFigure, *axes: Axes, columns: int = 4) -> None:
     """Draws one legend of some axes below them, in so many columns, or in fewer where it is wider than the figure."""
-    named = labelled(*axes)
+    legend_of(figure, labelled(*axes), columns=columns)
+
+
+def legend_of(figure: Figure | SubFigure, named: dict[str, Any], *, columns: int = 4, side: str = "center") -> None:
+    """As `legend_below`, of handles by name, at the `side` "left", "center" or "right"."""
     for ncols in range(columns, 0, -1):
-        legend = figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=ncols)
+        legend = figure.legend(named.values(), named.keys(), loc=f"outside lower {side}", ncols=ncols)
         if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
             break
         legend.remove()

@@ -175,11 +175,11 @@ def draw(runs: list[SceneRun], key: str) -> Figure:
     named = style.labelled(*axes)
     kinds = [label for label, _, _ in KINDS.values()]
     labels = sorted(named, key=lambda label: kinds.index(label) if label in kinds else len(kinds))
-    handles = [named[label] for label in labels]
+    named = {label: named[label] for label in labels}
     if left_over:
-        axes[-1].legend(handles, labels, loc="center")
+        axes[-1].legend(named.values(), named.keys(), loc="center")
     else:
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        style.legend_of(figure, named)
     return figure
 
 

@@ -103,7 +103,7 @@ def draw(runs: list[SceneRun]) -> Figure:
     left.set_yticks(range(len(runs)), [run.name for run in runs])
     for axis, side, columns in ((left, "left", 2), (right, "right", 1)):
         named = dict(sorted(style.labelled(axis).items()))
-        figure.legend(named.values(), named.keys(), loc=f"outside lower {side}", ncols=columns)
+        style.legend_of(figure, named, columns=columns, side=side)
     return figure
 
 

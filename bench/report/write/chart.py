@@ -13,8 +13,7 @@ from matplotlib.transforms import Bbox
 from bench.pictures import style
 from bench.report.data.statistics import Interval
 
-# Places of a name relative to its point: offsets in points, and the alignment.
-# Where a name may stand, from its point, in points of type: the first that is free.
+# Where a name may stand, from its point, in points of type: the first of those where it hides the least.
 OFFSETS = ((0, 9), (0, -9), (6, 0), (-6, 0), (3, 9), (-3, 9), (3, -9), (-3, -9), (0, 18), (0, -18), (0, 27))
 OFFSETS += ((12, 18), (-12, 18), (12, -18), (-12, -18), (20, 27), (-20, 27), (20, -27), (-20, -27))
 OFFSETS += ((20, 36), (-20, 36), (20, -36), (-20, -36), (20, 45), (-20, 45), (20, -45), (-20, -45), (30, 63), (30, -63))
@@ -91,9 +90,9 @@ def reference(draw: Callable[..., Any], value: float, times: float, label: str) 
 
 
 def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: float = 7) -> None:
-    """Writes a name next to each point, on the first side where it covers no point, name or edge of the axes.
+    """Writes a name next to each point, on the first side where it covers the fewest points and names.
 
-    Above it, where there is no such side.
+    A side that is not wholly within the axes counts as if it covered all of them.
 
     Args:
         axes: axes with their final limits.
