@@ -17,24 +17,24 @@ from renderers.warm import Memory, warm_trace
 
 @dataclass(frozen=True)
 class Newton(Tracer):
-    """Coarse-to-fine marching to a loose threshold, one dense search for the rays that are left, and a Newton step.
+    """Coarse-to-fine marching until the sign changes, a dense search for the rays that are left, and a Newton step.
 
     The implicit gradient asks for the value and the slope at every hit. They also give the distance to second order, so
-    that the march may stop at a threshold that is larger by a factor of 20 than DIST's.
+    that the march may step behind the surface.
 
     Source: ours. The march follows DIST, Sec. 3.2; the search DVR, Sec. 3.3; the gradient DVR, Eqs. 8 and 11.
     Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step: off by
-        that step times the surface's curvature; the step is at most 6 `march_epsilon` times the cosine of incidence.
+        that step times the surface's curvature; the step is at most `tracer.LONGEST` times the cosine of incidence.
         What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
         fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
         points by automatic differentiation, also where no gradient is wanted.
-    Deviates from the paper: there is none. What may be missed: parts thinner along a ray than `extra_step_cap`; on the
-        rays of the dense search, what is thinner than the spacing of its samples, unless it is next to the least one;
-        in an image, what rays meet at the rim of the sphere in front of where their coarse ray enters it. A ray that
-        passes an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. Where the
-        field offers coarse values, a step may be longer by their error, and a miss's `closest` is off by it: rays that
-        came within that error of the surface are marched again, on the field itself.
+    Deviates from the paper: there is none. What may be missed: what is at most 1.5 `unseen` long on a ray, of a field
+        that is a distance; on the rays of the dense search, what is thinner than the spacing of its samples, unless it
+        is next to the least one; in an image, what rays meet at the rim of the sphere in front of where their coarse
+        ray enters it. A ray that passes an edge closer than `march_epsilon` may hit it. `residual` is the value before
+        the last step. Where the field offers coarse values, twice their error more of a ray may be unseen, and a miss's
+        `closest` is off by the error: rays that came within it of the surface are marched again, on the field itself.
 
     Args:
         coarse: see `tracer.Tracer` and `field.Coarse`.

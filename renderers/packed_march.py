@@ -14,11 +14,13 @@ from torch import Tensor
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Values
-from renderers.march import Stepping, pyramid
+from renderers.march import pyramid
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
 HOLDS = 2.0  # times the distance to the finer rays: with a smaller empty sphere, finer rays begin behind its boundary
-FORETOLD = 3.0  # times what alpha adds to a step: most that is added where the last two values foretell zero further on
+OVERLAP = 1.4  # times the value: what a step may leave between two spheres, beside surfaces that hide small parts
+FURTHER = 0.03  # scene units: most by which a step is longer than the value; the warm start's margin grows with it
+TOLERATED = 1.5  # times `unseen`: what a step may leave, since slopes change on the way
 CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
 
 
@@ -31,6 +33,32 @@ class Stop(IntEnum):
     LEFT = 3  # at the end of the sphere, or the ray does not meet it
     INSIDE = 4  # the field is negative where the ray begins
     NOT_FINITE = 5  # the value is NaN or infinite
+
+
+@dataclass(frozen=True)
+class Stride:
+    """How far a ray moves on a value of the field.
+
+    The sphere about a sample whose radius is the value is empty. A step is so long that the spheres about its two ends
+    are `unseen` apart if the field goes on to fall as between the last two samples: (2 value + unseen) / (1 + slope).
+    Close to a surface they are less apart, in proportion to the value, since what is small casts small values. Where
+    they turn out to be further apart than `unseen`, the ray goes back to the boundary of the first.
+
+    Source: ours, after Balint and Valasek 2018, "Accelerating sphere tracing", and Keinert et al. 2014, "Enhanced
+    sphere tracing", Sec. 3.1, whose spheres touch.
+
+    Args:
+        epsilon: a ray has come near where the field's magnitude is at most this, in scene units.
+        unseen: of a ray, between the spheres of two samples, in scene units; less beside values below it.
+    """
+
+    epsilon: float
+    unseen: float
+
+    def length(self, value: Float[Tensor, " n"], slope: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The signed step for values; the slope is that by which they fell per distance, 1 where it is not known."""
+        further = (2 * value + (OVERLAP * value).clamp_max(self.unseen)) / (1 + slope.clamp(0, 1))
+        return torch.where(value > 0, torch.minimum(further, value + FURTHER), value)
 
 
 @dataclass
@@ -154,31 +182,35 @@ class Reached:
         self.table[:, self.LEAST_DISTANCE] = torch.where(closer, distance, self.least_distance)
         self.table[:, self.LEAST] = torch.where(closer, value, self.least)
 
-    def advance(self, value: Float[Tensor, " n"], stepping: Stepping) -> Bool[Tensor, " n"]:
+    def advance(self, value: Float[Tensor, " n"], stride: Stride) -> Bool[Tensor, " n"]:
         """Moves all rays by the field's values where they are; which of them go on.
 
         A ray that continues from its coarse ray may begin behind the surface: it goes back until the field is positive,
         to where it begins at the most.
         """
-        at, epsilon = self.distance.clone(), stepping.epsilon
-        rises = value > self.free_value
+        at, epsilon = self.distance.clone(), stride.epsilon
+        went, safe = at - self.free, self.free_value
+        too_far = (value > epsilon) & (went - safe - value > TOLERATED * stride.unseen)
+        rises = (value > safe) & ~too_far
         before = torch.where(rises, self.free_value, value)
         closest = torch.minimum(self.passed, before)
         self.keep_least(at, value)
         behind, own, begins = value < -epsilon, self.free_value.isfinite(), at <= self.entry
         finite = value.isfinite()
-        left = (value > epsilon) & (at + value > self.leave) & finite
+        left = (value > epsilon) & (at + value > self.leave) & finite & ~too_far
         back = behind & ~own & ~begins
         goes_on = back | ((value > epsilon) & ~left)
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
-        moved = torch.minimum(torch.maximum(at + self._length(value, stepping), self.entry), self.leave)
+        slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
+        moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
+        moved = torch.minimum(torch.maximum(moved, self.entry), self.leave)
         self.table[:, self.STOP] = torch.where(finite, stop, Stop.NOT_FINITE).to(value.dtype)
         self.table[:, self.VALUE] = torch.where(finite, value, 0.0)
         self.table[:, self.DISTANCE] = torch.where(goes_on & finite, moved, torch.where(left, at + value, at))
         cleared = torch.where(left & (value <= CLEAR), self.leave, at)
         self.table[:, self.CLEARED] = torch.where(before <= CLEAR, cleared, self.cleared)
-        positive = (value > epsilon) & finite
+        positive = (value > epsilon) & finite & ~too_far
         self.table[:, self.FREE] = torch.where(positive, at, self.free)
         self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
         self.table[:, self.ANCHOR] = torch.where(closest > CLEAR, at, self.anchor)
@@ -186,16 +218,6 @@ class Reached:
             least = self.table[:, column]
             self.table[:, column] = torch.where(rises | left, torch.minimum(least, before), least)
         return goes_on & finite
-
-    def _length(self, value: Float[Tensor, " n"], stepping: Stepping) -> Float[Tensor, " n"]:
-        """The step for the field's values where all rays are.
-
-        Where a ray descends slowly, it is as long as the slope between its last two values foretells, in bounds.
-        """
-        slope = (self.free_value - value) / (self.distance - self.free)
-        most = replace(stepping, alpha=1 + FORETOLD * (stepping.alpha - 1)).length(value)
-        foretold = (value / slope).nan_to_num(0.0, torch.inf, -torch.inf)  # a step too short for the dtype has no slope
-        return torch.maximum(stepping.length(value), torch.minimum(foretold, most))
 
     def split(
         self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], rays: Rays, *, radius: float, error: float
@@ -227,16 +249,14 @@ class Reached:
         return child
 
 
-def approach(
-    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, error: float = 0.0
-) -> Reached:
+def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: float, error: float = 0.0) -> Reached:
     """Marches all rays; those of an image coarse to fine (DIST, Sec. 3.2).
 
     A coarse ray stops before its empty sphere is too small to hold the finer rays next to it.
 
     Args:
         rays: of any leading shape; the answer has them in one row.
-        stepping: its epsilon, alpha, extra_step_cap and step_clamp.
+        stride: of rays that are not coarse ones; these come near earlier.
         steps: most steps per ray, beside those of its coarse rays.
         radius: of the sphere about the origin that holds the shape.
         error: most that one of the values is off.
@@ -247,20 +267,20 @@ def approach(
         coarse, parent = level.coarse[level.parent], level.parent
         apart = _apart(coarse, level.fine, reached.entry[parent], reached.leave[parent])
         clear = HOLDS * (float(apart.max()) if apart.numel() else 0.0) + error
-        march(values, level.coarse, reached, replace(stepping, epsilon=max(clear, stepping.epsilon)), LEVEL_STEPS)
+        march(values, level.coarse, reached, replace(stride, epsilon=max(clear, stride.epsilon)), LEVEL_STEPS)
         reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
-    march(values, levels[-1].fine if levels else rays.flat(), reached, stepping, steps)
+    march(values, levels[-1].fine if levels else rays.flat(), reached, stride, steps)
     return reached
 
 
-def march(values: Values, rays: Rays, reached: Reached, stepping: Stepping, steps: int) -> None:
+def march(values: Values, rays: Rays, reached: Reached, stride: Stride, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
     origins, directions, moving = rays.origins[index], rays.directions[index], reached.some(index)
     for _ in range(steps):
         if index.numel() == 0:
             return
-        goes_on = moving.advance(values(origins + moving.distance[:, None] * directions), stepping)
+        goes_on = moving.advance(values(origins + moving.distance[:, None] * directions), stride)
         stopped, going = (~goes_on).nonzero().squeeze(-1), goes_on.nonzero().squeeze(-1)
         reached.table[index[stopped]] = moving.table[stopped]
         index, origins, directions, moving = index[going], origins[going], directions[going], moving.some(going)

@@ -1,4 +1,4 @@
-"""What finds the surface along rays for `newton.Newton`: a loose march, Newton steps, and a search for what is left."""
+"""What finds the surface along rays for `newton.Newton`: a march across it, Newton steps, a search for the rest."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -11,27 +11,26 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Coarse, Field, carries_gradient, coarse_of
 from renderers.gradients import crossing
-from renderers.march import Stepping
-from renderers.packed_march import Reached, Stop, approach, march
+from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
-# Times march_epsilon and the slope along the ray: after a longer Newton step the field is asked again, since a step is
-# off by its square over the slope, times half the field's curvature.
-LONGEST = 6.0
+# Scene units, times the slope along the ray: after a longer Newton step the field is asked again, since a step is off
+# by its square over the slope, times half the field's curvature.
+LONGEST = 0.006
 PATIENT = 2  # times `steps`, where the field offers coarse values: first on these, then on the field for rays in doubt
-SETTLED = 0.1  # times march_epsilon: a value so little behind the surface is a hit, whatever its slope
+NO_NEARER = 0.25  # times the error of coarse values: to how small ones rays are marched
 
 
 @dataclass(frozen=True)
 class Tracer:
-    """Marches coarse to fine to a loose threshold, solves for the crossings by Newton steps, searches for the rest.
+    """Marches coarse to fine until the sign changes, solves for the crossings by Newton steps, searches for the rest.
 
     Args:
         steps: most marching steps per ray, beside those of its coarse rays; rays that are left are searched densely.
             See `PATIENT`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
-            the rest.
-        alpha, extra_step_cap: see `march.Stepping`.
+            the rest. A value so little behind the surface is a hit, whatever its slope.
+        unseen: see `packed_march.Stride`.
         newton_steps: most evaluations of value and slope per root; a second one only where the first step is long.
         search_samples: of the dense search, from a ray's last value above the threshold to where it leaves the sphere,
             and as many again about the least of these.
@@ -43,8 +42,7 @@ class Tracer:
 
     steps: int
     march_epsilon: float
-    alpha: float
-    extra_step_cap: float
+    unseen: float
     newton_steps: int
     search_samples: int
     search_steps: int
@@ -54,19 +52,17 @@ class Tracer:
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "20 leave one ray in 300 to the search")
-        check_positive("march_epsilon", self.march_epsilon, "1e-3 is a twentieth of a pixel at 64 x 64")
-        check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, 1.7 is aggressive marching")
-        check_positive("extra_step_cap", self.extra_step_cap, "0.01 keeps parts of that thickness")
+        check_positive("march_epsilon", self.march_epsilon, "1e-4 is a two-hundredth of a pixel at 64 x 64")
+        check_at_least("unseen", self.unseen, 0, "0.005 finds plates of half that thickness")
         check_at_least("newton_steps", self.newton_steps, 1, "3 are enough")
         check_at_least("search_samples", self.search_samples, 2, "32 find what a pixel shows")
         check_at_least("search_steps", self.search_steps, 0, "4 are enough")
         check_positive("least_slope", self.least_slope, "0.03 keeps grazing rays from throwing a fit off")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
-    @property
-    def stepping(self) -> Stepping:
-        """How the march steps."""
-        return Stepping(self.march_epsilon, self.alpha, self.extra_step_cap, None, active_only=True, careful_split=True)
+    def stride(self, error: float = 0.0) -> Stride:
+        """How the march steps on values that are off by at most `error`."""
+        return Stride(max(self.march_epsilon, NO_NEARER * error), self.unseen)
 
     def trace(self, field: Field, rays: Rays) -> tuple[Reached, "Solved"]:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
@@ -74,14 +70,15 @@ class Tracer:
             coarse = self._coarse(field)
             values, error = (coarse.values, coarse.error) if coarse else (field, 0.0)
             steps = PATIENT * self.steps if coarse else self.steps
-            reached = approach(values, rays, self.stepping, steps=steps, radius=self.sphere_radius, error=error)
+            reached = approach(values, rays, self.stride(error), steps=steps, radius=self.sphere_radius, error=error)
         return reached, self._crossings(field, rays.flat(), reached, coarse)
 
     def resume(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
         """Marches flat rays on from where they are, in place, and gives their crossings, which carry the gradient."""
         with torch.no_grad():
             coarse = self._coarse(field)
-            march(coarse.values if coarse else field, rays, reached, self.stepping, self.steps)
+            values, error = (coarse.values, coarse.error) if coarse else (field, 0.0)
+            march(values, rays, reached, self.stride(error), self.steps)
         return self._crossings(field, rays, reached, coarse)
 
     def _coarse(self, field: Field) -> Coarse | None:
@@ -104,7 +101,7 @@ class Tracer:
             certain = reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & (reached.grazed > error)
             index = (~certain).nonzero().squeeze(-1)
             again = reached.some(index).begun_again(rays[index], ~certain[index], radius=self.sphere_radius)
-            march(field, rays[index], again, self.stepping, PATIENT * self.steps)
+            march(field, rays[index], again, self.stride(), PATIENT * self.steps)
         second = self.crossings(field, rays[index], again).among(index)
         reached.put_back(index, again)
         reached.table[:, Reached.PASSED] -= error
@@ -150,21 +147,21 @@ class Tracer:
         ray's beginning where the step leads behind that.
 
         Args:
-            furthest: longest step, in scene units; None for `extra_step_cap`, by which the march may go too far.
+            furthest: longest step, in scene units; None for `unseen`, by which the march may go too far.
         """
         towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
         nothing = torch.zeros_like(guess)
         solved = Solved(index, guess, nothing, nothing, nothing, nothing, torch.zeros_like(index).bool())
-        asked, longest = torch.arange(len(index), device=index.device), LONGEST * self.march_epsilon
-        furthest = max(longest, self.extra_step_cap if furthest is None else furthest)
+        asked = torch.arange(len(index), device=index.device)
+        furthest = max(LONGEST, self.unseen if furthest is None else furthest)
         for _ in range(self.newton_steps):
             ray, at = index[asked], solved.distance.detach()[asked]
             found = crossing(field, rays[ray], at, towards_field=towards_field)
             slope = found.slope.clamp_max(-self.least_slope)
             step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)
-            short = enters & (found.value.abs() <= longest * found.slope.square()) & (at + step <= reached.leave[ray])
-            small = (found.value <= 0) & (found.value >= -SETTLED * self.march_epsilon)
+            short = enters & (found.value.abs() <= LONGEST * found.slope.square()) & (at + step <= reached.leave[ray])
+            small = (found.value <= 0) & (found.value >= -self.march_epsilon)
             step = torch.where(enters | small, step.clamp(-furthest, furthest), 0.0)
             step = torch.maximum(step, reached.entry[ray] - at)
             distance = at + step - found.change / slope

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.packed_march import CLEAR, Reached
+from renderers.packed_march import CLEAR, FURTHER, Reached
 from renderers.rendering import Rendering
 from renderers.tracer import Solved, Tracer
 
@@ -34,7 +34,7 @@ GOLDEN = 0.618034  # of the way along a ray from one of these places to the next
 AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
 SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
 WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
-APART = 10.0  # times march_epsilon: crossings further apart differ
+APART = 0.01  # scene units: crossings further apart differ
 
 
 @dataclass
@@ -78,10 +78,10 @@ class Image:
     def free(self, tracer: Tracer, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
         """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
 
-        Between two samples a march that may go too far by `extra_step_cap` has seen half the smaller value, less half
-        of that cap. A hit is not compared with what it passed on its last descent, which its Newton step sees.
+        Between two samples a step that is longer than the value by `FURTHER` has seen half the smaller value, less half
+        of that. A hit is not compared with what it passed on its last descent, which its Newton step sees.
         """
-        margin = 2 * (moved - self.marched) + tracer.extra_step_cap
+        margin = 2 * (moved - self.marched) + FURTHER
         passed, up_to_anchor = self.reached.passed, margin < CLEAR
         passed = torch.where(self.hit, passed, torch.minimum(passed, self.reached.least))
         return (margin < passed) & (up_to_anchor | ~self.hit), up_to_anchor
@@ -217,7 +217,7 @@ def _differing(tracer: Tracer, kept: Solved, found: Solved, audited: Bool[Tensor
         return nowhere.index_put((solved.index,), solved.distance.detach())[audited]
 
     said, seen = met(kept), met(found)
-    alike = (said == seen) | ((said - seen).abs() <= APART * tracer.march_epsilon)
+    alike = (said == seen) | ((said - seen).abs() <= APART)
     return int((~alike).sum())
 
 

@@ -55,9 +55,11 @@ def needs(*settings: str) -> Callable[[Theory], Theory]:
 
 @needs()
 def thin_plate(renderer: Any, resolution: int, criteria: Criteria) -> list[Prediction]:
-    """The overshoot of the first long step; or DVR's sample spacing (Eq. 9) on the longest ray."""
+    """The overshoot of the first long step, or of Newton's last; or DVR's sample spacing (Eq. 9) on the longest ray."""
     if hasattr(renderer, "n_ray_samples"):
         return [Prediction(2 * FRONT / (renderer.n_ray_samples - 1), "spacing 2 / (n - 1) of DVR's samples (Eq. 9)")]
+    if hasattr(renderer, "unseen"):
+        return [Prediction(renderer.unseen / 2, "overshoot of Newton's last step at normal incidence, unseen / 2")]
     bounded = getattr(renderer, "slope_samples", 0)
     extra = getattr(renderer, "alpha", 1.0) / (STEEPEST_MARGIN if bounded else 1.0) - 1
     reach = min(FRONT, getattr(renderer, "step_clamp", None) or FRONT)
@@ -159,6 +161,8 @@ def _alpha(renderer: Any) -> float:
     """
     if getattr(renderer, "slope_samples", 0) or getattr(renderer, "least_step", 0) or getattr(renderer, "step_back", 0):
         raise ValueError("a guarded march has other steps")
+    if hasattr(renderer, "unseen"):
+        raise ValueError("steps follow slopes")
     return getattr(renderer, "alpha", 1.0)
 
 

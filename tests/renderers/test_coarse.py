@@ -119,6 +119,12 @@ def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind):
     assert (on_ball ^ inside).sum() <= 0.02 * inside.sum()
 
 
+def test_rays_are_not_marched_to_where_coarse_values_say_nothing():
+    assert NEWTON.stride().epsilon == NEWTON.march_epsilon
+    assert NEWTON.stride(ERROR).epsilon == pytest.approx(ERROR / 4)
+    assert NEWTON.stride(1e-6).epsilon == NEWTON.march_epsilon
+
+
 def test_coarse_values_can_be_switched_off():
     meter = Meter(Offering(box((0.5, 0.4, 0.3)), ERRORS["rippled"]))
     with torch.no_grad():
