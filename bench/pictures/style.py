@@ -22,6 +22,8 @@ RC = {
     "legend.fontsize": 7,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
+    "xtick.minor.pad": 5.0,  # in line with labels of major ticks, whose marks are longer
+    "ytick.minor.pad": 5.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
