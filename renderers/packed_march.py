@@ -191,7 +191,7 @@ class Reached:
         at, epsilon = self.distance.clone(), stride.epsilon
         went, safe = at - self.free, self.free_value
         too_far = (value > epsilon) & (went - safe - value > TOLERATED * stride.unseen)
-        rises = (value > safe) & ~too_far
+        rises = value > safe
         before = torch.where(rises, self.free_value, value)
         closest = torch.minimum(self.passed, before)
         self.keep_least(at, value)

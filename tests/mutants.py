@@ -81,7 +81,6 @@ MUTANTS = (
       TRACED),
     M("renderers/packed_march.py", "> TOLERATED * stride.unseen", "> torch.inf", TRACED),
     M("renderers/packed_march.py", "torch.where(too_far, self.free + safe,", "torch.where(too_far, at,", TRACED),
-    M("renderers/packed_march.py", "rises = (value > safe) & ~too_far", "rises = value > safe", TRACED),
     M("renderers/packed_march.py", "(value > epsilon) & finite & ~too_far", "(value > epsilon) & finite", TRACED),
     M("renderers/packed_march.py", "self.leave) & finite & ~too_far", "self.leave) & finite", TRACED),
     M("renderers/packed_march.py", "further, value + FURTHER", "further, value + 1", TRACED),

@@ -311,6 +311,27 @@ def marched(*values: float) -> Reached:
     return reached
 
 
+def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unseen_before():
+    assert marched(0.4, 0.58).stopped(Stop.ON_THE_WAY).item()  # at 0.4025: its step would lead behind the end
+    assert marched(0.4, 0.6).stopped(Stop.LEFT).item()
+    taken_back = marched(0.4, 0.58, 0.005)
+    assert taken_back.stopped(Stop.ON_THE_WAY).item()
+    assert taken_back.distance.item() == pytest.approx(0.4025 + 0.58)
+
+
+def test_a_ray_that_begins_a_little_inside_began_inside():
+    assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()
+
+
+def test_a_step_of_no_length_has_no_slope():
+    at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
+    at.advance(torch.tensor([0.4]).double(), NEWTON.stride())
+    first = at.distance.item()
+    at.table[:, Reached.DISTANCE] = at.free
+    at.advance(torch.tensor([0.4]).double(), NEWTON.stride())
+    assert at.distance.item() == first
+
+
 def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
     parent, apart, fine = torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0))
     for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-5), 0.4025), ((0.4, 0.2), 0.6325)]:
