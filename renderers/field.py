@@ -52,7 +52,7 @@ Values = Callable[[Tensor], Tensor]  # points [*batch, 3] to values [*batch]: a 
 
 @dataclass(frozen=True)
 class Coarse:
-    """Cheaper values of a field, for where they decide nothing.
+    """Cheaper values of a field, to march on; what they leave in doubt is decided by the field itself.
 
     Args:
         values: without a gradient.

@@ -1,4 +1,4 @@
-"""Newton: a march that stops short of the surface, and a Newton step on the value and slope that its gradient needs."""
+"""Newton: a march across the surface, and a Newton step on the value and slope that its gradient needs."""
 
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -24,7 +24,8 @@ class Newton(Tracer):
 
     Source: ours. The march follows DIST, Sec. 3.2; the search DVR, Sec. 3.3; the gradient DVR, Eqs. 8 and 11.
     Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step: off by
-        that step times the surface's curvature; the step is at most `tracer.LONGEST` times the cosine of incidence.
+        that step times the surface's curvature; the step is at most `tracer.LONGEST` times the cosine of incidence, but
+        for hits on surfaces flatter than `least_slope` along the ray.
         What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
         fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
@@ -73,7 +74,7 @@ class Newton(Tracer):
         return self.assembled(rays, *self.trace(field, rays))
 
     def fresh(self) -> "Newton":
-        """For another optimisation: no ray is remembered."""
+        """The same renderer with an empty memory, for another optimisation."""
         return replace(self, memory=Memory())
 
     def final_notes(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""A march that stops short of the surface: where the field's magnitude is small, or its sign changes.
+"""A march that stops at the surface, or right behind it: where the field's magnitude is small, or its sign changes.
 
 The rays that go on are rows of one table, so that a step costs few operations. Everything here runs without a graph;
 `newton.py` finds the surface from where the rays stopped.
@@ -18,7 +18,7 @@ from renderers.march import pyramid
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
 HOLDS = 2.0  # times the distance to the finer rays: with a smaller empty sphere, finer rays begin behind its boundary
-OVERLAP = 1.4  # times the value: what a step may leave between two spheres, beside surfaces that hide small parts
+GAP = 1.4  # times the value: what a step may leave between two spheres; beside surfaces, where parts are small
 FURTHER = 0.03  # scene units: most by which a step is longer than the value; the warm start's margin grows with it
 TOLERATED = 1.5  # times `unseen`: what a step may leave, since slopes change on the way
 CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
@@ -42,14 +42,16 @@ class Stride:
     The sphere about a sample whose radius is the value is empty. A step is so long that the spheres about its two ends
     are `unseen` apart if the field goes on to fall as between the last two samples: (2 value + unseen) / (1 + slope).
     Close to a surface they are less apart, in proportion to the value, since what is small casts small values. Where
-    they turn out to be further apart than `unseen`, the ray goes back to the boundary of the first.
+    they turn out to be further apart than `TOLERATED` times `unseen`, the ray goes back to the boundary of the first,
+    also from behind a surface: another one may lie between.
 
     Source: ours, after Balint and Valasek 2018, "Accelerating sphere tracing", and Keinert et al. 2014, "Enhanced
     sphere tracing", Sec. 3.1, whose spheres touch.
 
     Args:
         epsilon: a ray has come near where the field's magnitude is at most this, in scene units.
-        unseen: of a ray, between the spheres of two samples, in scene units; less beside values below it.
+        unseen: longest part of a ray that a step should leave between the spheres about its ends, in scene units; at
+            most `GAP` times the value. From `FURTHER` / `TOLERATED` on no step is taken back.
     """
 
     epsilon: float
@@ -57,8 +59,21 @@ class Stride:
 
     def length(self, value: Float[Tensor, " n"], slope: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """The signed step for values; the slope is that by which they fell per distance, 1 where it is not known."""
-        further = (2 * value + (OVERLAP * value).clamp_max(self.unseen)) / (1 + slope.clamp(0, 1))
-        return torch.where(value > 0, torch.minimum(further, value + FURTHER), value)
+        step = (2 * value + (GAP * value).clamp_max(self.unseen)) / (1 + slope.clamp(0, 1))
+        return torch.where(value > 0, torch.minimum(step, value + FURTHER), value)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of `Reached.table`, to read and to write."""
+
+    place: int
+
+    def __get__(self, reached: "Reached", owner: type) -> Float[Tensor, " n"]:
+        return reached.table[:, self.place]
+
+    def __set__(self, reached: "Reached", values: Tensor) -> None:
+        reached.table[:, self.place] = values
 
 
 @dataclass
@@ -66,89 +81,39 @@ class Reached:
     """Where n rays are, and what is known of them: one row each, so that rays are chosen in one operation.
 
     Args:
-        table: the columns that the properties below name.
+        table: the columns below.
     """
 
     table: Float[Tensor, "n 13"]
 
-    DISTANCE, VALUE, LEAST_DISTANCE, LEAST, FREE, FREE_VALUE, ENTRY, LEAVE, STOP = range(9)
-    PASSED, ANCHOR, CLEARED, GRAZED = range(9, 13)
+    distance = Column(0)  # along each ray to where it stopped, or is evaluated next; beyond its end where it has LEFT
+    value = Column(1)  # the last value of the field on each ray
+    least_distance = Column(2)  # to the sample of least magnitude, which may have been evaluated on the coarse ray
+    least = Column(3)  # the value of that sample, with its sign; infinite before the first
+    free = Column(4)  # to the ray's own last value above the threshold; to where it begins before the first
+    free_value = Column(5)  # that value; infinite before the first
+    entry = Column(6)  # to where each ray begins
+    leave = Column(7)  # to where it leaves the sphere
+    stop = Column(8)  # a Stop
+    # The least value from which each ray rose again, or its coarse ray, less how far apart these are: what the field is
+    # at least on the way to where the ray stopped, but for the descent there.
+    passed = Column(9)
+    anchor = Column(10)  # to the last sample before `passed` fell to `CLEAR`; to where the ray begins if there is none
+    cleared = Column(11)  # of a ray that has LEFT: to where its samples are above `CLEAR` from then on, or to its end
+    grazed = Column(12)  # as `passed`, of the ray's own values alone; infinite before the first
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "Reached":
         """Every ray where it enters the sphere of `radius` about the origin, or at its origin if that lies inside."""
         entry, leave, meets = sphere_span(rays, radius)
-        none = torch.full_like(entry, torch.inf)
-        stop = torch.where(meets, float(Stop.ON_THE_WAY), float(Stop.LEFT)).to(entry.dtype)
-        columns = (entry, torch.zeros_like(entry), entry, none, entry, none, entry, leave, stop)
-        return Reached(torch.stack([*columns, none, entry, entry, none], dim=1))
-
-    @property
-    def distance(self) -> Float[Tensor, " n"]:
-        """Along each ray to where it stopped, or is to be evaluated next; beyond its end where it has LEFT."""
-        return self.table[:, self.DISTANCE]
-
-    @property
-    def value(self) -> Float[Tensor, " n"]:
-        """The last value of the field on each ray."""
-        return self.table[:, self.VALUE]
-
-    @property
-    def least_distance(self) -> Float[Tensor, " n"]:
-        """Along each ray to its sample of least magnitude, which may have been evaluated on its coarse ray."""
-        return self.table[:, self.LEAST_DISTANCE]
-
-    @property
-    def least(self) -> Float[Tensor, " n"]:
-        """The value of that sample, with its sign; infinite before the first."""
-        return self.table[:, self.LEAST]
-
-    @property
-    def free(self) -> Float[Tensor, " n"]:
-        """Along each ray to its own last value above the threshold; to where it begins before the first."""
-        return self.table[:, self.FREE]
-
-    @property
-    def free_value(self) -> Float[Tensor, " n"]:
-        """That value; infinite before the first."""
-        return self.table[:, self.FREE_VALUE]
-
-    @property
-    def entry(self) -> Float[Tensor, " n"]:
-        """Along each ray to where it begins."""
-        return self.table[:, self.ENTRY]
-
-    @property
-    def leave(self) -> Float[Tensor, " n"]:
-        """Along each ray to where it leaves the sphere."""
-        return self.table[:, self.LEAVE]
-
-    @property
-    def passed(self) -> Float[Tensor, " n"]:
-        """The least value from which each ray rose again, or its coarse ray, less how far apart these are.
-
-        That is what the field is at least on the way to where the ray stopped, but for the descent there.
-        """
-        return self.table[:, self.PASSED]
-
-    @property
-    def anchor(self) -> Float[Tensor, " n"]:
-        """Along each ray to its last sample before `passed` fell to `CLEAR`; to where it begins if there is none."""
-        return self.table[:, self.ANCHOR]
-
-    @property
-    def cleared(self) -> Float[Tensor, " n"]:
-        """Along each ray that has LEFT, to where its samples are above `CLEAR` from then on; its end at the most."""
-        return self.table[:, self.CLEARED]
-
-    @property
-    def grazed(self) -> Float[Tensor, " n"]:
-        """The same of each ray's own values alone; infinite before the first."""
-        return self.table[:, self.GRAZED]
+        zero, infinite = torch.zeros_like(entry), torch.full_like(entry, torch.inf)
+        stop = torch.where(meets, Stop.ON_THE_WAY, Stop.LEFT).to(entry.dtype)
+        columns = (entry, zero, entry, infinite, entry, infinite, entry, leave, stop, infinite, entry, entry, infinite)
+        return Reached(torch.stack(columns, dim=1))
 
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
-        return self.table[:, self.STOP] == float(stop)
+        return self.stop == stop
 
     def some(self, index: Int[Tensor, " m"]) -> "Reached":
         """The same of some of the rays, as a copy."""
@@ -160,16 +125,17 @@ class Reached:
         What they have passed up to there stays known. Those that had LEFT end where they had passed all that is close,
         since they are free from there on.
         """
-        start = Reached.on_sphere(rays, radius)
-        columns = [self.DISTANCE, self.ANCHOR, self.CLEARED, self.PASSED, self.LEAVE]
-        leave = torch.where(self.stopped(Stop.LEFT), self.cleared, self.leave)
-        begun = torch.stack([self.anchor, self.anchor, self.cleared, self.passed.clamp_min(CLEAR), leave], dim=1)
-        start.table[:, columns] = torch.where(anchored[:, None], begun, start.table[:, columns])
-        return start
+        again = Reached.on_sphere(rays, radius)
+        again.distance = torch.where(anchored, self.anchor, again.distance)
+        again.anchor = torch.where(anchored, self.anchor, again.anchor)
+        again.cleared = torch.where(anchored, self.cleared, again.cleared)
+        again.passed = torch.where(anchored, self.passed.clamp_min(CLEAR), again.passed)
+        again.leave = torch.where(anchored & self.stopped(Stop.LEFT), self.cleared, again.leave)
+        return again
 
     def put_back(self, index: Int[Tensor, " m"], others: "Reached") -> None:
         """Has m of the rays as `others` are now; both leave the sphere where these rays did."""
-        others.table[:, self.LEAVE] = self.leave[index]
+        others.leave = self.leave[index]
         self.table[index] = others.table
 
     def bracket(self) -> Bracket:
@@ -179,8 +145,8 @@ class Reached:
     def keep_least(self, distance: Float[Tensor, " n"], value: Float[Tensor, " n"]) -> None:
         """Keeps a sample of each ray where its magnitude is the least so far."""
         closer = value.isfinite() & (value.abs() < self.least.abs())
-        self.table[:, self.LEAST_DISTANCE] = torch.where(closer, distance, self.least_distance)
-        self.table[:, self.LEAST] = torch.where(closer, value, self.least)
+        self.least_distance = torch.where(closer, distance, self.least_distance)
+        self.least = torch.where(closer, value, self.least)
 
     def advance(self, value: Float[Tensor, " n"], stride: Stride) -> Bool[Tensor, " n"]:
         """Moves all rays by the field's values where they are; which of them go on.
@@ -188,36 +154,33 @@ class Reached:
         A ray that continues from its coarse ray may begin behind the surface: it goes back until the field is positive,
         to where it begins at the most.
         """
-        at, epsilon = self.distance.clone(), stride.epsilon
-        went, safe = at - self.free, self.free_value
-        too_far = (value > epsilon) & (went - safe - value > TOLERATED * stride.unseen)
-        rises = value > safe
-        before = torch.where(rises, self.free_value, value)
-        closest = torch.minimum(self.passed, before)
-        self.keep_least(at, value)
-        behind, own, begins = value < -epsilon, self.free_value.isfinite(), at <= self.entry
-        finite = value.isfinite()
-        left = (value > epsilon) & (at + value > self.leave) & finite & ~too_far
-        back = behind & ~own & ~begins
-        goes_on = back | ((value > epsilon) & ~left)
+        at, epsilon, safe = self.distance.clone(), stride.epsilon, self.free_value.clone()
+        went, finite, own, begins = at - self.free, value.isfinite(), safe.isfinite(), at <= self.entry
+        above, behind = (value > epsilon) & finite, value < -epsilon
+        too_far = finite & (went - safe - value.abs() > TOLERATED * stride.unseen)
+        self.keep_least(at, torch.where(too_far & (value < 0), torch.inf, value))
+        positive = above & ~too_far
+        left = positive & (at + value > self.leave)
+        goes_on = finite & (too_far | (behind & ~own & ~begins) | (above & ~left))
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
         slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
         moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
         moved = torch.minimum(torch.maximum(moved, self.entry), self.leave)
-        self.table[:, self.STOP] = torch.where(finite, stop, Stop.NOT_FINITE).to(value.dtype)
-        self.table[:, self.VALUE] = torch.where(finite, value, 0.0)
-        self.table[:, self.DISTANCE] = torch.where(goes_on & finite, moved, torch.where(left, at + value, at))
+        self.stop = torch.where(finite, stop, Stop.NOT_FINITE)
+        self.value = torch.where(finite, value, 0.0)
+        self.distance = torch.where(goes_on, moved, torch.where(left, at + value, at))
+        self.free = torch.where(positive, at, self.free)
+        self.free_value = torch.where(positive, value, safe)
+        rises = value > safe
+        lower = torch.where(rises, safe, value)
         cleared = torch.where(left & (value <= CLEAR), self.leave, at)
-        self.table[:, self.CLEARED] = torch.where(before <= CLEAR, cleared, self.cleared)
-        positive = (value > epsilon) & finite & ~too_far
-        self.table[:, self.FREE] = torch.where(positive, at, self.free)
-        self.table[:, self.FREE_VALUE] = torch.where(positive, value, self.free_value)
-        self.table[:, self.ANCHOR] = torch.where(closest > CLEAR, at, self.anchor)
-        for column in (self.PASSED, self.GRAZED):
-            least = self.table[:, column]
-            self.table[:, column] = torch.where(rises | left, torch.minimum(least, before), least)
-        return goes_on & finite
+        self.cleared = torch.where(lower <= CLEAR, cleared, self.cleared)
+        self.anchor = torch.where(torch.minimum(self.passed, lower) > CLEAR, at, self.anchor)
+        risen = torch.where(rises | left, lower, torch.inf)
+        self.passed = torch.minimum(self.passed, risen)
+        self.grazed = torch.minimum(self.grazed, torch.where(too_far, value, risen))
+        return goes_on
 
     def split(
         self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], rays: Rays, *, radius: float, error: float
@@ -233,19 +196,21 @@ class Reached:
         child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
         inherits &= child.stopped(Stop.ON_THE_WAY)
-        reach = torch.where(known.stopped(Stop.CROSSED), known.free + known.free_value, known.distance)
+        spheres = known.stopped(Stop.CROSSED) | (known.stopped(Stop.ON_THE_WAY) & known.free_value.isfinite())
+        reach = torch.where(spheres, known.free + known.free_value, known.distance)
         start = torch.where(inherits, torch.maximum(reach - apart - error, child.entry), child.entry)
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
         keeps = inherits & ~ended & (known.least > 0)
-        gone, begins = keeps & (start >= child.leave), torch.minimum(start, child.leave)
-        child.table[:, self.DISTANCE] = torch.where(gone, start, begins)
-        child.table[:, self.STOP] = torch.where(gone, float(Stop.LEFT), child.table[:, self.STOP])
-        for column in (self.VALUE, self.LEAST_DISTANCE, self.LEAST):
-            child.table[:, column] = torch.where(keeps, known.table[:, column], child.table[:, column])
+        gone, resumes = keeps & (start >= child.leave), torch.minimum(start, child.leave)
+        child.distance = torch.where(gone, start, resumes)
+        child.stop = torch.where(gone, Stop.LEFT, child.stop)
+        child.value = torch.where(keeps, known.value, child.value)
+        child.least_distance = torch.where(keeps, known.least_distance, child.least_distance)
+        child.least = torch.where(keeps, known.least, child.least)
         passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
-        child.table[:, self.PASSED] = torch.where(inherits, passed - apart, child.passed)
-        child.table[:, self.ANCHOR] = torch.where(~ended & (child.passed > CLEAR), begins, child.entry)
-        child.table[:, self.CLEARED] = begins
+        child.passed = torch.where(inherits, passed - apart, child.passed)
+        child.anchor = torch.where(~ended & (child.passed > CLEAR), resumes, child.entry)
+        child.cleared = resumes
         return child
 
 
@@ -269,7 +234,7 @@ def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: 
         clear = HOLDS * (float(apart.max()) if apart.numel() else 0.0) + error
         march(values, level.coarse, reached, replace(stride, epsilon=max(clear, stride.epsilon)), LEVEL_STEPS)
         reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
-    march(values, levels[-1].fine if levels else rays.flat(), reached, stride, steps)
+    march(values, rays.flat(), reached, stride, steps)
     return reached
 
 

@@ -17,7 +17,7 @@ from renderers.rendering import Deferred, Rendering, Status, assemble
 # Scene units, times the slope along the ray: after a longer Newton step the field is asked again, since a step is off
 # by its square over the slope, times half the field's curvature.
 LONGEST = 0.006
-PATIENT = 2  # times `steps`, where the field offers coarse values: first on these, then on the field for rays in doubt
+PATIENT = 2  # times `steps`, where all rays are marched on coarse values, and for those in doubt on the field after it
 NO_NEARER = 0.25  # times the error of coarse values: to how small ones rays are marched
 
 
@@ -30,7 +30,7 @@ class Tracer:
             See `PATIENT`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
             the rest. A value so little behind the surface is a hit, whatever its slope.
-        unseen: see `packed_march.Stride`.
+        unseen: of a ray, between the samples of the march; see `packed_march.Stride`.
         newton_steps: most evaluations of value and slope per root; a second one only where the first step is long.
         search_samples: of the dense search, from a ray's last value above the threshold to where it leaves the sphere,
             and as many again about the least of these.
@@ -53,7 +53,7 @@ class Tracer:
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "20 leave one ray in 300 to the search")
         check_positive("march_epsilon", self.march_epsilon, "1e-4 is a two-hundredth of a pixel at 64 x 64")
-        check_at_least("unseen", self.unseen, 0, "0.005 finds plates of half that thickness")
+        check_positive("unseen", self.unseen, "0.005 may miss what is 1.5 times as long on a ray")
         check_at_least("newton_steps", self.newton_steps, 1, "3 are enough")
         check_at_least("search_samples", self.search_samples, 2, "32 find what a pixel shows")
         check_at_least("search_steps", self.search_steps, 0, "4 are enough")
@@ -67,28 +67,28 @@ class Tracer:
     def trace(self, field: Field, rays: Rays) -> tuple[Reached, "Solved"]:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
-            coarse = self._coarse(field)
-            values, error = (coarse.values, coarse.error) if coarse else (field, 0.0)
-            steps = PATIENT * self.steps if coarse else self.steps
-            reached = approach(values, rays, self.stride(error), steps=steps, radius=self.sphere_radius, error=error)
-        return reached, self._crossings(field, rays.flat(), reached, coarse)
+            asked = self._asked(field)
+            steps = self.steps if asked.values is field else PATIENT * self.steps
+            stride, error = self.stride(asked.error), asked.error
+            reached = approach(asked.values, rays, stride, steps=steps, radius=self.sphere_radius, error=error)
+        return reached, self._crossings_after(field, rays.flat(), reached, asked)
 
     def resume(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
         """Marches flat rays on from where they are, in place, and gives their crossings, which carry the gradient."""
         with torch.no_grad():
-            coarse = self._coarse(field)
-            values, error = (coarse.values, coarse.error) if coarse else (field, 0.0)
-            march(values, rays, reached, self.stride(error), self.steps)
-        return self._crossings(field, rays, reached, coarse)
+            asked = self._asked(field)
+            march(asked.values, rays, reached, self.stride(asked.error), self.steps)
+        return self._crossings_after(field, rays, reached, asked)
 
-    def _coarse(self, field: Field) -> Coarse | None:
-        return coarse_of(field) if self.coarse else None
+    def _asked(self, field: Field) -> Coarse:
+        """What the march asks: the field's coarse values where it offers any, else the field itself."""
+        return (coarse_of(field) if self.coarse else None) or Coarse(field, 0.0)
 
-    def _crossings(self, field: Field, rays: Rays, reached: Reached, coarse: Coarse | None) -> "Solved":
-        """The crossings of flat rays that were marched on the field, or on its coarse values."""
-        if coarse is None:
-            return self.crossings(field, rays, reached)
-        return self._decided(field, rays, reached, coarse.error)
+    def _crossings_after(self, field: Field, rays: Rays, reached: Reached, asked: Coarse) -> "Solved":
+        """The crossings of flat rays that were marched on these values."""
+        if asked.values is field:
+            return self._crossings(field, rays, reached)
+        return self._decided(field, rays, reached, asked.error)
 
     def _decided(self, field: Field, rays: Rays, reached: Reached, error: float) -> "Solved":
         """The crossings of flat rays that were marched on coarse values, which are off by at most `error`.
@@ -100,11 +100,12 @@ class Tracer:
         with torch.no_grad():
             certain = reached.stopped(Stop.LEFT).index_put((first.index,), first.settled) & (reached.grazed > error)
             index = (~certain).nonzero().squeeze(-1)
-            again = reached.some(index).begun_again(rays[index], ~certain[index], radius=self.sphere_radius)
-            march(field, rays[index], again, self.stride(), PATIENT * self.steps)
-        second = self.crossings(field, rays[index], again).among(index)
+            doubtful, anchored = rays[index], torch.ones_like(index, dtype=torch.bool)
+            again = reached.some(index).begun_again(doubtful, anchored, radius=self.sphere_radius)
+            march(field, doubtful, again, self.stride(), PATIENT * self.steps)
+        second = self._crossings(field, doubtful, again).among(index)
         reached.put_back(index, again)
-        reached.table[:, Reached.PASSED] -= error
+        reached.passed -= error
         return first.some(certain[first.index]).joined(second)
 
     def _close(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
@@ -115,7 +116,7 @@ class Tracer:
             guess = torch.where(crossed, reached.bracket().secant(), reached.distance)[close]
         return self.solve(field, rays, reached, close, guess)
 
-    def crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
+    def _crossings(self, field: Field, rays: Rays, reached: Reached) -> "Solved":
         """Where flat rays cross the surface, from where the march left them; in `reached`, also what a search saw."""
         first = self._close(field, rays, reached)
         with torch.no_grad():
@@ -147,14 +148,14 @@ class Tracer:
         ray's beginning where the step leads behind that.
 
         Args:
-            furthest: longest step, in scene units; None for `unseen`, by which the march may go too far.
+            furthest: longest step, in scene units; None for `LONGEST`.
         """
         towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
         nothing = torch.zeros_like(guess)
         solved = Solved(index, guess, nothing, nothing, nothing, nothing, torch.zeros_like(index).bool())
         asked = torch.arange(len(index), device=index.device)
-        furthest = max(LONGEST, self.unseen if furthest is None else furthest)
-        for _ in range(self.newton_steps):
+        furthest = LONGEST if furthest is None else furthest
+        for steps_before in range(self.newton_steps):
             ray, at = index[asked], solved.distance.detach()[asked]
             found = crossing(field, rays[ray], at, towards_field=towards_field)
             slope = found.slope.clamp_max(-self.least_slope)
@@ -165,7 +166,7 @@ class Tracer:
             step = torch.where(enters | small, step.clamp(-furthest, furthest), 0.0)
             step = torch.maximum(step, reached.entry[ray] - at)
             distance = at + step - found.change / slope
-            begun = found.value if len(asked) == len(index) else solved.begun[asked]
+            begun = solved.begun[asked] if steps_before else found.value
             solved = solved.updated(asked, distance, found.value, found.slope, begun, found.change, short | small)
             asked = asked[enters & ~short]
             if asked.numel() == 0:
@@ -185,12 +186,12 @@ class Tracer:
         ends = start.new_full((len(index), 4), torch.nan)
         _keep_crossing(ends, torch.arange(len(index), device=index.device), distance, value)
         # What is thinner than the spacing may hide beside a small value in front of the change of sign.
-        free = torch.where((value <= 0).cumsum(dim=1) > 0, torch.inf, value.nan_to_num(torch.inf))
-        least, place = free.min(dim=1)
+        in_front = torch.where((value <= 0).cumsum(dim=1) > 0, torch.inf, value.nan_to_num(torch.inf))
+        least, place = in_front.min(dim=1)
         nearest = distance.gather(1, place[:, None]).squeeze(1)
         known.keep_least(nearest, least)
         inside = value[:, 0] < 0
-        known.table[:, Reached.STOP] = torch.where(inside, float(Stop.INSIDE), known.table[:, Reached.STOP])
+        known.stop = torch.where(inside, Stop.INSIDE, known.stop)
         reached.table[index] = known.table
         spacing = (known.leave - start) / (self.search_samples - 1)
         again = ((least < spacing / 2) & ~inside).nonzero().squeeze(-1)
@@ -252,7 +253,7 @@ class Solved:
 
     @property
     def columns(self) -> tuple[Tensor, ...]:
-        """All of them, in their order."""
+        """The tensors in the order of the constructor."""
         return tuple(getattr(self, column.name) for column in fields(self))
 
     def some(self, which: Bool[Tensor, " m"]) -> "Solved":
@@ -260,7 +261,7 @@ class Solved:
         return Solved(*(column[which] for column in self.columns))
 
     def among(self, index: Int[Tensor, " n"]) -> "Solved":
-        """The same, numbered among n rays, of which these were those at `index`."""
+        """The same, with `index` counted among the n rays from which these were chosen by `index`."""
         return replace(self, index=index[self.index])
 
     def joined(self, other: "Solved") -> "Solved":

@@ -31,7 +31,7 @@ USUAL = 0.9  # quantile of the movement of hits that were marched: it foretells 
 MARCHED = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
 LOOKED = 29  # on one of so many rays the field's movement is measured; no part of a usual image's width
 GOLDEN = 0.618034  # of the way along a ray from one of these places to the next: they spread over all of it
-AUDITED, STRIDE = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
+AUDITED, SHIFT = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
 SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
 WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
 APART = 0.01  # scene units: crossings further apart differ
@@ -64,8 +64,8 @@ class Image:
     @staticmethod
     def of(reached: Reached, step: Float[Tensor, ""], looked: Float[Tensor, " m"]) -> "Image":
         """Rays that were just marched."""
-        none = torch.zeros_like(reached.distance)
-        return Image(reached, torch.zeros_like(none).bool(), none, none, none.new_zeros(()), step, none, looked)
+        zeros = torch.zeros_like(reached.distance)
+        return Image(reached, zeros.bool(), zeros, zeros, zeros.new_zeros(()), step, zeros.clone(), looked)
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
@@ -75,11 +75,12 @@ class Image:
         self.slope = self.slope.index_put((solved.index,), solved.slope)
         self.renderings += 1
 
-    def free(self, tracer: Tracer, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+    def free(self, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
         """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
 
-        Between two samples a step that is longer than the value by `FURTHER` has seen half the smaller value, less half
-        of that. A hit is not compared with what it passed on its last descent, which its Newton step sees.
+        On a step that is at most `FURTHER` longer than the value, the field is at least half the smaller of the values
+        at its ends, less half of `FURTHER`. A hit is not compared with what it passed on its last descent, which its
+        Newton step sees.
         """
         margin = 2 * (moved - self.marched) + FURTHER
         passed, up_to_anchor = self.reached.passed, margin < CLEAR
@@ -110,9 +111,9 @@ class Memory:
 
     def of(self, rays: Rays) -> Image | None:
         """What is known of these very rays."""
-        origins, directions, image = self.images.get(id(rays.origins), (None, None, None))
-        known = origins is not None and origins() is rays.origins
-        return image if known and directions is not None and directions() is rays.directions else None
+        kept = self.images.get(id(rays.origins))
+        same = kept and kept[0]() is rays.origins and kept[1]() is rays.directions
+        return kept[2] if kept and same else None
 
     def keep(self, rays: Rays, image: Image) -> None:
         """Remembers an image until its rays are gone."""
@@ -142,7 +143,7 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
     if rays.origins.requires_grad or rays.directions.requires_grad or memory.thread != get_ident():
         return tracer.assembled(rays, *tracer.trace(field, rays))
     image, solved = memory.of(rays), None
-    if image is not None and not memory.unsound and _worthwhile(image, tracer):
+    if image is not None and not memory.unsound and _worthwhile(image):
         solved = _continued(tracer, memory, field, rays.flat(), image)
     if image is None or solved is None:
         image, solved = _begun(tracer, field, rays, image)
@@ -166,9 +167,9 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
     return image, solved
 
 
-def _worthwhile(image: Image, tracer: Tracer) -> bool:
+def _worthwhile(image: Image) -> bool:
     """Whether enough rays will be free, if values move as far as the last time."""
-    free, _ = image.free(tracer, image.moved + image.step)
+    free, _ = image.free(image.moved + image.step)
     return bool((~free).sum() <= MARCHED * len(free))
 
 
@@ -181,10 +182,10 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         looked = _look(field, rays, reached)
         image.step = SAFETY * torch.maximum(_largest(solved.begun), _largest(looked - image.looked))
         image.moved, image.looked = image.moved + image.step, looked
-        free, up_to_anchor = image.free(tracer, image.moved)
+        free, up_to_anchor = image.free(image.moved)
         certain = free & ~image.hit.index_put((steady,), ~solved.settled)
         audited = torch.zeros_like(free)
-        audited[STRIDE * image.renderings % AUDITED :: AUDITED] = True
+        audited[SHIFT * image.renderings % AUDITED :: AUDITED] = True
         index = (~certain | audited).nonzero().squeeze(-1)
         if len(index) > MARCHED * len(free):
             return None
@@ -192,7 +193,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
     found = tracer.resume(field, rays[index], moving).among(index)
     with torch.no_grad():
-        differing = _differing(tracer, solved, found, certain & audited)
+        differing = _differing(solved, found, certain & audited)
         if memory.audit(int((certain & audited).sum()), differing):
             return None
         reached.put_back(index, moving)
@@ -208,7 +209,7 @@ def _look(field: Field, rays: Rays, reached: Reached) -> Float[Tensor, " m"]:
     return field(rays[index].at(entry + shares * (leave - entry))).nan_to_num(0.0)
 
 
-def _differing(tracer: Tracer, kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:
+def _differing(kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:
     """How many of the audited rays meet a surface elsewhere than was certain of them."""
 
     def met(solved: Solved) -> Float[Tensor, " n"]:

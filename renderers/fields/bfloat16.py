@@ -71,7 +71,7 @@ class _Network:
 
     def __call__(self, points: Tensor) -> Tensor:
         values = [self._values(some) for some in points.reshape(-1, 3).split(CHUNK)]
-        return torch.cat(values).view(points.shape[:-1]) if values else points.new_zeros(points.shape[:-1])
+        return torch.cat(values).view(points.shape[:-1])
 
     def _values(self, points: Tensor) -> Tensor:
         features = linear(points, *self.first).relu_().bfloat16()
