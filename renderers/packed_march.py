@@ -178,8 +178,7 @@ class Reached:
         self.cleared = torch.where(lower <= CLEAR, cleared, self.cleared)
         self.anchor = torch.where(torch.minimum(self.passed, lower) > CLEAR, at, self.anchor)
         risen = torch.where(rises | left, lower, torch.inf)
-        self.passed = torch.minimum(self.passed, risen)
-        self.grazed = torch.minimum(self.grazed, torch.where(too_far, value, risen))
+        self.passed, self.grazed = torch.minimum(self.passed, risen), torch.minimum(self.grazed, risen)
         return goes_on
 
     def split(

@@ -94,7 +94,8 @@ class Tracer:
         """The crossings of flat rays that were marched on coarse values, which are off by at most `error`.
 
         A ray is certain if it left the sphere, or a Newton step on the field settled; and if it rose from no value
-        within `error` before. The others are marched again from their anchors, on the field itself.
+        within `error` before, but for values that a step was taken back from. The others are marched again from their
+        anchors, on the field itself.
         """
         first = self._close(field, rays, reached)
         with torch.no_grad():
