@@ -85,7 +85,6 @@ MUTANTS = (
     M("renderers/packed_march.py", "> TOLERATED * stride.unseen", "> torch.inf", TRACED),
     M("renderers/packed_march.py", "torch.where(too_far, self.free + safe,", "torch.where(too_far, at,", TRACED),
     M("renderers/packed_march.py", "positive = above & ~too_far", "positive = above", TRACED),
-    M("renderers/packed_march.py", "left = positive & (at", "left = above & (at", TRACED),
     M("renderers/tracer.py", "solved.begun[asked] if steps_before else found.value", "found.value", TRACED),
     M("renderers/packed_march.py", "step, value + FURTHER", "step, value + 1", TRACED),
     M("renderers/packed_march.py", "(GAP * value).clamp_max(self.unseen)", "self.unseen", TRACED),
