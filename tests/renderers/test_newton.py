@@ -303,6 +303,14 @@ def test_a_root_lies_between_where_its_ray_begins_and_ends():
         assert place is None or solved.distance.item() == pytest.approx(place)
 
 
+def test_the_value_where_the_first_step_began_is_kept_where_all_roots_take_a_second():
+    rays, guess = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0)), torch.tensor([1.99, 1.992]).double()
+    reached = Reached.on_sphere(rays, 1.0)
+    solved = NEWTON.solve(plane((0.0, 0.0, -1.0), 0.0), rays, reached, torch.arange(2), guess)
+    assert solved.settled.all()
+    assert solved.begun.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
+
+
 def marched(*values: float) -> Reached:
     """Where a ray is that begins in the sphere's centre and finds these values."""
     rays, left = beam((0.0, 0.0, 0.0)), iter(values)
