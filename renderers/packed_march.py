@@ -43,7 +43,7 @@ class Stride:
     are `unseen` apart if the field goes on to fall as between the last two samples: (2 value + unseen) / (1 + slope).
     Close to a surface they are less apart, in proportion to the value, since what is small casts small values. Where
     they turn out to be further apart than `TOLERATED` times `unseen`, the ray goes back to the boundary of the first,
-    also from behind a surface: another one may lie between.
+    also from behind a surface: another one may lie between. It does not pass that one then.
 
     Source: ours, after Balint and Valasek 2018, "Accelerating sphere tracing", and Keinert et al. 2014, "Enhanced
     sphere tracing", Sec. 3.1, whose spheres touch.
@@ -84,7 +84,7 @@ class Reached:
         table: the columns below.
     """
 
-    table: Float[Tensor, "n 13"]
+    table: Float[Tensor, "n 14"]
 
     distance = Column(0)  # along each ray to where it stopped, or is evaluated next; beyond its end where it has LEFT
     value = Column(1)  # the last value of the field on each ray
@@ -101,6 +101,7 @@ class Reached:
     anchor = Column(10)  # to the last sample before `passed` fell to `CLEAR`; to where the ray begins if there is none
     cleared = Column(11)  # of a ray that has LEFT: to where its samples are above `CLEAR` from then on, or to its end
     grazed = Column(12)  # as `passed`, of the ray's own values alone; infinite before the first
+    wall = Column(13)  # to the last sample behind a surface that a step was taken back from; infinite before the first
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "Reached":
@@ -108,8 +109,8 @@ class Reached:
         entry, leave, meets = sphere_span(rays, radius)
         zero, infinite = torch.zeros_like(entry), torch.full_like(entry, torch.inf)
         stop = torch.where(meets, Stop.ON_THE_WAY, Stop.LEFT).to(entry.dtype)
-        columns = (entry, zero, entry, infinite, entry, infinite, entry, leave, stop, infinite, entry, entry, infinite)
-        return Reached(torch.stack(columns, dim=1))
+        columns = (entry, zero, entry, infinite, entry, infinite, entry, leave, stop, infinite, entry, entry)
+        return Reached(torch.stack([*columns, infinite, infinite], dim=1))
 
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
@@ -159,14 +160,15 @@ class Reached:
         above, behind = (value > epsilon) & finite, value < -epsilon
         too_far = finite & (went - safe - value.abs() > TOLERATED * stride.unseen)
         self.keep_least(at, torch.where(too_far & (value < 0), torch.inf, value))
+        self.wall = torch.where(too_far & (value < 0), at, self.wall)
         positive = above & ~too_far
-        left = positive & (at + value > self.leave)
+        left = positive & (at + value > self.leave) & self.wall.isinf()
         goes_on = finite & (too_far | (behind & ~own & ~begins) | (above & ~left))
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
         slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
         moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
-        moved = torch.minimum(torch.maximum(moved, self.entry), self.leave)
+        moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, self.wall))
         self.stop = torch.where(finite, stop, Stop.NOT_FINITE)
         self.value = torch.where(finite, value, 0.0)
         self.distance = torch.where(goes_on, moved, torch.where(left, at + value, at))

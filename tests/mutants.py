@@ -82,6 +82,8 @@ MUTANTS = (
     M("renderers/packed_march.py", " | (known.stopped(Stop.ON_THE_WAY) & known.free_value.isfinite())", "", TRACED),
     M("renderers/packed_march.py", "too_far = finite & (went", "too_far = above & (went", TRACED),
     M("renderers/packed_march.py", "torch.where(too_far & (value < 0), torch.inf, value)", "value", TRACED),
+    M("renderers/packed_march.py", "torch.minimum(self.leave, self.wall)", "self.leave", TRACED),
+    M("renderers/packed_march.py", " & self.wall.isinf()", "", TRACED),
     M("renderers/packed_march.py", "> TOLERATED * stride.unseen", "> torch.inf", TRACED),
     M("renderers/packed_march.py", "torch.where(too_far, self.free + safe,", "torch.where(too_far, at,", TRACED),
     M("renderers/packed_march.py", "positive = above & ~too_far", "positive = above", TRACED),

@@ -328,9 +328,11 @@ def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unse
 
 
 def test_what_a_step_was_taken_back_from_is_no_closest_sample():
-    missed = marched(0.4, 0.39, -0.005, 0.3)  # the third at 0.8225, a gap of 0.025 behind the second's sphere
-    assert missed.stopped(Stop.LEFT).item()
-    assert missed.least.item() == pytest.approx(0.3)
+    taken_back = marched(0.4, 0.39, -0.005, 0.3)  # the third at 0.8225, a gap of 0.025 behind the second's sphere
+    assert taken_back.stopped(Stop.ON_THE_WAY).item()
+    assert taken_back.least.item() == pytest.approx(0.3)
+    assert taken_back.distance.item() == pytest.approx(0.8225)  # and no further
+    assert marched(0.4, 0.39, -0.005, 0.3, -0.005).stopped(Stop.CROSSED).item()
 
 
 def test_a_ray_that_begins_a_little_inside_began_inside():
