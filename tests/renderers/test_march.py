@@ -378,6 +378,12 @@ def test_naive_asks_every_ray_that_meets_the_sphere_at_every_step():
     assert meter.counts == Counts(value=2 * 17)
 
 
+def test_naive_does_not_hit_what_is_behind_the_sphere():
+    found = NAIVE.render(plane((0, 0, -1), -1.5), HEAD_ON)  # the ray leaves the unit sphere at z = 1
+    assert found.status.item() == Status.MISS
+    assert found.distance.item() == pytest.approx(3.0)
+
+
 def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> Front:
     front = Front.on_sphere(rays, radius=1.0, samples=1)
     march(field, rays, front, stepping, steps)
