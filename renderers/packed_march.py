@@ -159,8 +159,9 @@ class Reached:
         went, finite, own, begins = at - self.free, value.isfinite(), safe.isfinite(), at <= self.entry
         above, behind = (value > epsilon) & finite, value < -epsilon
         too_far = finite & (went - safe - value.abs() > TOLERATED * stride.unseen)
-        self.keep_least(at, torch.where(too_far & (value < 0), torch.inf, value))
-        self.wall = torch.where(too_far & (value < 0), at, self.wall)
+        from_behind = too_far & (value < 0)
+        self.keep_least(at, torch.where(from_behind, torch.inf, value))
+        self.wall = torch.where(from_behind, at, self.wall)
         positive = above & ~too_far
         left = positive & (at + value > self.leave) & self.wall.isinf()
         goes_on = finite & (too_far | (behind & ~own & ~begins) | (above & ~left))

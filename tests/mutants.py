@@ -81,7 +81,7 @@ MUTANTS = (
       "known.distance", TRACED),
     M("renderers/packed_march.py", " | (known.stopped(Stop.ON_THE_WAY) & known.free_value.isfinite())", "", TRACED),
     M("renderers/packed_march.py", "too_far = finite & (went", "too_far = above & (went", TRACED),
-    M("renderers/packed_march.py", "torch.where(too_far & (value < 0), torch.inf, value)", "value", TRACED),
+    M("renderers/packed_march.py", "torch.where(from_behind, torch.inf, value)", "value", TRACED),
     M("renderers/packed_march.py", "torch.minimum(self.leave, self.wall)", "self.leave", TRACED),
     M("renderers/packed_march.py", " & self.wall.isinf()", "", TRACED),
     M("renderers/packed_march.py", "> TOLERATED * stride.unseen", "> torch.inf", TRACED),

@@ -236,8 +236,8 @@ def test_in_an_image_what_is_thin_is_hit_and_not_the_wall_behind(thin):
     image, truth = replace(NEWTON, unseen=1e-4, steps=100).render(thin | wall, rays), exact(thin | wall)
     in_front = thin(truth.points) < 1e-9
     assert in_front.sum() > 20
-    assert ((image.distance - truth.distance)[in_front] < 0.05).all()
-    assert (thin(image.points)[in_front] < NEWTON.march_epsilon).all()  # an edge so close may be hit in front
+    assert ((image.distance - truth.distance).abs()[in_front] < 0.05).all()
+    assert (thin(image.points)[in_front] < NEWTON.march_epsilon).all()
 
 
 def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
@@ -289,7 +289,7 @@ def test_up_to_its_anchor_the_field_is_large(shape):
     assert (reached.anchor > reached.entry).sum() > 300
     shares = torch.linspace(0, 1, 100)
     before = rays.flat().at_each(reached.entry[:, None] + shares * (reached.anchor - reached.entry)[:, None])
-    assert shape(before).min() > (CLEAR - FURTHER) / 2
+    assert shape(before).min() > CLEAR - 0.01
 
 
 def test_a_root_lies_between_where_its_ray_begins_and_ends():
@@ -474,7 +474,7 @@ def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
     assert ((cleared < reached.leave[left]) & (reached.least[left] < CLEAR)).sum() > 50
     shares = torch.linspace(0, 1, 200)
     behind = field(rays.flat()[left].at_each(cleared[:, None] + shares * (reached.leave[left] - cleared)[:, None]))
-    assert behind.min() > (CLEAR - FURTHER) / 2
+    assert behind.min() > CLEAR - 0.01
 
 
 def test_rays_that_begin_inside_do_so_beside_rays_that_do_not():
