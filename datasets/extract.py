@@ -4,14 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation
 from skimage.measure import block_reduce, marching_cubes
 
 from datasets.mesh import Mesh
 from renderers.field import Field, Kind
 
-BLOCK = 4  # side of the blocks, in samples, that are skipped where the surface is far
+BLOCKS = (8, 4, 2)  # sides of the blocks, in samples, that are not divided further where the surface is far
 MARGIN = 2.0  # a field may exceed the distance by this factor before a part of its surface can be skipped
 CHUNK = 65536  # points per evaluation
 
@@ -34,7 +34,7 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
         return torch.cat([field(chunk).float().cpu() for chunk in places.split(CHUNK)]).numpy()
 
     axis = torch.linspace(-reach, reach, grid).numpy()
-    if field.kind is Kind.LEVEL or grid < 2 * BLOCK:
+    if field.kind is Kind.LEVEL or grid < 2 * BLOCKS[0]:
         values = evaluate(_places(np.arange(grid**3), axis)).reshape(grid, grid, grid)
     else:
         values = _near_values(evaluate, axis)
@@ -50,23 +50,29 @@ def _near_values(
 ) -> Float[np.ndarray, "grid grid grid"]:
     """Values that are right near the surface and have the right sign elsewhere.
 
-    A block is not sampled if its middle is farther from the surface than its corners are from its middle; it takes the
+    A block is not divided if its middle is farther from the surface than its corners are from its middle; it takes the
     value of its middle. Where signs then differ across the side of a block, that block is sampled as well.
     """
-    grid, spacing = len(axis), axis[1] - axis[0]
-    block_of = np.arange(grid) // BLOCK
-    middles = np.array([axis[block_of == block].mean() for block in range(block_of[-1] + 1)], dtype=np.float32)
-    coarse = evaluate(_places(np.arange(len(middles) ** 3), middles)).reshape((len(middles),) * 3)
-    near = ~(np.abs(coarse) > MARGIN * np.sqrt(3) * (BLOCK + 1) / 2 * spacing)  # NaN counts as near
-    values = coarse[np.ix_(block_of, block_of, block_of)]
-    known = np.zeros(near.shape, dtype=bool)
-    while (near & ~known).any():
-        wanted = (near & ~known)[np.ix_(block_of, block_of, block_of)]
+    spacing, parent = axis[1] - axis[0], len(axis)
+    values, near = np.zeros((1, 1, 1), dtype=np.float32), np.ones((1, 1, 1), dtype=bool)
+    for side in (*BLOCKS, 1):
+        middles = np.array([axis[start : start + side].mean() for start in range(0, len(axis), side)], dtype=axis.dtype)
+        parent_of = np.ix_(*(np.arange(len(middles)) * side // parent,) * 3)
+        values, known = values[parent_of], near
+        values[near[parent_of]] = evaluate(_places(np.flatnonzero(near[parent_of]), middles))
+        far = np.abs(values) > MARGIN * np.sqrt(3) * (side + 1) / 2 * spacing  # NaN is not
+        near, parent = near[parent_of] & ~far, side
+    while (found := block_reduce(_beside_another_sign(values), BLOCKS[-1], np.any) & ~known).any():
+        wanted = found[parent_of]
         values[wanted] = evaluate(_places(np.flatnonzero(wanted), axis))
-        known |= near
-        inside = values < 0
-        near |= block_reduce(binary_dilation(inside) & binary_dilation(~inside), BLOCK, np.any)
+        known |= found
     return values
+
+
+def _beside_another_sign(values: Float[np.ndarray, "grid grid grid"]) -> Bool[np.ndarray, "grid grid grid"]:
+    """The samples that have a neighbour along an axis on the other side of the surface."""
+    inside = values < 0
+    return binary_dilation(inside) & binary_dilation(~inside)
 
 
 def _places(flat: Int[np.ndarray, " n"], axis: Float[np.ndarray, " grid"]) -> Float[np.ndarray, "n 3"]:

@@ -150,6 +150,8 @@ MUTANTS = (
       "tests/tasks/test_multiview.py"),
     M("bench/shape_prior/autodecoder.py", "settings.code_penalty * codes[chosen]", "0.0 * codes[chosen]",
       "tests/shape_prior"),
+    M("bench/solve/optimise.py", "if (gradient := one.grad) is not None", "if (gradient := one.grad) is not self",
+      "tests/solve"),
     M("bench/solve/optimise.py", "DIVERGED = 100.0", "DIVERGED = 1e9", "tests/solve"),
     # Sizes of fields, and the choice by one of them.
     M("bench/models/choice.py", "candidate.size.by(measure)", "candidate.size.free", "tests/models/test_sizes.py"),
@@ -199,7 +201,8 @@ MUTANTS = (
       "generator.random(count)", "tests/datasets/test_truth.py"),
     M("datasets/truth.py", "[origins, directions / lengths]", "[origins, directions]", "tests/datasets/test_truth.py"),
     M("datasets/extract.py", "MARGIN = 2.0", "MARGIN = 0.2", "tests/datasets/test_extract.py"),
-    M("datasets/extract.py", "near |= block_reduce", "block_reduce", "tests/datasets/test_extract.py"),
+    M("datasets/extract.py", "while (found :=", "if (found :=", "tests/datasets/test_extract.py"),
+    M("datasets/extract.py", "BLOCKS = (8, 4, 2)", "BLOCKS = (4,)", "tests/datasets/test_extract.py"),
     M("datasets/deform.py", "1 / curvature - radius * np.cos(angle)", "1 / curvature + radius * np.cos(angle)",
       "tests/datasets/test_deform.py"),
     M("datasets/deform.py", "* np.exp(self.stretch)",

@@ -1,6 +1,5 @@
 """The field of an unknown shape, where it is no code of a prior: the candidate that early growth ends on."""
 
-import time
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -76,19 +75,18 @@ def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
         settings = replace(choice.models.fit, iterations=task.optimiser.iterations)
         fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
         growth = grow(fitter, by_size(choice.candidates, choice.models.size), choice.models.growth)
-    clock = time.perf_counter()
     _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
-    first, last = growth.first, growth.fitted.model.frozen()
-    record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
-    metrics, notes = after.metrics | ended(growth), tuple(growth.summary(choice.name))
-    status, reason = verdict(growth, after)
-    note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
-    curve = rendered(lines, growth.fitted.evidence.candidate)
-    filmstrip = Filmstrip(inputs, "by candidate")
-    for name, field in growth.fields.items():
-        filmstrip.add(name, field)
-    draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
-    record.seconds["evaluation"] = time.perf_counter() - clock
+    with run.off_clock():
+        first, last = growth.first, growth.fitted.model.frozen()
+        record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
+        metrics, notes = after.metrics | ended(growth), tuple(growth.summary(choice.name))
+        status, reason = verdict(growth, after)
+        note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
+        curve = rendered(lines, growth.fitted.evidence.candidate)
+        filmstrip = Filmstrip(inputs, "by candidate")
+        for name, field in growth.fields.items():
+            filmstrip.add(name, field)
+        draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
 
 
 def fitted_shape(run: RunContext, weights: Weights) -> Field:

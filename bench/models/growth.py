@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from math import ceil
 
-import torch
-
 from bench.models.choice import Evidence
 from bench.models.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.models.held_out import HeldOutError
@@ -122,8 +120,6 @@ def _load() -> None:
     """Imports slow modules beforehand, so that their seconds do not count for the first candidate."""
     import scipy.cluster.vq  # noqa: F401
     import trimesh  # noqa: F401
-
-    torch.optim.Adam([torch.zeros(1)])
 
 
 def _is_better(new: Evidence, old: Evidence) -> bool:

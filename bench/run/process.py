@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from pkgutil import iter_modules
 
 import psutil
 from omegaconf import DictConfig
 
-import bench.tasks
-import datasets
 from bench.records.record import Record, RunStatus
+from bench.run import fork_server
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -112,8 +110,7 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     """
     if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
         multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(preloaded())
+    context = fork_server.start()
     channel, childs = context.Pipe()
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
     process = context.Process(target=_enter, args=(job, childs, alive))
@@ -129,14 +126,6 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
         finally:
             if process.pid is not None:
                 _end(process, channel, receive)
-
-
-def preloaded() -> list[str]:
-    """Modules that are slow to import and that runs need: their processes inherit them from the fork server."""
-    packages = bench.tasks, datasets
-    named = [module.name for one in packages for module in iter_modules(one.__path__, f"{one.__name__}.")]
-    # bench first: it sets what torch reads at its import; _dynamo: optimisers import it when they are created.
-    return ["bench", "open3d", "torch._dynamo", "bench.run.execute", *named]
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:

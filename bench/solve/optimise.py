@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from bench.machine.environment import MemoryPeak, synchronise
 from bench.records.record import RunStatus
@@ -56,16 +57,15 @@ def optimise(
         least_reference: for divergence, a smaller first loss counts as this; for starts that are nearly right.
         on_step: called with each line of the curve, to which it may add; off the clock, and its memory is not counted.
     """
-    optimiser = torch.optim.Adam(problem.parameters, lr=settings.learning_rate)
+    optimiser = _Adam(problem.parameters)
     history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
     before = replace(problem.counts)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
-        optimiser.param_groups[0]["lr"] = settings.rate(iteration)
-        optimiser.zero_grad(set_to_none=True)
-        terms: dict[str, Tensor] = {}
+        optimiser.forget_gradients()
+        rate, terms = settings.rate(iteration), dict[str, Tensor]()
         forward = _timed(device, lambda i=iteration, terms=terms: terms.update(problem.loss(i)))
-        backward = _timed(device, lambda terms=terms: (terms["total"].backward(), optimiser.step()))
+        backward = _timed(device, lambda rate=rate, terms=terms: (terms["total"].backward(), optimiser.step(rate)))
         history.seconds["forward"] += forward
         history.seconds["backward"] += backward
         history.counts = problem.counts - before
@@ -83,6 +83,29 @@ def optimise(
             on_step(line)
         if over:
             break
+
+
+class _Adam:
+    """`torch.optim.Adam` by its function alone: the class imports torch's compiler, for a second of every process."""
+
+    def __init__(self, parameters: list[Tensor]) -> None:
+        self.parameters = parameters
+        self.averages, self.squares = ([torch.zeros_like(one) for one in parameters] for _ in range(2))
+        self.steps = [torch.tensor(0.0, device="cpu") for _ in parameters]
+
+    def forget_gradients(self) -> None:
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Moves the parameters that have a gradient, at a learning rate."""
+        states = zip(self.parameters, self.averages, self.squares, self.steps, strict=True)
+        moved = [(one, gradient, *state) for one, *state in states if (gradient := one.grad) is not None]
+        if moved:
+            ones, gradients, averages, squares, steps = map(list, zip(*moved, strict=True))
+            settings = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
+            adam(ones, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
 
 
 def _failed(history: History, problem: Objective, least_reference: float) -> bool:

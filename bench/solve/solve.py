@@ -1,6 +1,5 @@
 """Solves an inverse problem: evaluates, optimises, evaluates again, and draws."""
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -27,7 +26,8 @@ COSTS = {
     "seconds.warmup": "one step's forward and backward pass before the clock starts; its evaluations are not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
-    "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
+    "seconds.evaluation": "meshes, metrics and pictures, by all threads unless `threads` is set; not part of the "
+    "loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
     "peak_memory_bytes": "highest rise, during the loop, of the process's resident memory (CPU) or PyTorch's (GPU)",
     "flops": "evaluations times the field's operations per evaluation, coarse ones included",
@@ -55,9 +55,9 @@ def solve(
     problem = make_problem()
     first = problem.field()
     check_kind(inputs.renderer, first)
-    clock = time.perf_counter()
-    before = problem.evaluate(inputs)
-    record.metrics_start, record.seconds["evaluation"] = before.metrics, time.perf_counter() - clock
+    with run.off_clock():
+        before = problem.evaluate(inputs)
+    record.metrics_start = before.metrics
     filmstrip = Filmstrip(inputs)
 
     def errors_at(iteration: int) -> dict[str, float]:
@@ -65,12 +65,11 @@ def solve(
         return problem.checkpoint(inputs) if iteration else {name: before.metrics[name] for name in problem.tracked}
 
     history = descend(problem, settings, run, errors_at)
-    clock = time.perf_counter()
-    after = problem.evaluate(inputs)
-    note_result(run, replace(after, failure=failure_of(history, after)))
-    filmstrip.add(len(history.curve), *problem.frame())
-    draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
-    record.seconds["evaluation"] += time.perf_counter() - clock
+    with run.off_clock():
+        after = problem.evaluate(inputs)
+        note_result(run, replace(after, failure=failure_of(history, after)))
+        filmstrip.add(len(history.curve), *problem.frame())
+        draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
     return problem
 
 
@@ -124,12 +123,10 @@ def descend(
     history = History()
     checkpoints = run.inputs.evaluation.checkpoints(settings.iterations)
     known: dict[int, dict[str, float]] = {}
-    run.record.seconds.setdefault("evaluation", 0.0)
 
     def check(iteration: int) -> None:
-        clock = time.perf_counter()
-        known[iteration] = errors_at(iteration)
-        run.record.seconds["evaluation"] += time.perf_counter() - clock
+        with run.off_clock():
+            known[iteration] = errors_at(iteration)
 
     def note_objective() -> None:
         if (value := problem.objective()) is not None:

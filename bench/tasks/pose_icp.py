@@ -70,9 +70,8 @@ class PoseICP(PoseTask):
         found, distance = min(tried, key=lambda result: result[1])
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
-        clock = time.perf_counter()
-        after = self.evaluate(found, inputs.scene)
-        record.seconds["evaluation"] = time.perf_counter() - clock
+        with run.off_clock():
+            after = self.evaluate(found, inputs.scene)
         record.metrics, record.notes = after.metrics, [*record.notes, *after.notes]
         record.status, record.reason = RunStatus.OK, ""
         if not np.isfinite(distance):

@@ -58,7 +58,7 @@ def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_los
     near = extract(counted, grid=96, reach=1.05)
     everywhere = extract(Shape(lambda p: scale * shape(p), Kind.LEVEL), grid=96, reach=1.05)
     assert np.array_equal(near.vertices, everywhere.vertices) and np.array_equal(near.faces, everywhere.faces)
-    assert scale < 1 or counted.counts.value < 96**3 / 4
+    assert scale < 1 or counted.counts.value < 96**3 / 8
 
 
 def test_a_surface_that_leads_out_of_the_asked_blocks_is_followed():

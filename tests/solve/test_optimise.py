@@ -76,6 +76,33 @@ def test_it_finds_the_answer():
     assert history.curve[-1]["total"] < 1e-3
 
 
+@dataclass
+class Two(Toy):
+    """Two unknowns, of which the second one has no gradient in every other iteration."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.place = torch.tensor([0.5, -0.5], requires_grad=True)
+        self.parameters = [self.radius, self.place]
+
+    def loss(self, iteration):
+        terms = super().loss(iteration)
+        return terms if iteration % 2 else {"total": terms["total"] + (self.place**4).sum()}
+
+
+def test_a_step_is_that_of_torchs_adam():
+    ours, theirs = Two(), Two()
+    settings = OptimiserSettings(20, 0.1, "cosine")
+    optimise(ours, settings, CPU, history=History(), on_step=lambda line: None)
+    adam = torch.optim.Adam(theirs.parameters)
+    for iteration in range(20):
+        adam.param_groups[0]["lr"] = settings.rate(iteration)
+        adam.zero_grad()
+        theirs.loss(iteration)["total"].backward()
+        adam.step()
+    assert all(torch.equal(one, other) for one, other in zip(ours.parameters, theirs.parameters, strict=True))
+
+
 def test_the_curve_has_a_line_per_iteration_passed_on_at_once():
     given = []
     history = go(Toy(), 5, on_step=lambda line: given.append(dict(line)))
