@@ -28,7 +28,8 @@ class Newton(Tracer):
         for hits on surfaces flatter than `least_slope` along the ray.
         What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
         fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
-    Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Its gradient towards
+    Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Where a field is steeper,
+        its values are divided by how steep it is nearly everywhere, see `packed_march.steepness`. Its gradient towards
         points by automatic differentiation, also where no gradient is wanted.
     Deviates from the paper: there is none. What may be missed: what is at most 1.5 `unseen` long on a ray, of a field
         that is a distance; on the rays of the dense search, what is thinner than the spacing of its samples, unless it

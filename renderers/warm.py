@@ -82,7 +82,7 @@ class Image:
         at its ends, less half of `FURTHER`. A hit is not compared with what it passed on its last descent, which its
         Newton step sees.
         """
-        margin = 2 * (moved - self.marched) + FURTHER
+        margin = 2 * (moved - self.marched) + FURTHER * self.reached.steepness
         passed, up_to_anchor = self.reached.passed, margin < CLEAR
         passed = torch.where(self.hit, passed, torch.minimum(passed, self.reached.least))
         return (margin < passed) & (up_to_anchor | ~self.hit), up_to_anchor

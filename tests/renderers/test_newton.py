@@ -11,7 +11,7 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
-from renderers.packed_march import CLEAR, FURTHER, Reached, Stop, Stride, march
+from renderers.packed_march import CLEAR, FURTHER, PAIRS, Reached, Stop, Stride, march, steepness
 from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, beam
 
@@ -22,6 +22,7 @@ SHAPES = {
     "brick": box((0.5, 0.4, 0.3)),
     "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1),
 }
+RAYS = beam((0.0, 0.0, 0.0))
 by_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 
 
@@ -108,7 +109,8 @@ def test_grazing_rays_are_found_by_the_dense_search():
     rendering = replace(NEWTON, steps=6).render(meter, rays)
     assert rendering.hit.all() and without.hit.all()
     assert rendering.distance.item() == pytest.approx(0.9, abs=1e-6)
-    assert meter.counts.value <= 6 + 2 * NEWTON.search_samples + NEWTON.search_steps + NEWTON.newton_steps
+    searched = 2 * NEWTON.search_samples + NEWTON.search_steps
+    assert meter.counts.value <= 2 * PAIRS + 6 + searched + NEWTON.newton_steps
 
 
 def test_what_hides_between_two_samples_is_found_beside_the_least():
@@ -122,14 +124,38 @@ def test_what_hides_between_two_samples_is_found_beside_the_least():
     torch.testing.assert_close(rendering.distance, truth.distance, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("factor", [0.25, 1.5])
-def test_values_that_are_wrong_by_a_factor_lose_few_hits(factor):
-    ring = SHAPES["ring"]
-    truth = exact(ring)
-    rendering = NEWTON.render(Shape(lambda p: factor * ring(p), Kind.BOUND), camera().rays())
+WRONG = {  # fields with the zero set of a distance d, and the most values that they take per ray
+    "weak": (lambda d: 0.25 * d, 18),
+    "strong": (lambda d: 1.5 * d, 4.5),
+    "far too strong": (lambda d: 20 * d, 4.5),
+    "saturated": (lambda d: torch.tanh(d / 0.2), 4.5),
+}
+
+
+@pytest.mark.parametrize("image", [True, False], ids=["image", "rays"])
+@pytest.mark.parametrize(("of", "most"), WRONG.values(), ids=WRONG)
+def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most, image):
+    ring, seen = SHAPES["ring"], camera().rays()
+    truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p)), Kind.BOUND))
+    rendering = NEWTON.render(wrong, seen if image else Rays(seen.origins, seen.directions))
     both = truth.hit & rendering.hit
     assert (truth.hit ^ rendering.hit).sum() <= 0.01 * truth.hit.sum()
     assert (rendering.distance - truth.distance)[both].abs().quantile(0.9) < 1e-5
+    assert wrong.counts.value <= most * truth.hit.numel()
+
+
+@pytest.mark.parametrize("of", [lambda d: 1.1 * d, lambda d: d, lambda d: 0.1 * d, lambda d: 0.4 * torch.sin(d / 0.4)])
+def test_a_field_that_is_hardly_steeper_than_a_distance_is_taken_for_one(of):
+    assert steepness(lambda p: of(SHAPES["ring"](p)), RAYS, 1.0) == 1.0
+
+
+def test_the_steepness_of_a_field_is_measured_wherever_it_has_numbers():
+    def halved(points: Tensor) -> Tensor:
+        return torch.where(points[..., 0] > 0.3, torch.nan, 4 * SHAPES["ball"](points))
+
+    assert steepness(halved, RAYS, 1.0) == pytest.approx(4.0, rel=0.1)
+    assert steepness(lambda p: torch.full_like(p[..., 0], torch.nan), RAYS, 1.0) == 1.0
+    assert steepness(lambda p: torch.full_like(p[..., 0], torch.inf), RAYS, 1.0) == 1.0
 
 
 def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():

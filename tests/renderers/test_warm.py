@@ -65,6 +65,11 @@ def test_a_shape_that_moves_is_found_with_fewer_values(warm):
     assert sum(values for _, values in renderings) < 0.7 * cold
 
 
+def test_a_shape_that_moves_is_found_by_values_that_are_far_too_large(warm):
+    fields = [Shape(lambda p, r=0.4 + 0.01 * i: 6 * ball(r, x=0.02 * r)(p)) for i in range(6)]
+    assert most_differing(warm, fields) == 0
+
+
 def test_a_shape_that_stays_costs_its_hits_and_little_besides(warm):
     (found, _), _, _, (again, values) = in_turn(warm, [ball(0.5)] * 4)
     assert torch.equal(found.hit, again.hit)
