@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.models.held_out import HeldOut, HeldOutError
+from bench.setup.inputs import Invalid
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import GivenView
 from renderers.adaptive_samples import at_max_samples
@@ -166,7 +167,7 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
         rays: number drawn in an iteration.
 
     Raises:
-        ValueError: where too few depths are given to hold some out.
+        Invalid: where too few depths are given to hold some out.
     """
     draw = torch.Generator().manual_seed(split.seed)
     out = torch.isin(group, torch.tensor(split.whole))
@@ -178,7 +179,7 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
     given = view.some((~out).nonzero().squeeze(-1))
     held_out = held(view, out, group, split.footprint)
     if len(held_out.group[held_out.observed].unique()) < 2:
-        raise ValueError(
+        raise Invalid(
             f"a field without a prior is evaluated on held-out depths, and {int(view.observed.sum())} depths are too "
             "few to hold some out: give more (task.points=100), or set field=prior"
         )

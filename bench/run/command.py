@@ -5,6 +5,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -77,7 +78,9 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
 
 def unwritten(error: OSError) -> str:
     """One line on what could not be written, and what to do."""
-    where = f" ({error.filename})" if error.filename else ""
+    path = Path(error.filename) if error.filename else None
+    file = next((above for above in path.parents if above.is_file()), path) if path else None
+    where = f" ({file})" if file else ""
     return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
 
 

@@ -21,7 +21,7 @@ from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
 from bench.run.process import Ended, Job, Notice, Started, Step
-from bench.setup.inputs import RunContext, RunInputs, set_up
+from bench.setup.inputs import Invalid, RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
 from bench.tasks.task import TakesField, Task
 
@@ -95,10 +95,6 @@ def execute(
         record.notes += contention.warnings(record)
         log.info("%s %s", record.status, record.reason)
         _close_log(log)
-
-
-class Invalid(Exception):
-    """A configuration that cannot be run."""
 
 
 def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunInputs]:

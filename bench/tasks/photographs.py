@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.models.held_out import HeldOutError
+from bench.setup.inputs import Invalid
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings
@@ -152,13 +153,13 @@ class PhotographObservations:
         """Holds out one of every `HELD_OUT_EVERY` pairs.
 
         Raises:
-            ValueError: where there are too few photographs.
+            Invalid: where there are too few photographs.
         """
         count = len(given.cameras)
         fitted, held_out = split_pairs(count, neighbour=given.settings.neighbour)
         if len(held_out) < 2 or not fitted:
             least = 2 * HELD_OUT_EVERY
-            raise ValueError(
+            raise Invalid(
                 f"{count} photographs leave no pairs to hold out where no prior is used: task.images.views={least}, "
                 "with task.neighbour=1, or field=prior"
             )

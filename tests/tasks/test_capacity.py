@@ -228,7 +228,7 @@ def test_photographs_evaluate_a_field_on_held_out_pairs(compose_config, tmp_path
         (("task=capacity", "task.frugal_rays=0"), "refused", "frugal_rays must be above 0"),
         (  # found by the run, when it pairs its photographs
             ("task=multiview", "field=auto", "task.images.views=6"),
-            "crashed",
+            "refused",
             "6 photographs leave no pairs to hold out",
         ),
     ],
