@@ -14,6 +14,7 @@ from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
 from renderers.packed_march import CLEAR, FURTHER, PAIRS, Reached, Stop, Stride, march, steepness
 from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, beam
+from tests.tiny import camera_of
 
 NEWTON, DIST = load("renderer", "newton"), load("renderer", "dist")
 SHAPES = {
@@ -28,7 +29,7 @@ by_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 
 def camera(size: int = 64, dtype: torch.dtype = torch.float32) -> Camera:
     """The unit sphere from 2.5 away."""
-    seen = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), size).camera(30.0, 25.0)
+    seen = camera_of(size, angles=(30.0, 25.0))
     return seen.double() if dtype is torch.float64 else seen
 
 
