@@ -387,6 +387,16 @@ def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
     assert gone.stopped(Stop.LEFT).item()
 
 
+@pytest.mark.parametrize("steepness", [1.0, 6.0])
+def test_what_a_finer_ray_has_passed_is_less_by_what_the_field_changes_on_the_way_to_it(steepness):
+    coarse = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0, steepness)
+    coarse.keep_least(coarse.entry, torch.tensor([0.5]).double())
+    finer = coarse.split(
+        torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0)), radius=1.0, error=0.0
+    )
+    assert finer.passed.item() == pytest.approx(0.5 - 0.03 * steepness)
+
+
 def test_a_step_whose_spheres_lie_apart_is_taken_back():
     at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
     at.advance(torch.tensor([0.4]).double(), Stride(1e-3, 0.005))
