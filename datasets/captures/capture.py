@@ -1,0 +1,82 @@
+"""Photographs of one object with their cameras, read from a folder and moved into the unit sphere."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from datasets.captures.formats import OPENGL, find_layout
+from datasets.captures.hull import Sphere, sphere_of
+from datasets.captures.shot import Shot, take
+from renderers.checks import check_at_least, check_choice
+
+AXES = {"stated": np.eye(4), "flipped": OPENGL}
+FEWEST = 3  # photographs
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs of one object, which lies in the unit sphere.
+
+    Args:
+        format: of the folder.
+        shots: the photographs, by name.
+        masks: where the masks come from, in words; empty without masks.
+        sphere: which part of the file's world became the unit sphere.
+        notes: what was left out or changed.
+    """
+
+    format: str
+    shots: tuple[Shot, ...]
+    masks: str
+    sphere: Sphere
+    notes: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """What was found, in one sentence."""
+        sizes = sorted({(shot.camera.width, shot.camera.height) for shot in self.shots})
+        pixels = " and ".join(f"{width} x {height}" for width, height in sizes)
+        masks = f"masks from {self.masks}" if self.masks else "no masks"
+        place = ", ".join(f"{value:.3g}" for value in self.sphere.centre)
+        return (
+            f"{self.format}: {len(self.shots)} photographs of {pixels} pixels, {masks}; the unit sphere has its centre "
+            f"at ({place}) and radius {self.sphere.radius:.3g}, {self.sphere.found}"
+        )
+
+
+def read_capture(folder: Path, *, longest: int, masks: bool = True, axes: str = "stated") -> Capture:
+    """Reads the photographs of a folder.
+
+    Args:
+        folder: in one of the formats of `formats`.
+        longest: most pixels of a photograph's longer side; larger ones are made smaller.
+        masks: whether masks are used where there are any.
+        axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
+
+    Raises:
+        ValueError: where something is missing, or cameras and masks do not fit.
+    """
+    check_at_least("dataset.longest", longest, 8, "96 is small")
+    check_choice("dataset.axes", axes, tuple(AXES))
+    layout = find_layout(folder)
+    if len(layout.frames) < FEWEST:
+        raise ValueError(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
+    frames = [replace(frame, world_to_camera=AXES[axes] @ frame.world_to_camera) for frame in layout.frames]
+    shots = [take(frame, longest) for frame in frames]
+    lacking = [shot.name for shot in shots if shot.mask is None]
+    if masks and 0 < len(lacking) < len(shots):
+        raise ValueError(f"{lacking[0]} has no mask, and others have one: add it, or set dataset.masks=false")
+    masked = masks and not lacking
+    shots = shots if masked else [replace(shot, mask=None) for shot in shots]
+    if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
+        raise ValueError(f"the mask of {blank[0]} is empty: remove the image, or set dataset.masks=false")
+    sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(shots)
+    source = "files" if frames[0].mask is not None else "the alpha channel"
+    return Capture(
+        layout.format,
+        tuple(shot.within(sphere.centre, sphere.radius) for shot in shots),
+        source if masked else "",
+        sphere,
+        layout.notes,
+    )

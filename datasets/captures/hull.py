@@ -1,0 +1,122 @@
+"""The visual hull of masks: where the object is, whether cameras and masks fit, and a first shape (a baseline)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from datasets.captures.shot import Shot
+from datasets.mesh import Mesh
+from datasets.scene import see
+from datasets.truth import Truth
+
+SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
+FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
+CHUNK = 65_536  # points projected at once
+SAMPLES = 48  # per axis, while the hull is looked for
+ROUNDS = 4  # in which the part of the world that is sampled shrinks to the hull
+FILLED = 0.9  # of the unit sphere's radius that the hull takes
+
+
+@torch.no_grad()
+def carve(shots: Sequence[Shot], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """How far points are outside of the visual hull: negative inside of all masks that they are seen against.
+
+    A value is 1/2 less the least mask, from 0 to 1, that is interpolated between pixels; 1/2 for a point that lies in
+    less than `SEEN` of the photographs.
+
+    Args:
+        shots: with masks.
+        points: in the world of the cameras.
+    """
+    flat = points.reshape(-1, 3)
+    values = torch.cat([_carved(shots, some) for some in flat.split(CHUNK)]) if len(flat) else flat[:, 0]
+    return values.view(points.shape[:-1])
+
+
+def _carved(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    least, seen = torch.ones(len(points)), torch.zeros(len(points))
+    left = torch.arange(len(points))  # not yet far outside of a mask
+    for shot in shots:
+        assert shot.mask is not None
+        pixels, depth = shot.camera.project(points[left])
+        size = torch.tensor([shot.camera.width, shot.camera.height])
+        inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
+        places = (2 * pixels / size - 1)[None, :, None]
+        mask = shot.mask.float()[None, None]
+        found = torch.nn.functional.grid_sample(mask, places, padding_mode="border", align_corners=False).flatten()
+        least[left] = torch.where(inside, torch.minimum(least[left], found), least[left])
+        seen[left] += inside
+        left = left[least[left] > FAR]
+    return torch.where((seen >= SEEN * len(shots)) | (least <= FAR), 0.5 - least, 0.5)
+
+
+def hull_mesh(shots: Sequence[Shot], samples: int, reach: float = 1.0) -> Mesh | None:
+    """The visual hull within the cube [-reach, reach]^3, at `samples` per axis; None where it is empty."""
+    axis = torch.linspace(-reach, reach, samples)
+    values = carve(shots, torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)).numpy()
+    values = np.pad(values[1:-1, 1:-1, 1:-1], 1, constant_values=0.5)  # closed where it leaves the cube
+    if not values.min() < 0:
+        return None
+    spacing = 2 * reach / (samples - 1)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
+    return Mesh(vertices - reach, faces)
+
+
+def hull_views(shots: Sequence[Shot], hull: Mesh | None) -> list[Bool[Tensor, "height width"]]:
+    """The hull's silhouette in each photograph: where cameras are right, it covers nearly all of the mask."""
+    if hull is None:
+        return [torch.zeros(shot.camera.height, shot.camera.width, dtype=torch.bool) for shot in shots]
+    truth = Truth(hull, closed=False)
+    return [see(truth, shot.camera).mask for shot in shots]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere about the object, in the file's world, and how it was found."""
+
+    centre: Float[np.ndarray, "3"]
+    radius: float
+    found: str
+
+
+def sphere_of(shots: Sequence[Shot]) -> Sphere:
+    """A sphere about the object: about the visual hull of the masks or, without masks, about what all cameras look at.
+
+    Raises:
+        ValueError: where the hull is empty.
+    """
+    centre, half = _looked_at(shots)
+    if any(shot.mask is None for shot in shots):
+        return Sphere(centre, half, "about the point that the cameras look at, as far as most of them see")
+    for _ in range(ROUNDS):
+        axis = torch.linspace(-half, half, SAMPLES, dtype=torch.float64)
+        points = torch.from_numpy(centre) + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        inside = points[carve(shots, points.float()) < 0].numpy()
+        if len(inside) == 0:
+            raise ValueError(
+                "the visual hull of the masks is empty: no point is inside of all masks. Cameras do not fit the masks: "
+                "try dataset.axes=flipped, check the order of the images, or set dataset.masks=false"
+            )
+        spacing = 2 * half / (SAMPLES - 1)
+        low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing
+        centre, half = (low + high) / 2, float((high - low).max()) / 2
+    radius = float(np.linalg.norm(inside - centre, axis=1).max()) + spacing
+    return Sphere(centre, radius / FILLED, "about the visual hull of the masks")
+
+
+def _looked_at(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3"], float]:
+    """The point nearest to all optical axes, and half the width that the narrower side of most images shows there."""
+    motions = [shot.camera.camera_to_world.double().numpy() for shot in shots]
+    across = [np.eye(3) - np.outer(motion[:3, 2], motion[:3, 2]) for motion in motions]
+    places = [motion[:3, 3] for motion in motions]
+    pulled = np.sum([one @ place for one, place in zip(across, places, strict=True)], axis=0)
+    centre = np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=None)[0]
+    away = np.array([np.linalg.norm(place - centre) for place in places])
+    cameras = [shot.camera for shot in shots]
+    shown = np.array([min(one.width, one.height) / 2 / one.intrinsics[0, 0].item() for one in cameras])
+    return centre, float(np.median(away * shown))

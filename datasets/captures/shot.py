@@ -1,0 +1,115 @@
+"""A photograph with its camera, as a file's frame becomes it: made smaller, without distortion."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image, UnidentifiedImageError
+from scipy.ndimage import map_coordinates
+from torch import Tensor
+
+from datasets.captures.formats import Frame
+from renderers.camera import Camera
+
+BACKGROUND = 1.0  # behind an image with an alpha channel: white, as NeRF has it
+SAME_SHAPE = 0.01  # most by which width over height of an image may differ from those of its camera, as a share
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph with its camera.
+
+    Args:
+        name: of its file.
+        camera: its resolution is the photograph's.
+        colours: RGB from 0 to 1.
+        mask: true on the object; None where it is not known.
+    """
+
+    name: str
+    camera: Camera
+    colours: Float[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"] | None
+
+    def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
+        """The same photograph in a world where the sphere about `centre` is the unit sphere about the origin."""
+        motion = self.camera.world_to_camera.double().clone()
+        motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
+        return replace(self, camera=replace(self.camera, world_to_camera=motion.float()))
+
+
+def take(frame: Frame, longest: int) -> Shot:
+    """Reads a frame's photograph, with at most `longest` pixels along its longer side.
+
+    Raises:
+        ValueError: where a file cannot be read, or image, mask and camera have different shapes.
+    """
+    image = _opened(frame.image)
+    height, width = frame.size or (image.height, image.width)
+    if abs(image.width * height / (image.height * width) - 1) > SAME_SHAPE:
+        raise ValueError(
+            f"{frame.image} has {image.width} x {image.height} pixels, its camera {width} x {height}: crop neither, or "
+            "write the camera for this image"
+        )
+    share = min(longest / max(image.width, image.height), 1.0)
+    size = max(round(image.width * share), 1), max(round(image.height * share), 1)
+    alpha = "A" in image.getbands() or "transparency" in image.info
+    pixels = np.asarray(image.convert("RGBA" if alpha else "RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
+    colours, opaque = pixels[..., :3], pixels[..., 3:] if alpha else None
+    if opaque is not None:
+        colours = colours * opaque + BACKGROUND * (1 - opaque)
+    if frame.mask is not None:
+        opaque = _mask(frame, (image.width, image.height), size)
+    scale = np.array([[size[0] / width], [size[1] / height], [1.0]])
+    intrinsics = scale * frame.intrinsics
+    if any(frame.distortion):
+        colours = _undistorted(colours, intrinsics, frame.distortion)
+        opaque = None if opaque is None else _undistorted(opaque, intrinsics, frame.distortion)
+    matrices = (torch.from_numpy(matrix).float() for matrix in (intrinsics, frame.world_to_camera))
+    try:
+        camera = Camera(*matrices, size[1], size[0])
+    except ValueError as error:
+        raise ValueError(f"the camera of {frame.image}: {error}") from None
+    mask = None if opaque is None else torch.from_numpy(opaque[..., 0] > 0.5)
+    return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask)
+
+
+def _opened(path: object) -> Image.Image:
+    try:
+        image = Image.open(str(path))
+        image.load()
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+    return image
+
+
+def _mask(frame: Frame, full: tuple[int, int], size: tuple[int, int]) -> Float[np.ndarray, "height width 1"]:
+    """A frame's mask, from 0 to 1, at the size of its made-smaller photograph."""
+    image = _opened(frame.mask)
+    if (image.width, image.height) != full:
+        raise ValueError(
+            f"{frame.mask} has {image.width} x {image.height} pixels, its image {full[0]} x {full[1]}: a mask has the "
+            "size of its image"
+        )
+    grey = image.getchannel("A") if image.mode in ("LA", "RGBA") and image.getextrema()[-1][0] < 255 else image
+    return np.asarray(grey.convert("L").resize(size, Image.Resampling.BOX), np.float32)[..., None] / 255
+
+
+def _undistorted(
+    image: Float[np.ndarray, "height width channels"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    distortion: tuple[float, ...],
+) -> Float[np.ndarray, "height width channels"]:
+    """The image that a pinhole camera of these intrinsics takes (Brown's model, as OpenCV writes it)."""
+    k1, k2, p1, p2 = distortion
+    focal, middle = intrinsics[[0, 1], [0, 1]], intrinsics[:2, 2]
+    rows, columns = np.meshgrid(np.arange(image.shape[0]) + 0.5, np.arange(image.shape[1]) + 0.5, indexing="ij")
+    x, y = (columns - middle[0]) / focal[0], (rows - middle[1]) / focal[1]
+    square = x**2 + y**2
+    radial = 1 + k1 * square + k2 * square**2
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2)
+    bent_y = y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y
+    places = np.stack([bent_y * focal[1] + middle[1] - 0.5, bent_x * focal[0] + middle[0] - 0.5])
+    channels = [map_coordinates(image[..., i], places, order=1, mode="nearest") for i in range(image.shape[2])]
+    return np.stack(channels, axis=-1)
