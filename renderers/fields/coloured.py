@@ -1,0 +1,124 @@
+"""A distance network of one shape with colours, for shapes that are learnt from images."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import pi, sqrt
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Flops, Kind
+
+CHUNK = 2048  # points per pass without a graph: keeps the activations in cache
+SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
+AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
+DIRECTION_OCTAVES = 2  # of the encoding of view directions
+
+
+class ColouredDistance(nn.Module):
+    """A network of distance, and one of colour that takes its features, the point, and the normal and view direction.
+
+    It begins as a sphere about the origin: the encoding has no weight yet, and the other weights are drawn so that
+    values grow by one per unit (Atzmon and Lipman 2020, "SAL", Theorem 1; IDR, Sec. 4).
+
+    Source: IDR (Yariv et al. 2020), Sec. 3.2 and its supplement: softplus, positional encoding; colours of point,
+        normal, direction and features.
+    Deviates: narrower; no skip; the features are a linear map of the last hidden layer.
+
+    Args:
+        layers: hidden layers of the distance, at least 1.
+        width: neurons per hidden layer, and of each of the two hidden layers of the colour.
+        octaves: of the encoding of points: sine and cosine of 1, 2, 4, ... times each coordinate.
+        radius: of the sphere that it begins as, in scene units.
+        directional: whether colours depend on the view direction.
+    """
+
+    def __init__(self, *, layers: int, width: int, octaves: int, radius: float, directional: bool) -> None:
+        super().__init__()
+        check_at_least("layers", layers, 1, "4 suit one shape")
+        check_at_least("width", width, 8, "128 suit one shape")
+        check_at_least("octaves", octaves, 0, "5 follow details of a pixel at 128 x 128")
+        check_positive("radius", radius, "0.5 lies within most objects")
+        self.octaves, self.directional = octaves, directional
+        inputs = [3 + 6 * octaves] + [width] * (layers - 1)
+        self.hidden = nn.ModuleList(nn.Linear(size, width) for size in inputs)
+        self.last, self.features = nn.Linear(width, 1), nn.Linear(width, width)
+        seen = 3 + 6 * DIRECTION_OCTAVES if directional else 0
+        sizes = [width + 6 + seen, width, width, 3]
+        self.colour = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(sizes))
+        self._begin_as_sphere(radius)
+
+    @torch.no_grad()
+    def _begin_as_sphere(self, radius: float) -> None:
+        for index, layer in enumerate(self.hidden):
+            assert isinstance(layer, nn.Linear)
+            layer.weight.normal_(0.0, sqrt(2 / len(layer.weight)))
+            layer.bias.zero_()
+            if index == 0:
+                layer.weight[:, 3:] = 0.0
+        self.last.weight.normal_(sqrt(pi / self.last.in_features), 1e-4)
+        self.last.bias.zero_()
+        around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
+        self.last.bias.fill_(-self.field(around).mean())  # softplus is a little more than a ReLU
+
+    @property
+    def field(self) -> "DistanceOf":
+        """The distance at the current weights."""
+        return DistanceOf(self)
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """Red, green and blue from 0 to 1.
+
+        Args:
+            points: on the surface.
+            normals: the distance's gradients there; their graph leads colours to the shape.
+            directions: of the rays that see the points, unit; unused unless `directional`.
+        """
+        seen = [encoded(directions, DIRECTION_OCTAVES)] if self.directional else []
+        features = torch.cat([self.features(self._hidden(points)), points, normals, *seen], dim=-1)
+        *layers, last = self.colour
+        for layer in layers:
+            features = torch.relu(layer(features))
+        return torch.sigmoid(last(features))
+
+    def _hidden(self, points: Tensor) -> Tensor:
+        features = encoded(points, self.octaves)
+        for layer in self.hidden:
+            features = softplus(layer(features), beta=SHARPNESS)
+        return features
+
+
+@dataclass(frozen=True)
+class DistanceOf:
+    """The distance of a `ColouredDistance`: a Field near enough to a distance where an eikonal term keeps it so."""
+
+    network: ColouredDistance
+    kind: Kind = Kind.DISTANCE
+    lipschitz: float | None = None
+    flops: Flops = field(init=False)
+
+    def __post_init__(self) -> None:
+        layers = (*self.network.hidden, self.network.last)
+        value = 2 * sum(weight.numel() for layer in layers for weight in layer.parameters() if weight.dim() > 1)
+        learnt = any(weight.requires_grad for layer in layers for weight in layer.parameters())
+        object.__setattr__(self, "flops", Flops(value, 2 * value if learnt else value))
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        flat = points.reshape(-1, 3)
+        chunks = [flat] if torch.is_grad_enabled() else flat.split(CHUNK)
+        values = [self.network.last(self.network._hidden(chunk)) for chunk in chunks]
+        return torch.cat(values).view(points.shape[:-1])
+
+
+def encoded(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:
+    """The vectors, and sine and cosine of 1, 2, 4, ... times each coordinate (NeRF, Eq. 4, without pi)."""
+    scaled = [2.0**octave * vectors for octave in range(octaves)]
+    return torch.cat([vectors, *(wave(each) for each in scaled for wave in (torch.sin, torch.cos))], dim=-1)
