@@ -11,8 +11,9 @@ from skimage.measure import block_reduce, marching_cubes
 from datasets.mesh import Mesh
 from renderers.field import Field, Kind
 
-BLOCKS = (8, 4, 2)  # sides of the blocks, in samples, that are not divided further where the surface is far
+BLOCKS = (4, 2)  # sides of the blocks, in samples, that are not divided further where the surface is far
 MARGIN = 2.0  # a field may exceed the distance by this factor before a part of its surface can be skipped
+STEEPER = 1.2  # the same, times its steepest slope between the middles of blocks, where that is more
 CHUNK = 65536  # points per evaluation
 
 
@@ -53,14 +54,18 @@ def _near_values(
     A block is not divided if its middle is farther from the surface than its corners are from its middle; it takes the
     value of its middle. Where signs then differ across the side of a block, that block is sampled as well.
     """
-    spacing, parent = axis[1] - axis[0], len(axis)
+    spacing, parent, margin = axis[1] - axis[0], len(axis), MARGIN
     values, near = np.zeros((1, 1, 1), dtype=np.float32), np.ones((1, 1, 1), dtype=bool)
     for side in (*BLOCKS, 1):
         middles = np.array([axis[start : start + side].mean() for start in range(0, len(axis), side)], dtype=axis.dtype)
         parent_of = np.ix_(*(np.arange(len(middles)) * side // parent,) * 3)
         values, known = values[parent_of], near
         values[near[parent_of]] = evaluate(_places(np.flatnonzero(near[parent_of]), middles))
-        far = np.abs(values) > MARGIN * np.sqrt(3) * (side + 1) / 2 * spacing  # NaN is not
+        if side == BLOCKS[0]:
+            steps = [np.nan_to_num(np.abs(np.diff(values, axis=i)), posinf=0.0).max() for i in range(3)]
+            steepest = max(steps) / (side * spacing)
+            margin = max(MARGIN, STEEPER * steepest)
+        far = np.abs(values) > margin * np.sqrt(3) * (side + 1) / 2 * spacing  # NaN is not
         near, parent = near[parent_of] & ~far, side
     while (found := block_reduce(_beside_another_sign(values), BLOCKS[-1], np.any) & ~known).any():
         wanted = found[parent_of]

@@ -14,7 +14,7 @@ import torch
 from datasets.dataset import Split, seed_of
 from datasets.extract import extract
 from datasets.mesh import Mesh, fit_in_sphere, normalise
-from renderers.checks import check_at_least, check_choice, check_share
+from renderers.checks import BadInput, check_at_least, check_choice, check_share
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
@@ -68,7 +68,7 @@ class Family:
     def _raw_mesh(self, split: Split, index: int) -> Mesh:
         mesh = extract(self._raw_shape(split, index), grid=self.resolution, reach=HALF_GRID)
         if mesh is None:
-            raise ValueError(f"{self.name} {split} {index} has no surface: check dataset.ranges")
+            raise BadInput(f"{self.name} {split} {index} has no surface: check dataset.ranges")
         return mesh
 
     def identity(self) -> dict[str, Any]:

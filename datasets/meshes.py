@@ -10,6 +10,7 @@ import numpy as np
 from datasets.mesh import Mesh
 from datasets.repair import repair
 from datasets.truncated import check_whole
+from renderers.checks import BadInput
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
 FLAT = 1e-12  # of the squared diagonal: a mesh with less area is a line or a point
@@ -63,7 +64,7 @@ def load_mesh(path: str | Path) -> Mesh:
     try:
         return repair(_read(path))
     except ValueError as error:
-        raise ValueError(f"mesh file '{path}': {error}") from None
+        raise BadInput(f"mesh file '{path}': {error}") from None
 
 
 def _read(path: Path) -> Mesh:

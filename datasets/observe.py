@@ -5,6 +5,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from datasets.scene import View
+from renderers.checks import BadInput
 
 
 def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "height width"]:
@@ -23,7 +24,9 @@ def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "h
     amount, is_share = parse_amount(points)
     count = max(1, round(available * amount)) if is_share else round(amount)
     if count > available:
-        raise ValueError(f"points must be at most the {available} pixels of the shape, not {points}: raise resolution")
+        raise BadInput(
+            f"points must be at most the {available} pixels of the shape, not {points}: give fewer, or raise view.resolution"
+        )
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
     observed = torch.zeros(view.mask.numel(), dtype=torch.bool)
     observed[foreground[order[:count]]] = True

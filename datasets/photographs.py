@@ -12,7 +12,7 @@ from datasets.scene import View, see
 from datasets.textures import TEXTURES, Texture, make_texture
 from datasets.truth import Truth
 from renderers.camera import Camera
-from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 
 SUPERSAMPLING = 2  # a pixel's colour is the mean over 2 x 2 rays
 LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
@@ -81,9 +81,9 @@ class Photography:
         taken = [self._take_one(truth, texture, camera, generator) for camera in cameras]
         for index, photograph in enumerate(taken):
             if not bool(photograph.view.mask.any()):
-                raise ValueError(f"camera {index} sees nothing of the shape: widen view.field_of_view or distance")
+                raise BadInput(f"camera {index} sees nothing of the shape: widen view.field_of_view or distance")
         if max(_spread(photograph) for photograph in taken) < UNIFORM:
-            raise ValueError("the surface has one colour in all images: choose another texture or shading")
+            raise BadInput("the surface has one colour in all images: choose another texture or shading")
         return taken
 
     def _take_one(self, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator) -> Photograph:

@@ -16,6 +16,7 @@ from datasets.mesh import Mesh
 from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers.camera import Camera
+from renderers.checks import BadInput
 from renderers.field import Field
 
 
@@ -66,7 +67,7 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
     if not bool(view.mask.any()):
         repaired = f" (repaired: {'; '.join(mesh.repairs)})" if mesh.repairs else ""
         what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
-        raise ValueError(f"{what}: widen view.field_of_view or distance")
+        raise BadInput(f"{what}: widen view.field_of_view or distance")
     formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
     return Scene(scene_name(dataset, split, index), mesh, view, formula)
 

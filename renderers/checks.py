@@ -3,6 +3,10 @@
 from math import isfinite
 
 
+class BadInput(ValueError):
+    """What a user gave cannot be used, as is found only while it is used; the message names the remedy."""
+
+
 def check_positive(name: str, value: float, remedy: str) -> None:
     """Raises ValueError unless `value` is finite and above zero."""
     if not isfinite(value) or value <= 0:

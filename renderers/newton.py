@@ -29,8 +29,8 @@ class Newton(Tracer):
         What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
         fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Where a field is steeper,
-        its values are divided by how steep it is nearly everywhere, see `packed_march.steepness`. Its gradient towards
-        points by automatic differentiation, also where no gradient is wanted.
+        its values are divided by how steep it is nearly everywhere, see `evened`; those of a bound never are. Its
+        gradient towards points by automatic differentiation, also where no gradient is wanted.
     Deviates from the paper: there is none. What may be missed: what is at most 1.5 `unseen` long on a ray, of a field
         that is a distance; on the rays of the dense search, what is thinner than the spacing of its samples, unless it
         is next to the least one; in an image, what rays meet at the rim of the sphere in front of where their coarse
@@ -72,7 +72,7 @@ class Newton(Tracer):
         """Marches and searches without a graph; the Newton steps carry the gradient."""
         if self.remembers:
             return warm_trace(self, self.memory, field, rays)
-        return self.assembled(rays, *self.trace(field, rays))
+        return self.render_anew(field, rays)
 
     def fresh(self) -> "Newton":
         """The same renderer with an empty memory, for another optimisation."""

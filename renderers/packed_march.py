@@ -13,7 +13,7 @@ from torch import Tensor
 
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
-from renderers.field import Values, points_in_ball
+from renderers.field import Values
 from renderers.march import pyramid
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
@@ -21,8 +21,6 @@ HOLDS = 2.0  # times the distance to the finer rays: with a smaller empty sphere
 GAP = 1.4  # times the value: what a step may leave between two spheres; beside surfaces, where parts are small
 FURTHER = 0.03  # scene units: most by which a step is longer than the value; the warm start's margin grows with it
 TOLERATED = 1.5  # times `unseen`: what a step may leave, since slopes change on the way
-PAIRS, SPAN = 64, 0.1  # of points between which the steepness is measured; scene units between the points of a pair
-STEEP = 1.2  # up to which values are taken for distances
 CLEAR = 0.1  # scene units: the march notes how far a ray came before its first value at most this
 
 
@@ -84,11 +82,9 @@ class Reached:
 
     Args:
         table: the columns below.
-        steepness: of the field, see `steepness`: a sphere about a sample is empty whose radius is the value over it.
     """
 
     table: Float[Tensor, "n 14"]
-    steepness: float = 1.0
 
     distance = Column(0)  # along each ray to where it stopped, or is evaluated next; beyond its end where it has LEFT
     value = Column(1)  # the last value of the field on each ray
@@ -108,13 +104,13 @@ class Reached:
     wall = Column(13)  # to the last sample behind a surface that a step was taken back from; infinite before the first
 
     @staticmethod
-    def on_sphere(rays: Rays, radius: float, steepness: float = 1.0) -> "Reached":
+    def on_sphere(rays: Rays, radius: float) -> "Reached":
         """Every ray where it enters the sphere of `radius` about the origin, or at its origin if that lies inside."""
         entry, leave, meets = sphere_span(rays, radius)
         zero, infinite = torch.zeros_like(entry), torch.full_like(entry, torch.inf)
         stop = torch.where(meets, Stop.ON_THE_WAY, Stop.LEFT).to(entry.dtype)
         columns = (entry, zero, entry, infinite, entry, infinite, entry, leave, stop, infinite, entry, entry)
-        return Reached(torch.stack([*columns, infinite, infinite], dim=1), steepness)
+        return Reached(torch.stack([*columns, infinite, infinite], dim=1))
 
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays stopped so."""
@@ -122,7 +118,7 @@ class Reached:
 
     def some(self, index: Int[Tensor, " m"]) -> "Reached":
         """The same of some of the rays, as a copy."""
-        return Reached(self.table[index], self.steepness)
+        return Reached(self.table[index])
 
     def begun_again(self, rays: Rays, anchored: Bool[Tensor, " n"], *, radius: float) -> "Reached":
         """The rays to be marched again, from their anchor where they are `anchored`, else from their beginning.
@@ -130,7 +126,7 @@ class Reached:
         What they have passed up to there stays known. Those that had LEFT end where they had passed all that is close,
         since they are free from there on.
         """
-        again = Reached.on_sphere(rays, radius, self.steepness)
+        again = Reached.on_sphere(rays, radius)
         again.distance = torch.where(anchored, self.anchor, again.distance)
         again.anchor = torch.where(anchored, self.anchor, again.anchor)
         again.cleared = torch.where(anchored, self.cleared, again.cleared)
@@ -160,24 +156,23 @@ class Reached:
         to where it begins at the most.
         """
         at, epsilon, safe = self.distance.clone(), stride.epsilon, self.free_value.clone()
-        radius, free_radius = (value, safe) if self.steepness == 1 else (value / self.steepness, safe / self.steepness)
         went, finite, own, begins = at - self.free, value.isfinite(), safe.isfinite(), at <= self.entry
         above, behind = (value > epsilon) & finite, value < -epsilon
-        too_far = finite & (went - free_radius - radius.abs() > TOLERATED * stride.unseen)
+        too_far = finite & (went - safe - value.abs() > TOLERATED * stride.unseen)
         from_behind = too_far & (value < 0)
         self.keep_least(at, torch.where(from_behind, torch.inf, value))
         self.wall = torch.where(from_behind, at, self.wall)
         positive = above & ~too_far
-        left = positive & (at + radius > self.leave) & self.wall.isinf()
+        left = positive & (at + value > self.leave) & self.wall.isinf()
         goes_on = finite & (too_far | (behind & ~own & ~begins) | (above & ~left))
         stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
         stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
-        slope = ((free_radius - radius) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
-        moved = torch.where(too_far, self.free + free_radius, at + stride.length(radius, slope))
+        slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
+        moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
         moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, self.wall))
         self.stop = torch.where(finite, stop, Stop.NOT_FINITE)
         self.value = torch.where(finite, value, 0.0)
-        self.distance = torch.where(goes_on, moved, torch.where(left, at + radius, at))
+        self.distance = torch.where(goes_on, moved, torch.where(left, at + value, at))
         self.free = torch.where(positive, at, self.free)
         self.free_value = torch.where(positive, value, safe)
         rises = value > safe
@@ -200,12 +195,12 @@ class Reached:
             apart: how far each of the finer rays is from its coarse one, at most.
             error: most that the values of the coarse ray are off.
         """
-        child, known = Reached.on_sphere(rays, radius, self.steepness), self.some(parent)
+        child, known = Reached.on_sphere(rays, radius), self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
         inherits &= child.stopped(Stop.ON_THE_WAY)
         spheres = known.stopped(Stop.CROSSED) | (known.stopped(Stop.ON_THE_WAY) & known.free_value.isfinite())
-        reach = torch.where(spheres, known.free + known.free_value / self.steepness, known.distance)
-        start = torch.where(inherits, torch.maximum(reach - apart - error / self.steepness, child.entry), child.entry)
+        reach = torch.where(spheres, known.free + known.free_value, known.distance)
+        start = torch.where(inherits, torch.maximum(reach - apart - error, child.entry), child.entry)
         ended = known.stopped(Stop.NEAR) | known.stopped(Stop.CROSSED)
         keeps = inherits & ~ended & (known.least > 0)
         gone, resumes = keeps & (start >= child.leave), torch.minimum(start, child.leave)
@@ -215,7 +210,7 @@ class Reached:
         child.least_distance = torch.where(keeps, known.least_distance, child.least_distance)
         child.least = torch.where(keeps, known.least, child.least)
         passed = torch.where(ended, known.passed, torch.minimum(known.passed, known.least))
-        child.passed = torch.where(inherits, passed - self.steepness * apart, child.passed)
+        child.passed = torch.where(inherits, passed - apart, child.passed)
         child.anchor = torch.where(~ended & (child.passed > CLEAR), resumes, child.entry)
         child.cleared = resumes
         return child
@@ -234,32 +229,15 @@ def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: 
         error: most that one of the values is off.
     """
     levels = pyramid(rays) if rays.image else []
-    steep = steepness(values, rays, radius)
-    reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius, steep)
+    reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
     for level in levels:
         coarse, parent = level.coarse[level.parent], level.parent
         apart = _apart(coarse, level.fine, reached.entry[parent], reached.leave[parent])
-        clear = HOLDS * steep * (float(apart.max()) if apart.numel() else 0.0) + error
+        clear = HOLDS * (float(apart.max()) if apart.numel() else 0.0) + error
         march(values, level.coarse, reached, replace(stride, epsilon=max(clear, stride.epsilon)), LEVEL_STEPS)
         reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
     march(values, rays.flat(), reached, stride, steps)
     return reached
-
-
-def steepness(values: Values, rays: Rays, radius: float) -> float:
-    """How steep values are between `PAIRS` of points in the sphere: 1 where that is at most `STEEP`, as of a distance.
-
-    One pair in twenty may be steeper, so that a few places do not decide the step everywhere.
-
-    Args:
-        rays: whose dtype and device the points have.
-        radius: of the sphere about the origin that holds the shape.
-    """
-    points = radius * points_in_ball(PAIRS).to(rays.origins)
-    towards = torch.nn.functional.normalize(points.roll(1, dims=0) - points, dim=-1)
-    here, there = values(torch.cat([points, points + SPAN * towards])).chunk(2)
-    steep = float(((here - there).abs() / SPAN).nan_to_num(0.0).quantile(0.95))
-    return steep if steep > STEEP else 1.0
 
 
 def march(values: Values, rays: Rays, reached: Reached, stride: Stride, steps: int) -> None:

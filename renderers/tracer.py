@@ -9,7 +9,8 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Coarse, Field, carries_gradient, coarse_of
+from renderers.evened import evened, measured_steepness
+from renderers.field import Coarse, Field, Kind, carries_gradient, coarse_of
 from renderers.gradients import crossing
 from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
@@ -79,6 +80,20 @@ class Tracer:
             asked = self._asked(field)
             march(asked.values, rays, reached, self.stride(asked.error), self.steps)
         return self._crossings_after(field, rays, reached, asked)
+
+    def steepness(self, field: Field, rays: Rays) -> float:
+        """By what a field's values are to be divided before rays are marched on them; see `evened`.
+
+        Those of a bound are lengths that a step may take, however steep they are.
+        """
+        if field.kind is not Kind.DISTANCE:
+            return 1.0
+        return measured_steepness(self._asked(field).values, rays.origins, radius=self.sphere_radius)
+
+    def render_anew(self, field: Field, rays: Rays) -> Rendering:
+        """The rendering, without knowledge of an earlier one."""
+        steepness = self.steepness(field, rays)
+        return self.assembled(rays, *self.trace(evened(field, steepness), rays), steepness=steepness)
 
     def _asked(self, field: Field) -> Coarse:
         """What the march asks: the field's coarse values where it offers any, else the field itself."""
@@ -162,7 +177,9 @@ class Tracer:
             slope = found.slope.clamp_max(-self.least_slope)
             step = -found.value / slope
             enters = found.value.isfinite() & (found.slope < 0)
-            short = enters & (found.value.abs() <= LONGEST * found.slope.square()) & (at + step <= reached.leave[ray])
+            steep = found.slope.abs()
+            short = enters & (found.value.abs() <= LONGEST * steep * steep.clamp_max(1.0))
+            short &= at + step <= reached.leave[ray]
             small = (found.value <= 0) & (found.value >= -self.march_epsilon)
             step = torch.where(enters | small, step.clamp(-furthest, furthest), 0.0)
             step = torch.maximum(step, reached.entry[ray] - at)
@@ -211,8 +228,14 @@ class Tracer:
         points = rays.at_each(distance)
         return distance, torch.cat([field(some) for some in points.split(max(BLOCK // self.search_samples, 1))])
 
-    def assembled(self, rays: Rays, reached: Reached, solved: "Solved") -> Rendering:
-        """The rendering, with the gradient of hits; that of other rays' closest values is left to the loss."""
+    def assembled(self, rays: Rays, reached: Reached, solved: "Solved", *, steepness: float) -> Rendering:
+        """The rendering, with the gradient of hits; that of other rays' closest values is left to the loss.
+
+        Args:
+            rays: of any leading shape.
+            reached, solved: of the field divided by its steepness.
+            steepness: by which its values are multiplied again.
+        """
         inside, not_finite = reached.stopped(Stop.INSIDE), reached.stopped(Stop.NOT_FINITE)
         status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
         status[inside], status[not_finite] = Status.STARTED_INSIDE, Status.OUT_OF_STEPS
@@ -230,8 +253,8 @@ class Tracer:
             self.sphere_radius,
             distance=distance,
             status=status,
-            residual=residual,
-            closest=(queried, closest[queried]),
+            residual=steepness * residual,
+            closest=(queried, steepness * closest[queried]),
         )
         left_out = (sampled & (status != Status.HIT)).view(rays.shape)
         return replace(rendering, deferred=Deferred(reached.least_distance.clone().view(rays.shape), left_out))

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderers.camera import Rays
+from renderers.evened import evened
 from renderers.field import Field
 from renderers.packed_march import CLEAR, FURTHER, Reached
 from renderers.rendering import Rendering
@@ -35,6 +36,8 @@ AUDITED, SHIFT = 100, 37  # of so many rays one is audited in a rendering; by ho
 SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
 WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
 APART = 0.01  # scene units: crossings further apart differ
+MEASURED = 4  # of so many renderings one measures how steep the field is
+STEEPER = 0.05  # by what share that may have changed: where it has by more, all rays are begun anew; and slopes at hits
 
 
 @dataclass
@@ -48,6 +51,7 @@ class Image:
         step: how far of that in the last rendering.
         marched: what `moved` was when the ray was last marched from its beginning.
         looked: the field's last values at the places of `_look`.
+        steepness: of the field; its values here are divided by it.
         renderings: their number so far.
     """
 
@@ -59,13 +63,14 @@ class Image:
     step: Float[Tensor, ""]
     marched: Float[Tensor, " n"]
     looked: Float[Tensor, " m"]
+    steepness: float
     renderings: int = 0
 
     @staticmethod
-    def of(reached: Reached, step: Float[Tensor, ""], looked: Float[Tensor, " m"]) -> "Image":
+    def of(reached: Reached, step: Float[Tensor, ""], looked: Float[Tensor, " m"], steepness: float) -> "Image":
         """Rays that were just marched."""
         zeros = torch.zeros_like(reached.distance)
-        return Image(reached, zeros.bool(), zeros, zeros, zeros.new_zeros(()), step, zeros.clone(), looked)
+        return Image(reached, zeros.bool(), zeros, zeros, zeros.new_zeros(()), step, zeros.clone(), looked, steepness)
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
@@ -82,7 +87,7 @@ class Image:
         at its ends, less half of `FURTHER`. A hit is not compared with what it passed on its last descent, which its
         Newton step sees.
         """
-        margin = 2 * (moved - self.marched) + FURTHER * self.reached.steepness
+        margin = 2 * (moved - self.marched) + FURTHER
         passed, up_to_anchor = self.reached.passed, margin < CLEAR
         passed = torch.where(self.hit, passed, torch.minimum(passed, self.reached.least))
         return (margin < passed) & (up_to_anchor | ~self.hit), up_to_anchor
@@ -141,7 +146,7 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
     their tensors, which must not be changed in place.
     """
     if rays.origins.requires_grad or rays.directions.requires_grad or memory.thread != get_ident():
-        return tracer.assembled(rays, *tracer.trace(field, rays))
+        return tracer.render_anew(field, rays)
     image, solved = memory.of(rays), None
     if image is not None and not memory.unsound and _worthwhile(image):
         solved = _continued(tracer, memory, field, rays.flat(), image)
@@ -150,11 +155,18 @@ def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rend
         memory.keep(rays, image)
     else:
         image.note(solved)
-    return tracer.assembled(rays, image.reached, solved)
+    return tracer.assembled(rays, image.reached, solved, steepness=image.steepness)
+
+
+def _as_steep(tracer: Tracer, field: Field, rays: Rays, image: Image) -> bool:
+    """Whether the field is as steep as where these rays were begun."""
+    return abs(tracer.steepness(field, rays) / image.steepness - 1) <= STEEPER
 
 
 def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tuple[Image, Solved]:
     """All rays marched coarse to fine; what was known of them tells how far values have moved."""
+    steepness = tracer.steepness(field, rays)
+    field = evened(field, steepness)
     reached, solved = tracer.trace(field, rays)
     step = reached.distance.new_zeros(())
     if before is not None:
@@ -162,7 +174,7 @@ def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tu
         apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
         step = SAFETY * apart.quantile(USUAL) if len(apart) else step
     with torch.no_grad():
-        image = Image.of(reached, step, _look(field, rays.flat(), reached))
+        image = Image.of(reached, step, _look(field, rays.flat(), reached), steepness)
     image.note(solved)
     return image, solved
 
@@ -174,12 +186,19 @@ def _worthwhile(image: Image) -> bool:
 
 
 def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: Image) -> Solved | None:
-    """The crossings of flat rays; None where so many must be marched that coarse to fine is cheaper."""
-    reached = image.reached
+    """The crossings of flat rays; None where the field is steeper now, or so many must be marched that it does not pay.
+
+    How steep the field is, is measured now and then, and where the slopes at hits have changed.
+    """
+    reached, asked = image.reached, evened(field, image.steepness)
     steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
-    solved = tracer.solve(field, rays, reached, steady, image.distance[steady], furthest=CLEAR)
+    solved = tracer.solve(asked, rays, reached, steady, image.distance[steady], furthest=CLEAR)
     with torch.no_grad():
-        looked = _look(field, rays, reached)
+        change = (solved.slope / image.slope[steady])[solved.settled]
+        changed = len(change) == 0 or bool((change.median() - 1).abs() > STEEPER)
+        if (changed or image.renderings % MEASURED == 0) and not _as_steep(tracer, field, rays, image):
+            return None
+        looked = _look(asked, rays, reached)
         image.step = SAFETY * torch.maximum(_largest(solved.begun), _largest(looked - image.looked))
         image.moved, image.looked = image.moved + image.step, looked
         free, up_to_anchor = image.free(image.moved)
@@ -191,7 +210,7 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
             return None
         anchored = up_to_anchor & ~audited
         moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
-    found = tracer.resume(field, rays[index], moving).among(index)
+    found = tracer.resume(asked, rays[index], moving).among(index)
     with torch.no_grad():
         differing = _differing(solved, found, certain & audited)
         if memory.audit(int((certain & audited).sum()), differing):

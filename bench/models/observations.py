@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.models.held_out import HeldOut, HeldOutError
-from bench.setup.inputs import Invalid
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import GivenView
 from renderers.adaptive_samples import at_max_samples
 from renderers.camera import Rays, sphere_span
+from renderers.checks import BadInput
 from renderers.field import Field
 from renderers.rendering import Renderer
 
@@ -167,7 +167,7 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
         rays: number drawn in an iteration.
 
     Raises:
-        Invalid: where too few depths are given to hold some out.
+        BadInput: where too few depths are given to hold some out.
     """
     draw = torch.Generator().manual_seed(split.seed)
     out = torch.isin(group, torch.tensor(split.whole))
@@ -179,7 +179,7 @@ def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays:
     given = view.some((~out).nonzero().squeeze(-1))
     held_out = held(view, out, group, split.footprint)
     if len(held_out.group[held_out.observed].unique()) < 2:
-        raise Invalid(
+        raise BadInput(
             f"a field without a prior is evaluated on held-out depths, and {int(view.observed.sum())} depths are too "
             "few to hold some out: give more (task.points=100), or set field=prior"
         )

@@ -21,9 +21,10 @@ from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
 from bench.run.process import Ended, Job, Notice, Started, Step
-from bench.setup.inputs import Invalid, RunContext, RunInputs, set_up
+from bench.setup.inputs import RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
 from bench.tasks.task import TakesField, Task
+from renderers.checks import BadInput
 
 INTERVAL = 0.05  # least seconds between two messages on progress
 
@@ -79,7 +80,7 @@ def execute(
             task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
-    except Invalid as error:
+    except BadInput as error:
         record.status, record.reason = RunStatus.REFUSED, _one_line(error)
         log.error(traceback.format_exc())
     except Unsupported as error:
@@ -101,7 +102,7 @@ def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunIn
     """The task of that name and its inputs, before anything slow.
 
     Raises:
-        Invalid: for anything invalid in the configuration.
+        BadInput: for anything invalid in the configuration.
     """
     try:
         check_top_level(config)
@@ -112,7 +113,7 @@ def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunIn
         if not inputs.field.of_prior and not isinstance(task, TakesField):
             raise ValueError(f"task={name} does not take field={config.field}: leave it out")
     except (ValueError, OSError) as error:
-        raise Invalid(_one_line(error)) from error
+        raise BadInput(_one_line(error)) from error
     return task, inputs
 
 

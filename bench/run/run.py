@@ -16,7 +16,6 @@ from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, identify, release
 from bench.records.record import Record, RunStatus, now, read_record
-from bench.run import fork_server
 from bench.run.command import unwritten
 from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show
@@ -47,8 +46,6 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
         Interrupted: after Ctrl-C or SIGTERM.
         ValueError: where a single run's configuration cannot be run; its folder is removed.
     """
-    if config.isolation != Isolation.off:
-        fork_server.start()  # it imports meanwhile
     register()  # again, since a launcher's worker has not read the command line
     _stay_in_place(config)
     single = OmegaConf.is_missing(HydraConfig.get().job, "num")

@@ -23,23 +23,11 @@ from datasets.dataset import Dataset, Split
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.adaptive_samples import follow
+from renderers.checks import BadInput
 from renderers.rendering import Renderer, final_notes
 
 WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
 ALL_THREADS = torch.get_num_threads()  # that PyTorch takes by itself
-
-
-class Invalid(ValueError):
-    """What was asked for cannot be run, whatever the renderer; the message names the remedy."""
-
-
-@contextmanager
-def judging_input() -> Iterator[None]:
-    """Within it, a ValueError is about what the user gave."""
-    try:
-        yield
-    except ValueError as error:
-        raise Invalid(" ".join(str(error).split())) from error
 
 
 @dataclass(frozen=True)
@@ -64,8 +52,7 @@ class RunInputs:
     @cached_property
     def scene(self) -> Scene:
         """The scene, made at its first use: not every task needs one."""
-        with judging_input():
-            return self.make_scene()
+        return self.make_scene()
 
     @cached_property
     def pixel_precise(self) -> tuple[Renderer, list[str]]:
@@ -81,17 +68,17 @@ class RunInputs:
     @cached_property
     def prior(self) -> Prior:
         """The prior of the dataset, loaded or trained at its first use: not every task needs one."""
-        with judging_input(), torch.random.fork_rng():  # training a prior must not change later random draws
+        with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
 
     def fitted(self) -> Prior:
         """The prior with the code of the scene's shape alone.
 
         Raises:
-            Invalid: where the prior was not trained on that shape.
+            BadInput: where the prior was not trained on that shape.
         """
         if self.trained is None:
-            raise Invalid("task renders a network at a shape it was fitted to: add +experiment=fitted")
+            raise BadInput("task renders a network at a shape it was fitted to: add +experiment=fitted")
         return Prior(self.prior.decoder, self.prior.codes[self.trained : self.trained + 1])
 
 

@@ -11,7 +11,7 @@ from bench.models.field import solve_by_growth
 from bench.models.observations import Holdout, Observations, hold_out, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
-from bench.setup.inputs import RunContext, judging_input
+from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
@@ -88,7 +88,6 @@ class Completion:
         self, view: View, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[GivenView, Bool[Tensor, "height width"]]:
         """The given part of a view, and the pixels whose depth is given."""
-        with judging_input():
-            observed = observed_pixels(view, self.points, seed)
+        observed = observed_pixels(view, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
         return GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device), observed

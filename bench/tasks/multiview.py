@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.models.field import solve_by_growth
 from bench.models.observations import Observations
 from bench.pictures.run_figures import Given
-from bench.setup.inputs import Invalid, RunContext
+from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.optimise import StartSettings
@@ -22,7 +22,7 @@ from bench.tasks.photographs import GivenPhotographs, PhotographObservations
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.truth import Truth
-from renderers.checks import check_at_least, check_positive
+from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.rendering import Renderer
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
@@ -108,10 +108,10 @@ class Multiview:
         """The observations for a field without a prior; some photographs are held out.
 
         Raises:
-            Invalid: for settings that need a prior, and for too few photographs.
+            BadInput: for settings that need a prior, and for too few photographs.
         """
         if self.scale != 1 or self.degrees or self.shift or self.starts > 1:
-            raise Invalid("task.scale, degrees, shift and starts need a prior: set field=prior")
+            raise BadInput("task.scale, degrees, shift and starts need a prior: set field=prior")
         scene_seed = scene.seed(seed)
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
@@ -128,7 +128,7 @@ class Multiview:
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
         if len(prior.codes) < 2:
-            raise Invalid("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
+            raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
         spread = self.start_scale * prior.codes.std(0)
         codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
         return CodeProblem(

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.models.held_out import HeldOutError
-from bench.setup.inputs import Invalid
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings
@@ -19,6 +18,7 @@ from datasets.photographs import Photograph
 from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
 from renderers.camera import Rays
+from renderers.checks import BadInput
 from renderers.field import Field
 from renderers.rendering import Renderer, at_iteration
 
@@ -153,13 +153,13 @@ class PhotographObservations:
         """Holds out one of every `HELD_OUT_EVERY` pairs.
 
         Raises:
-            Invalid: where there are too few photographs.
+            BadInput: where there are too few photographs.
         """
         count = len(given.cameras)
         fitted, held_out = split_pairs(count, neighbour=given.settings.neighbour)
         if len(held_out) < 2 or not fitted:
             least = 2 * HELD_OUT_EVERY
-            raise Invalid(
+            raise BadInput(
                 f"{count} photographs leave no pairs to hold out where no prior is used: task.images.views={least}, "
                 "with task.neighbour=1, or field=prior"
             )

@@ -13,7 +13,7 @@ from torch import Tensor
 from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
 from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
-from bench.setup.inputs import Invalid, RunContext, RunInputs
+from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
@@ -22,7 +22,7 @@ from datasets.scene import Scene, View, see
 from datasets.truth import Truth
 from renderers.boundary import rendered
 from renderers.camera import Camera
-from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
 from renderers.rendering import Observed, Renderer, at_iteration
@@ -166,14 +166,14 @@ def known_shape(settings: Pose, inputs: RunInputs) -> Field:
     """The field of the scene's shape, of the kind that `settings.shape` names.
 
     Raises:
-        Invalid: where the scene has no such field.
+        BadInput: where the scene has no such field.
     """
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
     if settings.shape == "formula":
         if inputs.scene.formula is None:
-            raise Invalid(f"{inputs.scene.name} has no formula: set task.shape=grid")
+            raise BadInput(f"{inputs.scene.name} has no formula: set task.shape=grid")
         return inputs.scene.formula()
     values = Truth(inputs.scene.mesh).distance_grid(settings.grid, REACH)
     return Grid(torch.from_numpy(values).to(inputs.device), REACH)

@@ -77,5 +77,5 @@ def test_an_invalid_amount_is_an_error_with_a_remedy(view, points, rule):
 
 
 def test_more_points_than_the_shape_has_pixels_are_refused(view):
-    with pytest.raises(ValueError, match="at most the 200 pixels of the shape, not 201: raise resolution"):
+    with pytest.raises(ValueError, match="at most the 200 pixels of the shape, not 201: give fewer"):
         observed_pixels(view, 201, seed=0)

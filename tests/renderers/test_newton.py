@@ -8,10 +8,11 @@ from torch import Tensor
 
 from bench.config import load
 from datasets.views import ViewSampler
-from renderers.camera import Camera, Rays
+from renderers.camera import Camera, Rays, sphere_span
+from renderers.evened import PAIRS
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
-from renderers.packed_march import CLEAR, FURTHER, PAIRS, Reached, Stop, Stride, march, steepness
+from renderers.packed_march import CLEAR, FURTHER, Reached, Stop, Stride, march
 from renderers.rendering import Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, beam
 from tests.tiny import camera_of
@@ -23,7 +24,6 @@ SHAPES = {
     "brick": box((0.5, 0.4, 0.3)),
     "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1),
 }
-RAYS = beam((0.0, 0.0, 0.0))
 by_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 
 
@@ -137,7 +137,7 @@ WRONG = {  # fields with the zero set of a distance d, and the most values that 
 @pytest.mark.parametrize(("of", "most"), WRONG.values(), ids=WRONG)
 def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most, image):
     ring, seen = SHAPES["ring"], camera().rays()
-    truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p)), Kind.BOUND))
+    truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p))))
     rendering = NEWTON.render(wrong, seen if image else Rays(seen.origins, seen.directions))
     both = truth.hit & rendering.hit
     assert (truth.hit ^ rendering.hit).sum() <= 0.01 * truth.hit.sum()
@@ -145,18 +145,24 @@ def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most, image):
     assert wrong.counts.value <= most * truth.hit.numel()
 
 
-@pytest.mark.parametrize("of", [lambda d: 1.1 * d, lambda d: d, lambda d: 0.1 * d, lambda d: 0.4 * torch.sin(d / 0.4)])
-def test_a_field_that_is_hardly_steeper_than_a_distance_is_taken_for_one(of):
-    assert steepness(lambda p: of(SHAPES["ring"](p)), RAYS, 1.0) == 1.0
+def test_residuals_and_closest_values_of_a_steep_field_are_its_own():
+    ring, rays = SHAPES["ring"], camera().rays()
+    plain, steep = (NEWTON.render(Shape(lambda p, k=times: k * ring(p)), rays) for times in (1, 4))
+    beside = ~plain.hit & ~steep.hit & sphere_span(rays)[2] & (plain.closest < 0.1)
+    ratio = (steep.closest / plain.closest)[beside]
+    assert len(ratio) > 100 and ratio.median().item() == pytest.approx(4.0, rel=0.05)
+    inside = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]))
+    ball = Shape(lambda p: 4 * SHAPES["ball"](p))
+    assert NEWTON.render(ball, inside).residual.item() == pytest.approx(4 * -0.6)
 
 
-def test_the_steepness_of_a_field_is_measured_wherever_it_has_numbers():
-    def halved(points: Tensor) -> Tensor:
-        return torch.where(points[..., 0] > 0.3, torch.nan, 4 * SHAPES["ball"](points))
-
-    assert steepness(halved, RAYS, 1.0) == pytest.approx(4.0, rel=0.1)
-    assert steepness(lambda p: torch.full_like(p[..., 0], torch.nan), RAYS, 1.0) == 1.0
-    assert steepness(lambda p: torch.full_like(p[..., 0], torch.inf), RAYS, 1.0) == 1.0
+def test_values_of_a_bound_are_lengths_however_steep_they_are():
+    wire = SHAPES["brick"] | capsule((-0.8, 0.7, 0.0), (0.8, 0.7, 0.0), 0.02)
+    jumps = Shape(lambda p: torch.where(wire(p) > 0.3, wire(p), wire(p).clamp_max(0.1)), Kind.BOUND)
+    meters = [Meter(wire), Meter(jumps)]
+    plain, jumping = (NEWTON.render(meter, camera().rays()) for meter in meters)
+    assert (jumping.hit ^ plain.hit).sum() <= 3
+    assert meters[1].counts.value < 2.5 * meters[0].counts.value
 
 
 def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():
@@ -385,16 +391,6 @@ def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
     assert gone.distance.item() < 1.0 and gone.stopped(Stop.ON_THE_WAY).item()
     gone = marched(0.4, 0.7).split(parent, apart, fine, radius=1.0, error=0.002)
     assert gone.stopped(Stop.LEFT).item()
-
-
-@pytest.mark.parametrize("steepness", [1.0, 6.0])
-def test_what_a_finer_ray_has_passed_is_less_by_what_the_field_changes_on_the_way_to_it(steepness):
-    coarse = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0, steepness)
-    coarse.keep_least(coarse.entry, torch.tensor([0.5]).double())
-    finer = coarse.split(
-        torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0)), radius=1.0, error=0.0
-    )
-    assert finer.passed.item() == pytest.approx(0.5 - 0.03 * steepness)
 
 
 def test_a_step_whose_spheres_lie_apart_is_taken_back():

@@ -174,8 +174,8 @@ def test_in_a_sweep_a_value_that_cannot_be_is_a_record(bench, tmp_path):
 
 def test_more_points_than_pixels_are_told(bench):
     code, _, err = bench(*TINY, "task.points=5000")
-    assert code == 1
-    assert_one_line(err, "points must be at most the", "pixels of the shape, not 5000: raise resolution")
+    assert code == 2
+    assert_one_line(err, "points must be at most the", "pixels of the shape, not 5000: give fewer")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
