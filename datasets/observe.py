@@ -24,9 +24,8 @@ def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "h
     amount, is_share = parse_amount(points)
     count = max(1, round(available * amount)) if is_share else round(amount)
     if count > available:
-        raise BadInput(
-            f"points must be at most the {available} pixels of the shape, not {points}: give fewer, or raise view.resolution"
-        )
+        most = f"points must be at most the {available} pixels of the shape, not {points}"
+        raise BadInput(f"{most}: give fewer, or raise view.resolution")
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
     observed = torch.zeros(view.mask.numel(), dtype=torch.bool)
     observed[foreground[order[:count]]] = True
