@@ -2,9 +2,11 @@
 
 import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
@@ -14,57 +16,90 @@ from datasets.captures.hull import hull_mesh, hull_views
 
 MOST = 8  # photographs in the picture
 SAMPLES = 96  # of the hull, per axis
-DOUBTFUL = 0.8  # of the masks: where the hull covers less, cameras and masks hardly fit
+GOOD, DOUBTFUL = 0.9, 0.8  # overlap of hull and masks: above the first cameras are right, below the second hardly
+NAMED = 5  # photographs that fit worst
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How the visual hull fits the masks.
+
+    Args:
+        silhouettes: of the hull, for each photograph.
+        overlaps: intersection over union with its mask.
+    """
+
+    silhouettes: list[Bool[np.ndarray, "height width"]]
+    overlaps: list[float]
+
+    @staticmethod
+    def of(capture: Capture) -> "Fit":
+        """The fit of all photographs, which have masks."""
+        silhouettes = [seen.numpy() for seen in hull_views(capture.shots, hull_mesh(capture.shots, SAMPLES))]
+        masks = [np.asarray(shot.mask) for shot in capture.shots]
+        pairs = list(zip(silhouettes, masks, strict=True))
+        return Fit(silhouettes, [float((seen & mask).sum() / max((seen | mask).sum(), 1)) for seen, mask in pairs])
+
+    def lines(self, capture: Capture) -> list[str]:
+        """The fit in words."""
+        middle, order = float(np.median(self.overlaps)), np.argsort(self.overlaps)
+        found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD:.0%} and more is good)"]
+        worst = [place for place in order[:NAMED] if self.overlaps[place] < DOUBTFUL]
+        if worst:
+            named = ", ".join(f"{capture.shots[place].name} {self.overlaps[place]:.0%}" for place in worst)
+            found.append(f"note: least in {named}: look at their masks and cameras")
+        if middle < DOUBTFUL:
+            found.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
+        return found
 
 
 @rc_context(SCREEN)
-def draw(capture: Capture) -> tuple[Figure, float | None]:
-    """The photographs, with the hull's silhouette over the masks below; and the share of the masks that it covers."""
-    chosen = np.unique(np.linspace(0, len(capture.shots) - 1, min(MOST, len(capture.shots))).round().astype(int))
+def draw(capture: Capture, fit: Fit | None) -> Figure:
+    """Photographs, evenly spaced and the one that fits worst, with the hull's silhouette over the masks below."""
+    chosen = np.linspace(0, len(capture.shots) - 1, min(MOST, len(capture.shots))).round().astype(int)
+    if fit is not None and (worst := int(np.argmin(fit.overlaps))) not in chosen:
+        chosen[np.abs(chosen - worst).argmin()] = worst
     shots = [capture.shots[place] for place in chosen]
-    figure = Figure(figsize=(1.6 * len(shots), 3.6 if capture.masks else 2.0), layout="constrained")
-    axes = figure.subplots(2 if capture.masks else 1, len(shots), squeeze=False)
+    figure = Figure(figsize=(1.6 * len(shots), 2.0 if fit is None else 3.6), layout="constrained")
+    axes = figure.subplots(1 if fit is None else 2, len(shots), squeeze=False)
+    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs")
     for axis, shot in zip(axes[0], shots, strict=True):
         bare(axis).imshow(shot.colours.numpy())
         axis.set_title(Path(shot.name).stem)
-    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs")
-    if not capture.masks:
-        return figure, None
-    covered = []
-    for axis, shot, seen in zip(axes[1], shots, hull_views(shots, hull_mesh(capture.shots, SAMPLES)), strict=True):
-        assert shot.mask is not None
-        covered.append(float((seen & shot.mask).sum() / shot.mask.sum()))
-        bare(axis).imshow(silhouette_image(seen.numpy(), shot.mask.numpy()), interpolation="nearest")
-        axis.set_title(f"{covered[-1]:.0%} of the mask")
-    axes[1, 0].set_ylabel("hull and mask")
-    figure.supxlabel("grey both, red mask without hull, blue hull without mask")
-    return figure, float(np.median(covered))
+    if fit is not None:
+        for axis, place in zip(axes[1], chosen, strict=True):
+            picture = silhouette_image(fit.silhouettes[place], np.asarray(capture.shots[place].mask))
+            bare(axis).imshow(picture, interpolation="nearest")
+            axis.set_title(f"overlap {fit.overlaps[place]:.0%}")
+        axes[1, 0].set_ylabel("hull and mask")
+        figure.supxlabel("grey both, red mask without hull, blue hull without mask")
+    return figure
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Reads the command line; 0 where the photographs can be used."""
     parser = argparse.ArgumentParser(prog="python -m bench.photos", description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--longest", type=int, default=128, help="pixels of a photograph's longer side")
-    parser.add_argument("--axes", choices=tuple(AXES), default="stated")
-    parser.add_argument("--without-masks", action="store_true")
-    parser.add_argument("--into", type=Path, default=Path("photos.png"), help="the picture's file")
+    parser.add_argument("folder", type=Path, help="with photographs and their cameras, see datasets/README.md")
+    parser.add_argument("--longest", type=int, default=128, help="pixels of the longer side (default: %(default)s)")
+    parser.add_argument("--axes", choices=tuple(AXES), default="stated", help="flipped: y and z turned round")
+    parser.add_argument("--without-masks", action="store_true", help="as if there were none")
+    parser.add_argument("--into", type=Path, default=Path("photos.png"), help="the picture (default: %(default)s)")
     given = parser.parse_args(arguments)
+    into = given.into / "photos.png" if given.into.is_dir() else given.into.with_suffix(".png")
     try:
+        into.parent.mkdir(parents=True, exist_ok=True)
         capture = read_capture(given.folder, longest=given.longest, masks=not given.without_masks, axes=given.axes)
-        figure, covered = draw(capture)
-        figure.savefig(given.into, dpi=110)
+        fit = Fit.of(capture) if capture.masks else None
+        draw(capture, fit).savefig(into, dpi=110)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(capture.summary)
     for note in capture.notes:
         print(f"note: {note}")
-    if covered is not None:
-        print(f"the visual hull covers {covered:.0%} of the masks (median of the photographs in the picture)")
-        if covered < DOUBTFUL:
-            print("note: cameras and masks hardly fit: look at the picture, and try --axes flipped")
-    print(given.into)
+    if fit is not None:
+        print("\n".join(fit.lines(capture)))
+    print(into)
     return 0
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from datasets.captures.formats import OPENGL, find_layout
 from datasets.captures.hull import Sphere, sphere_of
 from datasets.captures.shot import Shot, take
-from renderers.checks import check_at_least, check_choice
+from renderers.checks import BadInput, check_at_least, check_choice
 
 AXES = {"stated": np.eye(4), "flipped": OPENGL}
 FEWEST = 3  # photographs
@@ -55,22 +55,22 @@ def read_capture(folder: Path, *, longest: int, masks: bool = True, axes: str = 
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
 
     Raises:
-        ValueError: where something is missing, or cameras and masks do not fit.
+        BadInput: where something is missing, or cameras and masks do not fit.
     """
-    check_at_least("dataset.longest", longest, 8, "96 is small")
-    check_choice("dataset.axes", axes, tuple(AXES))
+    check_at_least("longest", longest, 8, "128 shows what there is")
+    check_choice("axes", axes, tuple(AXES))
     layout = find_layout(folder)
     if len(layout.frames) < FEWEST:
-        raise ValueError(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
+        raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
     frames = [replace(frame, world_to_camera=AXES[axes] @ frame.world_to_camera) for frame in layout.frames]
     shots = [take(frame, longest) for frame in frames]
     lacking = [shot.name for shot in shots if shot.mask is None]
     if masks and 0 < len(lacking) < len(shots):
-        raise ValueError(f"{lacking[0]} has no mask, and others have one: add it, or set dataset.masks=false")
+        raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
     masked = masks and not lacking
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
     if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
-        raise ValueError(f"the mask of {blank[0]} is empty: remove the image, or set dataset.masks=false")
+        raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
     sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(shots)
     source = "files" if frames[0].mask is not None else "the alpha channel"
     return Capture(

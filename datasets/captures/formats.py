@@ -5,15 +5,19 @@ Axes and pixels become those of `renderers.camera`: x right, y down, z forward, 
 
 import json
 import re
-from dataclasses import dataclass
-from math import tan
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import pi, tan
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 from scipy.linalg import rq
+
+from renderers.checks import BadInput
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
@@ -73,18 +77,43 @@ def find_layout(folder: Path) -> Layout:
     """The photographs of a folder, in the first known format that it has.
 
     Raises:
-        ValueError: where it has none, where an image has no camera, or where a file cannot be read.
+        BadInput: where it has none, where an image has no camera, or where a file cannot be read.
     """
     if not folder.is_dir():
         what = f"{folder} is a file" if folder.exists() else f"there is no folder {folder}"
-        raise ValueError(f"dataset.path: {what}; name the folder that has the photographs and their cameras")
-    for read in (idr, transforms, middlebury, llff, colmap):
+        raise BadInput(f"{what}: name the folder that has the photographs and their cameras")
+    found = [layout for read in (idr, transforms, middlebury, llff, colmap) if (layout := _read(read, folder))]
+    if not found:
+        raise BadInput(f"{folder} has no cameras that are known: {KNOWN}")
+    usable = [layout for layout in found if layout.frames]
+    if not usable:
+        names = ", ".join(layout.format for layout in found)
+        raise BadInput(f"{folder} has cameras ({names}) but none of their images: copy these too")
+    others = ", ".join(layout.format for layout in found if layout is not usable[0])
+    notes = (*usable[0].notes, f"other cameras in the folder are not used: {others}") if others else usable[0].notes
+    return replace(usable[0], notes=notes)
+
+
+def _read(read: Callable[[Path], Layout | None], folder: Path) -> Layout | None:
+    """What a format's reader finds; where a file of it is broken, an error that names the format.
+
+    Raises:
+        BadInput: where something is missing, or cannot be read.
+    """
+    try:
         layout = read(folder)
-        if layout is not None and not layout.frames:
-            raise ValueError(f"{folder} has cameras ({layout.format}) but none of their images: copy these too")
-        if layout is not None:
-            return layout
-    raise ValueError(f"dataset.path: {folder} has no cameras that are known: {KNOWN}")
+    except BadInput:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, BadZipFile, RuntimeError) as error:
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise BadInput(f"{read.__name__} cameras of {folder} cannot be read ({what}): export them again") from error
+    for frame in layout.frames if layout else ():
+        numbers = np.concatenate([frame.intrinsics.ravel(), frame.world_to_camera.ravel(), frame.distortion])
+        if len(numbers) != 9 + 16 + 4 or not np.isfinite(numbers).all() or not (numbers[[0, 4]] > 0).all():
+            raise BadInput(
+                f"the camera of {frame.image} must have finite numbers and positive focal lengths: export it again"
+            )
+    return layout
 
 
 def idr(folder: Path) -> Layout | None:
@@ -103,9 +132,9 @@ def idr(folder: Path) -> Layout | None:
     images = _images(folder, "image", "images")
     place = dict(enumerate(images)) if len(images) >= count else _numbered(images)
     if lost := [image for i, image in place.items() if i >= count]:
-        raise ValueError(
+        raise BadInput(
             f"{lost[0]} has no camera: {files[0].name} has {count} cameras, and there are {len(images)} images; "
-            "remove those without a camera"
+            "remove those without a camera, or add its world_mat and scale_mat"
         )
     masks = _matched(images, _images(folder, "mask", "masks"))
     frames = [Frame(image, *decomposed(projections[i]), masks.get(image)) for i, image in place.items()]
@@ -124,8 +153,10 @@ def transforms(folder: Path) -> Layout | None:
         listed = [stored | frame for frame in stored["frames"]]
         found = [(frame, _with_suffix(folder / frame["file_path"])) for frame in listed]
         frames = [_nerf_frame(folder, frame, image) for frame, image in found if image is not None]
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{files[0]} cannot be read ({type(error).__name__}: {error}): export it again") from error
+    except (LookupError, TypeError, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput(f"{files[0]} cannot be read ({type(error).__name__}: {error}): export it again") from error
     missing = [str(frame["file_path"]) for frame, image in found if image is None]
     notes = (f"{len(missing)} images are not there, such as {missing[0]}",) if missing else ()
     return Layout("NeRF", tuple(sorted(frames, key=lambda frame: _order(frame.image))), None, notes)
@@ -134,9 +165,11 @@ def transforms(folder: Path) -> Layout | None:
 def _nerf_frame(folder: Path, known: dict[str, Any], image: Path) -> Frame:
     """The frame of one image from what the file says of all and of it."""
     if "FISHEYE" in str(known.get("camera_model", "")).upper():
-        raise ValueError(f"{folder} has fisheye cameras: undistort the images, and export them with pinhole cameras")
+        raise BadInput(f"{folder} has fisheye cameras: undistort the images, and export them with pinhole cameras")
     width, height = (int(known["w"]), int(known["h"])) if "w" in known else Image.open(image).size
-    across = known["fl_x"] if "fl_x" in known else width / 2 / tan(known["camera_angle_x"] / 2)
+    if "fl_x" not in known and not 0 < float(known["camera_angle_x"]) < pi:
+        raise BadInput(f"camera_angle_x must lie between 0 and pi, not {known['camera_angle_x']}: it is in radians")
+    across = float(known["fl_x"]) if "fl_x" in known else width / 2 / tan(float(known["camera_angle_x"]) / 2)
     down = known.get("fl_y", across)
     middle = known.get("cx", width / 2), known.get("cy", height / 2)
     intrinsics = np.array([[across, 0, middle[0]], [0, down, middle[1]], [0, 0, 1.0]])
@@ -157,7 +190,7 @@ def middlebury(folder: Path) -> Layout | None:
     for line in files[0].read_text().splitlines()[1:]:
         name, *numbers = line.split()
         if len(numbers) != 21:
-            raise ValueError(f"{files[0]}: a line must have a name and 21 numbers, not {len(numbers)}: copy it again")
+            raise BadInput(f"{files[0]}: the line of {name} must have 21 numbers, not {len(numbers)}: copy it again")
         values = np.array(numbers, dtype=np.float64)
         intrinsics, motion = values[:9].reshape(3, 3), np.eye(4)
         motion[:3, :3], motion[:3, 3] = values[9:18].reshape(3, 3), values[18:]
@@ -166,7 +199,7 @@ def middlebury(folder: Path) -> Layout | None:
         else:
             missing.append(name)
     if lost := sorted(set(images) - {frame.image.name for frame in frames}):
-        raise ValueError(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
+        raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
     notes = (f"no image for {', '.join(missing)}",) if missing else ()
     return Layout("Middlebury", tuple(frames), None, notes)
 
@@ -178,7 +211,7 @@ def llff(folder: Path) -> Layout | None:
         return None
     rows, images = np.load(file), _images(folder, "images", "images_2", "images_4", "images_8")
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) != len(images):
-        raise ValueError(
+        raise BadInput(
             f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)} and {len(images)} "
             "images: copy the images that were removed, or make it again"
         )
@@ -202,7 +235,7 @@ def colmap(folder: Path) -> Layout | None:
     try:
         import pycolmap
     except ImportError as error:
-        raise ValueError(f"{places[0]} is read by pycolmap: pip install -e '.[colmap]'") from error
+        raise BadInput(f"{places[0]} is read by pycolmap: pip install -e '.[colmap]'") from error
     stored = pycolmap.Reconstruction(str(places[0]))
     images = {image.name: image for image in _images(folder, "images", "images_2", "images_4", "images_8")}
     masks, frames, missing = _matched(list(images.values()), _images(folder, "mask", "masks")), [], []
@@ -210,7 +243,7 @@ def colmap(folder: Path) -> Layout | None:
         camera, name = stored.cameras[seen.camera_id], Path(seen.name).name
         model = camera.model.name
         if model not in DISTORTIONS:
-            raise ValueError(f"{places[0]} has cameras of the model {model}: use colmap image_undistorter first")
+            raise BadInput(f"{places[0]} has cameras of the model {model}: use colmap image_undistorter first")
         if name not in images:
             missing.append(name)
             continue
@@ -228,6 +261,8 @@ def colmap(folder: Path) -> Layout | None:
 
 def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "4 4"]]:
     """Intrinsics and world_to_camera of a projection whose first pixel's centre is at whole numbers."""
+    if projection.shape != (3, 4) or not np.isfinite(projection).all():
+        raise ValueError("a projection must have 3 x 4 finite numbers")
     projection = projection * np.sign(np.linalg.det(projection[:, :3]))
     upper, rotation = rq(projection[:, :3])
     signs = np.diag(np.sign(np.diag(upper)))
@@ -271,14 +306,14 @@ def _matched(images: list[Path], masks: list[Path]) -> dict[Path, Path]:
     """The mask of each image: of the same name, or else the same last number.
 
     Raises:
-        ValueError: where there are masks, but an image has none.
+        BadInput: where there are masks, but an image has none.
     """
     if not masks:
         return {}
     by_name, by_number = {mask.stem: mask for mask in masks}, _numbered(masks)
     found = {image: by_name.get(image.stem) or by_number.get(next(iter(_numbered([image])), -1)) for image in images}
     if lacking := [image for image, mask in found.items() if mask is None]:
-        raise ValueError(f"{lacking[0]} has no mask in {masks[0].parent}: add it, or remove the folder of masks")
+        raise BadInput(f"{lacking[0]} has no mask in {masks[0].parent}: add it, or remove the folder of masks")
     return {image: mask for image, mask in found.items() if mask is not None}
 
 

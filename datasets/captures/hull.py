@@ -13,6 +13,7 @@ from datasets.captures.shot import Shot
 from datasets.mesh import Mesh
 from datasets.scene import see
 from datasets.truth import Truth
+from renderers.checks import BadInput
 
 SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
 FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
@@ -88,7 +89,7 @@ def sphere_of(shots: Sequence[Shot]) -> Sphere:
     """A sphere about the object: about the visual hull of the masks or, without masks, about what all cameras look at.
 
     Raises:
-        ValueError: where the hull is empty.
+        BadInput: where the hull is empty.
     """
     centre, half = _looked_at(shots)
     if any(shot.mask is None for shot in shots):
@@ -98,9 +99,9 @@ def sphere_of(shots: Sequence[Shot]) -> Sphere:
         points = torch.from_numpy(centre) + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         inside = points[carve(shots, points.float()) < 0].numpy()
         if len(inside) == 0:
-            raise ValueError(
-                "the visual hull of the masks is empty: no point is inside of all masks. Cameras do not fit the masks: "
-                "try dataset.axes=flipped, check the order of the images, or set dataset.masks=false"
+            raise BadInput(
+                "the visual hull of the masks is empty: no point is inside of all masks, so that cameras do not fit "
+                "the masks. Try flipped axes, check the order of the images and that masks are white on the object"
             )
         spacing = 2 * half / (SAMPLES - 1)
         low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing

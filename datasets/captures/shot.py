@@ -5,14 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from datasets.captures.formats import Frame
 from renderers.camera import Camera
+from renderers.checks import BadInput
 
 BACKGROUND = 1.0  # behind an image with an alpha channel: white, as NeRF has it
+LABELS = 32  # a mask whose largest value is below has labels, not grey values
 SAME_SHAPE = 0.01  # most by which width over height of an image may differ from those of its camera, as a share
 
 
@@ -43,12 +45,12 @@ def take(frame: Frame, longest: int) -> Shot:
     """Reads a frame's photograph, with at most `longest` pixels along its longer side.
 
     Raises:
-        ValueError: where a file cannot be read, or image, mask and camera have different shapes.
+        BadInput: where a file cannot be read, or image, mask and camera have different shapes.
     """
     image = _opened(frame.image)
     height, width = frame.size or (image.height, image.width)
     if abs(image.width * height / (image.height * width) - 1) > SAME_SHAPE:
-        raise ValueError(
+        raise BadInput(
             f"{frame.image} has {image.width} x {image.height} pixels, its camera {width} x {height}: crop neither, or "
             "write the camera for this image"
         )
@@ -56,7 +58,7 @@ def take(frame: Frame, longest: int) -> Shot:
     size = max(round(image.width * share), 1), max(round(image.height * share), 1)
     alpha = "A" in image.getbands() or "transparency" in image.info
     pixels = np.asarray(image.convert("RGBA" if alpha else "RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
-    colours, opaque = pixels[..., :3], pixels[..., 3:] if alpha else None
+    colours, opaque = pixels[..., :3], pixels[..., 3:] if alpha and pixels[..., 3].min() < 1 else None
     if opaque is not None:
         colours = colours * opaque + BACKGROUND * (1 - opaque)
     if frame.mask is not None:
@@ -70,17 +72,20 @@ def take(frame: Frame, longest: int) -> Shot:
     try:
         camera = Camera(*matrices, size[1], size[0])
     except ValueError as error:
-        raise ValueError(f"the camera of {frame.image}: {error}") from None
+        raise BadInput(f"the camera of {frame.image}: {error}") from None
     mask = None if opaque is None else torch.from_numpy(opaque[..., 0] > 0.5)
     return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask)
 
 
 def _opened(path: object) -> Image.Image:
     try:
-        image = Image.open(str(path))
+        image = ImageOps.exif_transpose(Image.open(str(path)))
         image.load()
     except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+        raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+    if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
+        values = np.asarray(image, np.float64)
+        image = Image.fromarray((values * (255 / (65535 if values.max() > 255 else 255))).astype(np.uint8))
     return image
 
 
@@ -88,12 +93,15 @@ def _mask(frame: Frame, full: tuple[int, int], size: tuple[int, int]) -> Float[n
     """A frame's mask, from 0 to 1, at the size of its made-smaller photograph."""
     image = _opened(frame.mask)
     if (image.width, image.height) != full:
-        raise ValueError(
+        raise BadInput(
             f"{frame.mask} has {image.width} x {image.height} pixels, its image {full[0]} x {full[1]}: a mask has the "
             "size of its image"
         )
     grey = image.getchannel("A") if image.mode in ("LA", "RGBA") and image.getextrema()[-1][0] < 255 else image
-    return np.asarray(grey.convert("L").resize(size, Image.Resampling.BOX), np.float32)[..., None] / 255
+    values = np.asarray(grey.convert("L"))
+    if 0 < values.max() < LABELS:  # labels, 0 the background
+        values = (255 * (values > 0)).astype(np.uint8)
+    return np.asarray(Image.fromarray(values).resize(size, Image.Resampling.BOX), np.float32)[..., None] / 255
 
 
 def _undistorted(

@@ -237,6 +237,14 @@ def spoilt(folder: Path, how: str) -> None:
         Image.new("L", SIZE[::-1]).save(folder / "mask" / "004.png")
     elif how == "broken image":
         (folder / "image" / "000004.png").write_bytes(b"no image")
+    elif how == "no numbers":
+        np.savez(folder / "cameras_sphere.npz", **{f"world_mat_{i}": np.full((4, 4), np.nan) for i in range(10)})
+    elif how == "broken cameras":
+        (folder / "cameras_sphere.npz").write_bytes(b"no archive")
+    elif how == "gap in the cameras":
+        with np.load(folder / "cameras_sphere.npz") as stored:
+            known = {name: stored[name] for name in stored if name != "world_mat_0"}
+        np.savez(folder / "cameras_sphere.npz", **known)
     elif how == "no images":
         shutil.rmtree(folder / "image")
     elif how == "no cameras":
@@ -249,8 +257,11 @@ def spoilt(folder: Path, how: str) -> None:
         ("image without camera", ("000010.png has no camera", "has 10 cameras, and there are 11 images", "remove")),
         ("mask missing", ("000004.png has no mask in", "add it, or remove the folder")),
         ("mask of another size", ("004.png has 10 x 10 pixels, its image 48 x 40",)),
-        ("empty mask", ("the mask of 000004.png is empty", "dataset.masks=false")),
+        ("empty mask", ("the mask of 000004.png is empty", "use no masks")),
         ("broken image", ("000004.png cannot be read as an image", "copy or export it again")),
+        ("no numbers", ("idr cameras of", "cannot be read", "export them again")),
+        ("broken cameras", ("idr cameras of", "cannot be read", "export them again")),
+        ("gap in the cameras", ("idr cameras of", "world_mat_0", "export them again")),
         ("no images", ("has cameras (IDR/NeuS) but none of their images",)),
         ("no cameras", ("has no cameras that are known", "transforms.json", "poses_bounds.npy")),
     ],
@@ -268,7 +279,7 @@ def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
     out = capsys.readouterr().out
     assert "9 photographs" in out and "note: no image for cameras 4" in out
-    assert int(out.split("the visual hull covers ")[1].split("%")[0]) > 90
+    assert int(out.split("overlap by ")[1].split("%")[0]) > 90
     assert (tmp_path / "photos.png").stat().st_size > 10_000
 
 
@@ -280,8 +291,65 @@ def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
     (tmp_path / "transforms.json").write_text(json.dumps(stored))
     picture = ("--into", str(tmp_path / "photos.png"))
     assert main([str(tmp_path), *picture]) == 2
-    assert "the visual hull of the masks is empty" in (err := capsys.readouterr().err) and "axes=flipped" in err
+    assert "the visual hull of the masks is empty" in (err := capsys.readouterr().err) and "flipped axes" in err
     assert main([str(tmp_path), "--axes", "flipped", *picture]) == 0
+
+
+def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
+    idr(tmp_path)
+    mask = np.asarray(Image.open(tmp_path / "mask" / "007.png"))
+    Image.fromarray(np.roll(mask, 6, axis=1)).save(tmp_path / "mask" / "007.png")
+    assert main([str(tmp_path), "--into", str(tmp_path / "a" / "b")]) == 0
+    out = capsys.readouterr().out
+    assert "note: least in 000007.png" in out and out.splitlines()[-1] == str(tmp_path / "a" / "b.png")
+    assert (tmp_path / "a" / "b.png").is_file()
+
+
+def test_of_two_formats_the_one_with_images_is_taken_and_the_other_named(tmp_path):
+    nerf(tmp_path)
+    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))
+    capture = read_capture(tmp_path, longest=48)
+    assert capture.format == "NeRF" and capture.notes == ("other cameras in the folder are not used: IDR/NeuS",)
+
+
+@pytest.mark.parametrize("key", ["camera_angle_x", "transform_matrix"])
+def test_broken_transforms_are_told(tmp_path, key):
+    nerf(tmp_path)
+    stored = json.loads((tmp_path / "transforms.json").read_text())
+    if key == "camera_angle_x":
+        del stored["fl_x"]
+        stored[key] = 39.6
+    else:
+        stored["frames"][3][key] = [[1.0, 0.0], [0.0, 1.0]]
+    (tmp_path / "transforms.json").write_text(json.dumps(stored))
+    words = "between 0 and pi, not 39.6: it is in radians" if key == "camera_angle_x" else "cannot be read"
+    with pytest.raises(ValueError, match=words):
+        read_capture(tmp_path, longest=48)
+
+
+def test_images_of_16_bits_turned_images_and_masks_of_labels_are_read(tmp_path):
+    idr(tmp_path)
+    plain = read_capture(tmp_path, longest=48)
+    picture = Image.open(tmp_path / "image" / "000002.png")
+    Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257).save(tmp_path / "image" / "000002.png")
+    mask = np.asarray(Image.open(tmp_path / "mask" / "002.png"))
+    Image.fromarray((mask > 0).astype(np.uint8)).save(tmp_path / "mask" / "002.png")
+    turned = Image.open(tmp_path / "image" / "000005.png").transpose(Image.Transpose.ROTATE_90)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # "turn it by 90 degrees clockwise"
+    turned.save(tmp_path / "image" / "000005.png", exif=exif)
+    found = read_capture(tmp_path, longest=48)
+    assert torch.equal(found.shots[2].mask, plain.shots[2].mask)
+    grey = plain.shots[2].colours @ torch.tensor([0.299, 0.587, 0.114])
+    torch.testing.assert_close(found.shots[2].colours[..., 0], grey, rtol=0, atol=0.01)
+    assert torch.equal(found.shots[5].colours, plain.shots[5].colours)
+
+
+def test_an_alpha_channel_that_is_opaque_is_no_mask(tmp_path):
+    nerf(tmp_path)
+    for file in (tmp_path / "train").iterdir():
+        Image.open(file).convert("RGB").convert("RGBA").save(file)
+    assert read_capture(tmp_path, longest=48).masks == ""
 
 
 def test_images_of_two_sizes_each_have_their_camera(tmp_path):
