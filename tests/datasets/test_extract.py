@@ -67,3 +67,10 @@ def test_a_surface_that_leads_out_of_the_asked_blocks_is_followed():
     steep = Shape(lambda p: rod(p) * torch.where(p.norm(dim=-1) < 0.4, 1.0, 500.0), Kind.BOUND)
     mesh = extract(steep, grid=64, reach=1.05)
     assert mesh.watertight and mesh.vertices[:, 0].max() == pytest.approx(0.9, abs=0.02)
+
+
+def test_small_parts_are_found_by_values_that_are_far_too_large():
+    for place in np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3)).tolist():
+        counted = Meter(Shape(lambda p, ball=sphere(0.07, tuple(place)): 20 * ball(p), Kind.BOUND))
+        assert extract(counted, grid=64, reach=1.05) is not None
+        assert counted.counts.value < 64**3 / 20
