@@ -71,6 +71,7 @@ def test_a_surface_that_leads_out_of_the_asked_blocks_is_followed():
 
 def test_small_parts_are_found_by_values_that_are_far_too_large():
     for place in np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3)).tolist():
-        counted = Meter(Shape(lambda p, ball=sphere(0.07, tuple(place)): 20 * ball(p), Kind.BOUND))
+        ball = sphere(0.07, tuple(place))
+        counted = Meter(Shape(lambda p, ball=ball: 20 * ball(p), Kind.BOUND))
         assert extract(counted, grid=64, reach=1.05) is not None
         assert counted.counts.value < 64**3 / 20
