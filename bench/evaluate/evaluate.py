@@ -256,7 +256,7 @@ def _view(renderer: Renderer, field: Field, camera: Camera, device: torch.device
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:
     """From each source point to the nearest target point: distance, and absolute cosine of the normals."""
-    distance, index = cKDTree(target.points).query(source.points, workers=torch.get_num_threads())
+    distance, index = cKDTree(target.points).query(source.points)
     return distance, np.abs((_unit(source.normals) * _unit(target.normals)[index]).sum(axis=1))
 
 

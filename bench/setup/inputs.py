@@ -47,7 +47,6 @@ class RunInputs:
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
-    most_threads: int = 1  # of the CPU, for what is not timed
 
     @cached_property
     def scene(self) -> Scene:
@@ -93,10 +92,9 @@ class RunContext:
 
     @contextmanager
     def off_clock(self) -> Iterator[None]:
-        """Within it, what is not timed: it uses more threads, and its seconds count as the evaluation's."""
+        """Within it, what is not part of the loop's time: its seconds count as the evaluation's."""
         clock = time.perf_counter()
-        with using_threads(self.inputs.most_threads):
-            yield
+        yield
         seconds = self.record.seconds
         seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
 
@@ -114,7 +112,6 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
     evaluation = build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
     settings = prior_settings(config)
     torch.set_num_threads(config.threads or threads_for(settings.network.width))
-    most_threads = config.threads or ALL_THREADS
     cache = Path(config.priors_dir)
     torch.manual_seed(config.seed)
     trained = config.index if config.split == Split.TRAIN and config.index < settings.shapes else None
@@ -123,7 +120,7 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
         return make_scene(dataset, views, split=Split(config.split), index=config.index)
 
     def make_prior() -> Prior:
-        with using_threads(most_threads):  # training pays with more of them
+        with using_threads(config.threads or ALL_THREADS):  # training pays with more of them
             return prior_for(dataset, settings, cache, device, progress)
 
     return RunInputs(
@@ -140,7 +137,6 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
         field=FieldChoice(config.field, build(config.models, "models", target="bench.setup.fields.ModelSettings")),
         notes=tuple(notes),
         trained=trained,
-        most_threads=most_threads,
     )
 
 

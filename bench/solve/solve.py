@@ -26,8 +26,7 @@ COSTS = {
     "seconds.warmup": "one step's forward and backward pass before the clock starts; its evaluations are not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
-    "seconds.evaluation": "meshes, metrics and pictures, by all threads unless `threads` is set; not part of the "
-    "loop's time",
+    "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
     "peak_memory_bytes": "highest rise, during the loop, of the process's resident memory (CPU) or PyTorch's (GPU)",
     "flops": "evaluations times the field's operations per evaluation, coarse ones included",

@@ -19,7 +19,6 @@ from omegaconf import OmegaConf
 from bench.__main__ import main
 from bench.config import EvaluationSettings
 from bench.evaluate.evaluate import Evaluation
-from bench.machine.environment import using_threads
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus
 from bench.run import execute
@@ -322,7 +321,7 @@ def curve_after(tmp_path, monkeypatch):
                 seen.append((tmp_path / "curve.jsonl").read_text())
 
         monkeypatch.setattr(solve, "optimise", optimise)
-        stage = Mock(spec=RunInputs, device=None, most_threads=1, evaluation=EvaluationSettings(every=None))
+        stage = Mock(spec=RunInputs, device=None, evaluation=EvaluationSettings(every=None))
         cell = RunContext(stage, tmp_path, blank_record(), lambda *_: None)
         solve.descend(Toy(), OptimiserSettings(len(totals), 0.1, "constant"), cell, lambda _: {})
         return seen
@@ -356,7 +355,6 @@ def test_the_curve_is_json_whatever_the_loss(curve_after):
 def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(clock, tmp_path, every, iterations, looks):
     class Slow(Toy):
         def loss(self, iteration):
-            assert torch.get_num_threads() == 1
             clock.sleep(1.0)
             return super().loss(iteration)
 
@@ -364,18 +362,15 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(cloc
     radii = []
 
     def see(iteration):
-        assert torch.get_num_threads() == 3
         clock.sleep(100.0)
         radii.append(toy.radius.item())
         return {"chamfer_l2": radii[-1]}
 
-    often = EvaluationSettings(every=every)
-    stage = Mock(spec=RunInputs, device=torch.device("cpu"), most_threads=3, evaluation=often)
+    stage = Mock(spec=RunInputs, device=torch.device("cpu"), evaluation=EvaluationSettings(every=every))
     record = blank_record()
     record.seconds["evaluation"] = 1.0
     settings = OptimiserSettings(iterations, 0.05, "constant")
-    with using_threads(1):
-        history = solve.descend(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
+    history = solve.descend(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
     curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in curve] == list(range(iterations))
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == looks
