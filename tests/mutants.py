@@ -210,7 +210,7 @@ MUTANTS = (
     M("datasets/truth.py", "np.sqrt(generator.random(count))",
       "generator.random(count)", "tests/datasets/test_truth.py"),
     M("datasets/truth.py", "[origins, directions / lengths]", "[origins, directions]", "tests/datasets/test_truth.py"),
-    M("datasets/extract.py", "MARGIN = 2.0", "MARGIN = 0.2", "tests/datasets/test_extract.py"),
+    M("datasets/extract.py", "STEEPER = 1.2", "STEEPER = 0.12", "tests/datasets/test_extract.py"),
     M("datasets/extract.py", "while (found :=", "if (found :=", "tests/datasets/test_extract.py"),
     M("datasets/extract.py", "max(MARGIN, STEEPER * steepest)", "MARGIN", "tests/datasets/test_extract.py"),
     M("datasets/extract.py", "BLOCKS = (4, 2)", "BLOCKS = (4,)", "tests/datasets/test_extract.py"),
