@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from bench.evaluate.evaluate import picture_view
@@ -255,10 +256,11 @@ def _curve(curve: list[dict[str, Any]]) -> Figure:
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
         for name, colour in TERMS.items():
-            values = [line[name] for line in curve if name in line]
-            if any(value > 0 for value in values):
-                axis.semilogy([line[key] for line in curve], values, label=name, color=colour, lw=1.4)
+            known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
+            if known:
+                axis.semilogy(*zip(*known, strict=True), label=name, color=colour, lw=1.4)
         axis.set_xlabel(label)
+    figure.axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.axes[0].set_ylabel("weighted loss")
     if figure.axes[0].lines:
         figure.axes[0].legend(frameon=False)
