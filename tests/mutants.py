@@ -266,7 +266,7 @@ MUTANTS = (
       "tests/evaluate"),
     M("bench/evaluate/evaluate.py", "np.mean(to_truth < threshold)", "np.mean(to_truth < 2 * threshold)",
       "tests/evaluate"),
-    M("bench/evaluate/evaluate.py", "common.sum() / either.sum()", "common.sum() / truth_mask.sum()", "tests/evaluate"),
+    M("bench/evaluate/evaluate.py", "common.sum() / either.sum()", "common.sum() / true.sum()", "tests/evaluate"),
     M("bench/evaluate/evaluate.py", "DEPTH_CAP = 0.1", "DEPTH_CAP = 0.2", "tests/evaluate"),
     M("bench/evaluate/evaluate.py", "see(Truth(mesh, closed=False), truth.camera)",
       "render_view(field, truth.camera, inputs)", "tests/evaluate"),

@@ -163,8 +163,14 @@ def image_metrics(
     return {
         "depth_mae": float(error.mean()) if common.any() else np.inf,
         "depth_error_capped": (np.minimum(error, DEPTH_CAP).sum() + one_only) / max(either.sum(), 1),
-        "mask_iou": float(common.sum() / either.sum()) if either.any() else 1.0,
+        "mask_iou": mask_iou(predicted_mask, truth_mask),
     }
+
+
+def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
+    """See `IMAGE`."""
+    common, either = found & true, found | true
+    return float(common.sum() / either.sum()) if either.any() else 1.0
 
 
 @dataclass(frozen=True)

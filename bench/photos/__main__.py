@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from bench.evaluate.evaluate import mask_iou
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from datasets.captures.capture import AXES, Capture, read_capture
 from datasets.captures.hull import hull_mesh, hull_views
@@ -36,9 +37,8 @@ class Fit:
     def of(capture: Capture) -> "Fit":
         """The fit of all photographs, which have masks."""
         silhouettes = [seen.numpy() for seen in hull_views(capture.shots, hull_mesh(capture.shots, SAMPLES))]
-        masks = [np.asarray(shot.mask) for shot in capture.shots]
-        pairs = list(zip(silhouettes, masks, strict=True))
-        return Fit(silhouettes, [float((seen & mask).sum() / max((seen | mask).sum(), 1)) for seen, mask in pairs])
+        pairs = zip(silhouettes, capture.shots, strict=True)
+        return Fit(silhouettes, [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in pairs])
 
     def lines(self, capture: Capture) -> list[str]:
         """The fit in words."""

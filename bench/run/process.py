@@ -7,14 +7,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from pkgutil import iter_modules
 
 import psutil
 from omegaconf import DictConfig
 
+import bench.tasks
+import datasets
 from bench.records.record import Record, RunStatus
-from bench.run import fork_server
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -110,7 +113,7 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     """
     if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
         multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
-    context = fork_server.start()
+    context = fork_server()
     channel, childs = context.Pipe()
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
     process = context.Process(target=_enter, args=(job, childs, alive))
@@ -126,6 +129,16 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
         finally:
             if process.pid is not None:
                 _end(process, channel, receive)
+
+
+def fork_server() -> ForkServerContext:
+    """The context of processes that branch off from a server, which has imported what is slow, once for all of them."""
+    packages = bench.tasks, datasets
+    named = [module.name for one in packages for module in iter_modules(one.__path__, f"{one.__name__}.")]
+    context = multiprocessing.get_context("forkserver")
+    # bench first: it sets what torch reads at its import
+    context.set_forkserver_preload(["bench", "open3d", "bench.run.execute", *named])
+    return context
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:

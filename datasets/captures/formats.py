@@ -5,7 +5,7 @@ Axes and pixels become those of `renderers.camera`: x right, y down, z forward, 
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import pi, tan
 from pathlib import Path
@@ -26,12 +26,13 @@ KNOWN = (
     "cameras*.npz with image/ (IDR, NeuS), transforms.json or transforms_train.json (NeRF, nerfstudio), *_par.txt "
     "(Middlebury), poses_bounds.npy with images/ (LLFF), sparse/0 with images/ (COLMAP)"
 )
-DISTORTIONS = {  # of COLMAP's camera models: k1, k2, p1 and p2 by their place behind focal lengths and principal point
+BROWN = ("k1", "k2", "p1", "p2")
+DISTORTIONS = {  # of COLMAP's camera models: which of these stand behind focal lengths and principal point
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "OPENCV": BROWN,
 }
 
 
@@ -54,6 +55,13 @@ class Frame:
     mask: Path | None = None
     size: tuple[int, int] | None = None
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        numbers = np.concatenate([self.intrinsics.ravel(), self.world_to_camera.ravel(), self.distortion])
+        if len(numbers) != 9 + 16 + 4 or not np.isfinite(numbers).all() or not (numbers[[0, 4]] > 0).all():
+            raise BadInput(
+                f"the camera of {self.image} must have finite numbers and positive focal lengths: export it again"
+            )
 
 
 @dataclass(frozen=True)
@@ -101,19 +109,12 @@ def _read(read: Callable[[Path], Layout | None], folder: Path) -> Layout | None:
         BadInput: where something is missing, or cannot be read.
     """
     try:
-        layout = read(folder)
+        return read(folder)
     except BadInput:
         raise
     except (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, BadZipFile, RuntimeError) as error:
         what = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise BadInput(f"{read.__name__} cameras of {folder} cannot be read ({what}): export them again") from error
-    for frame in layout.frames if layout else ():
-        numbers = np.concatenate([frame.intrinsics.ravel(), frame.world_to_camera.ravel(), frame.distortion])
-        if len(numbers) != 9 + 16 + 4 or not np.isfinite(numbers).all() or not (numbers[[0, 4]] > 0).all():
-            raise BadInput(
-                f"the camera of {frame.image} must have finite numbers and positive focal lengths: export it again"
-            )
-    return layout
 
 
 def idr(folder: Path) -> Layout | None:
@@ -153,9 +154,9 @@ def transforms(folder: Path) -> Layout | None:
         listed = [stored | frame for frame in stored["frames"]]
         found = [(frame, _with_suffix(folder / frame["file_path"])) for frame in listed]
         frames = [_nerf_frame(folder, frame, image) for frame, image in found if image is not None]
+    except BadInput:
+        raise
     except (LookupError, TypeError, ValueError) as error:
-        if isinstance(error, BadInput):
-            raise
         raise BadInput(f"{files[0]} cannot be read ({type(error).__name__}: {error}): export it again") from error
     missing = [str(frame["file_path"]) for frame, image in found if image is None]
     notes = (f"{len(missing)} images are not there, such as {missing[0]}",) if missing else ()
@@ -175,8 +176,7 @@ def _nerf_frame(folder: Path, known: dict[str, Any], image: Path) -> Frame:
     intrinsics = np.array([[across, 0, middle[0]], [0, down, middle[1]], [0, 0, 1.0]])
     motion = np.linalg.inv(np.asarray(known["transform_matrix"], dtype=np.float64) @ OPENGL)
     mask = folder / known["mask_path"] if known.get("mask_path") else None
-    bent = tuple(float(known.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2"))
-    return Frame(image, intrinsics, motion, mask, (height, width), bent)
+    return Frame(image, intrinsics, motion, mask, (height, width), _distortion(known))
 
 
 def middlebury(folder: Path) -> Layout | None:
@@ -192,8 +192,7 @@ def middlebury(folder: Path) -> Layout | None:
         if len(numbers) != 21:
             raise BadInput(f"{files[0]}: the line of {name} must have 21 numbers, not {len(numbers)}: copy it again")
         values = np.array(numbers, dtype=np.float64)
-        intrinsics, motion = values[:9].reshape(3, 3), np.eye(4)
-        motion[:3, :3], motion[:3, 3] = values[9:18].reshape(3, 3), values[18:]
+        intrinsics, motion = values[:9].reshape(3, 3), _motion(values[9:18].reshape(3, 3), values[18:])
         if name in images:
             frames.append(Frame(images[name], _centred(intrinsics), motion, masks.get(images[name])))
         else:
@@ -220,8 +219,7 @@ def llff(folder: Path) -> Layout | None:
         pose = row[:15].reshape(3, 5)
         down, right, back, centre, (height, width, focal) = pose.T
         rotation = np.stack([right, down, -back])
-        motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = rotation, -rotation @ centre
+        motion = _motion(rotation, -rotation @ centre)
         intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         frames.append(Frame(image, intrinsics, motion, masks.get(image), (int(height), int(width))))
     return Layout("LLFF", tuple(frames))
@@ -247,13 +245,10 @@ def colmap(folder: Path) -> Layout | None:
         if name not in images:
             missing.append(name)
             continue
-        motion = np.eye(4)
-        motion[:3] = seen.cam_from_world().matrix()
-        names = DISTORTIONS[model]
+        matrix, names = seen.cam_from_world().matrix(), DISTORTIONS[model]
         bent = dict(zip(names, camera.params[len(camera.params) - len(names) :], strict=True))
-        distortion = tuple(float(bent.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2"))
-        image, size = images[name], (camera.height, camera.width)
-        frames.append(Frame(image, camera.calibration_matrix(), motion, masks.get(image), size, distortion))
+        image, size, motion = images[name], (camera.height, camera.width), _motion(matrix[:, :3], matrix[:, 3])
+        frames.append(Frame(image, camera.calibration_matrix(), motion, masks.get(image), size, _distortion(bent)))
     points = np.array([point.xyz for point in stored.points3D.values()])
     notes = (f"no image for {', '.join(missing)}",) if missing else ()
     return Layout("COLMAP", tuple(frames), _about(points) if len(points) else None, notes)
@@ -267,9 +262,19 @@ def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, 
     upper, rotation = rq(projection[:, :3])
     signs = np.diag(np.sign(np.diag(upper)))
     upper, rotation = upper @ signs, signs @ rotation
+    return _centred(upper / upper[2, 2]), _motion(rotation, np.linalg.solve(upper, projection[:, 3]))
+
+
+def _motion(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion that turns first."""
     motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, np.linalg.solve(upper, projection[:, 3])
-    return _centred(upper / upper[2, 2]), motion
+    motion[:3, :3], motion[:3, 3] = rotation, translation
+    return motion
+
+
+def _distortion(known: Mapping[str, Any]) -> tuple[float, ...]:
+    """Brown's numbers in their order, 0 where one is not given."""
+    return tuple(float(known.get(name, 0.0)) for name in BROWN)
 
 
 def _centred(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

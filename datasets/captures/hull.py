@@ -6,14 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from skimage.measure import marching_cubes
 from torch import Tensor
 
 from datasets.captures.shot import Shot
+from datasets.extract import extract
 from datasets.mesh import Mesh
 from datasets.scene import see
 from datasets.truth import Truth
 from renderers.checks import BadInput
+from renderers.field import Kind
+from renderers.fields.analytic import Shape
 
 SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
 FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
@@ -56,16 +58,14 @@ def _carved(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor
     return torch.where((seen >= SEEN * len(shots)) | (least <= FAR), 0.5 - least, 0.5)
 
 
-def hull_mesh(shots: Sequence[Shot], samples: int, reach: float = 1.0) -> Mesh | None:
-    """The visual hull within the cube [-reach, reach]^3, at `samples` per axis; None where it is empty."""
-    axis = torch.linspace(-reach, reach, samples)
-    values = carve(shots, torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)).numpy()
-    values = np.pad(values[1:-1, 1:-1, 1:-1], 1, constant_values=0.5)  # closed where it leaves the cube
-    if not values.min() < 0:
-        return None
-    spacing = 2 * reach / (samples - 1)
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
-    return Mesh(vertices - reach, faces)
+def hull_mesh(shots: Sequence[Shot], samples: int) -> Mesh | None:
+    """The hull in the cube [-1, 1]^3, `samples` per axis, closed where it leaves the cube; None where it is empty."""
+    within = 1 - 1 / (samples - 1)  # all samples but the outermost
+
+    def hull(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        return torch.where(points.abs().amax(-1) < within, carve(shots, points), 0.5)
+
+    return extract(Shape(hull, Kind.LEVEL, None), grid=samples, reach=1.0)
 
 
 def hull_views(shots: Sequence[Shot], hull: Mesh | None) -> list[Bool[Tensor, "height width"]]:

@@ -1,6 +1,6 @@
 """A distance network of one shape with colours, for shapes that are learnt from images."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from math import pi, sqrt
 
@@ -11,8 +11,8 @@ from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Flops, Kind
+from renderers.fields.mlp import CHUNK
 
-CHUNK = 2048  # points per pass without a graph: keeps the activations in cache
 SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
 AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
 DIRECTION_OCTAVES = 2  # of the encoding of view directions
@@ -103,13 +103,14 @@ class DistanceOf:
     network: ColouredDistance
     kind: Kind = Kind.DISTANCE
     lipschitz: float | None = None
-    flops: Flops = field(init=False)
 
-    def __post_init__(self) -> None:
-        layers = (*self.network.hidden, self.network.last)
-        value = 2 * sum(weight.numel() for layer in layers for weight in layer.parameters() if weight.dim() > 1)
-        learnt = any(weight.requires_grad for layer in layers for weight in layer.parameters())
-        object.__setattr__(self, "flops", Flops(value, 2 * value if learnt else value))
+    @property
+    def flops(self) -> Flops:
+        """A multiplication and an addition per weight; as much again towards points, twice with weights."""
+        layers = nn.ModuleList([*self.network.hidden, self.network.last])
+        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
+        learnt = any(weight.requires_grad for weight in layers.parameters())
+        return Flops(value, 2 * value if learnt else value)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         flat = points.reshape(-1, 3)

@@ -16,7 +16,7 @@ from unittest import mock
 from hydra.core.global_hydra import GlobalHydra
 
 from bench.__main__ import main
-from bench.run import fork_server, process
+from bench.run import process
 
 ROOT = Path(__file__).parents[2]
 FAILING = (
@@ -59,7 +59,7 @@ class Driver:
 
     def __init__(self, output: Path, arguments: tuple[str, ...]) -> None:
         output.mkdir(parents=True)
-        context = fork_server.start()
+        context = process.fork_server()
         self.output, self.process = output, context.Process(target=_drive, args=(output, arguments))
         self.process.start()
 
