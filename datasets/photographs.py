@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
-from torch import Tensor
 
-from datasets.scene import View, see
+from datasets.scene import see
+from datasets.shot import Shot
 from datasets.textures import TEXTURES, Texture, make_texture
 from datasets.truth import Truth
 from renderers.camera import Camera
@@ -19,19 +18,6 @@ LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT = 0.4  # of the light; the rest comes from one side
 GREY = 0.5
 UNIFORM = 1e-3  # least difference between the quartiles of a surface's colours: below it nothing can be matched
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """A view with its colours, RGB from 0 to 1."""
-
-    view: View
-    colours: Float[Tensor, "height width 3"]
-
-    def __post_init__(self) -> None:
-        size = (self.view.camera.height, self.view.camera.width, 3)
-        if tuple(self.colours.shape) != size:
-            raise ValueError(f"colours must have the camera's size, {size}, not {tuple(self.colours.shape)}")
 
 
 @dataclass(frozen=True)
@@ -69,7 +55,7 @@ class Photography:
         for name in ("noise", "blur", "exposure"):
             check_at_least(f"{name}", getattr(self, name), 0, f"{name}=0 switches it off")
 
-    def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Photograph]:
+    def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Shot]:
         """The photographs of a mesh.
 
         Raises:
@@ -78,15 +64,17 @@ class Photography:
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
         cameras = [turned(first, 2 * np.pi * index / self.views) for index in range(self.views)]
-        taken = [self._take_one(truth, texture, camera, generator) for camera in cameras]
-        for index, photograph in enumerate(taken):
-            if not bool(photograph.view.mask.any()):
-                raise BadInput(f"camera {index} sees nothing of the shape: widen view.field_of_view or distance")
-        if max(_spread(photograph) for photograph in taken) < UNIFORM:
+        taken = [self._take_one(str(index), truth, texture, camera, generator) for index, camera in enumerate(cameras)]
+        for shot in taken:
+            if shot.mask is None or not bool(shot.mask.any()):
+                raise BadInput(f"camera {shot.name} sees nothing of the shape: widen view.field_of_view or distance")
+        if max(_spread(shot) for shot in taken) < UNIFORM:
             raise BadInput("the surface has one colour in all images: choose another texture or shading")
         return taken
 
-    def _take_one(self, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator) -> Photograph:
+    def _take_one(
+        self, name: str, truth: Truth, texture: Texture, camera: Camera, generator: np.random.Generator
+    ) -> Shot:
         fine = camera.resized(SUPERSAMPLING * camera.height, SUPERSAMPLING * camera.width)
         rays = fine.rays().flat()
         origins, directions = rays.origins.numpy().astype(float), rays.directions.numpy().astype(float)
@@ -104,12 +92,13 @@ class Photography:
         if self.blur:
             image = gaussian_filter(image, (self.blur, self.blur, 0))
         image = image + self.noise * generator.standard_normal(image.shape)
-        return Photograph(see(truth, camera), torch.from_numpy(image.clip(0, 1).astype(np.float32)))
+        colours, view = torch.from_numpy(image.clip(0, 1).astype(np.float32)), see(truth, camera)
+        return Shot(name, camera, colours, view.mask, view.depth, view.normals)
 
 
-def _spread(photograph: Photograph) -> float:
+def _spread(shot: Shot) -> float:
     """The interquartile range of the colours on the shape; it ignores outline pixels, which mix with the background."""
-    quartiles = photograph.colours[photograph.view.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
+    quartiles = shot.colours[shot.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
     return float((quartiles[1] - quartiles[0]).max())
 
 

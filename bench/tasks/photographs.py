@@ -14,7 +14,7 @@ from bench.models.held_out import HeldOutError
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings
-from datasets.photographs import Photograph
+from datasets.shot import Shot
 from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
 from renderers.camera import Rays
@@ -56,10 +56,10 @@ class GivenPhotographs:
     """The given photographs; `compare` renders a field's depths and warps the photographs by them."""
 
     def __init__(
-        self, settings: PhotometricSettings, renderer: Renderer, photographs: list[Photograph], device: torch.device
+        self, settings: PhotometricSettings, renderer: Renderer, photographs: list[Shot], device: torch.device
     ):
         self.settings, self.renderer = settings, renderer
-        self.cameras = [photograph.view.camera.to(device) for photograph in photographs]
+        self.cameras = [photograph.camera.to(device) for photograph in photographs]
         self.rays = [camera.rays() for camera in self.cameras]
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))

@@ -7,7 +7,8 @@ import numpy as np
 
 from datasets.captures.formats import OPENGL, find_layout
 from datasets.captures.hull import Sphere, sphere_of
-from datasets.captures.shot import Shot, take
+from datasets.captures.take import take
+from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_choice
 
 AXES = {"stated": np.eye(4), "flipped": OPENGL}

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.captures.shot import Shot
 from datasets.extract import extract
 from datasets.mesh import Mesh
 from datasets.scene import see
+from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput
 from renderers.field import Kind

@@ -13,7 +13,7 @@ from bench.photos.__main__ import main
 from datasets.captures.capture import Capture, read_capture
 from datasets.captures.formats import OPENGL, decomposed, find_layout
 from datasets.captures.hull import hull_mesh, hull_views
-from datasets.captures.shot import take
+from datasets.captures.take import take
 from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.fields.analytic import sphere

@@ -10,7 +10,8 @@ import trimesh
 
 from bench.tasks.photographs import sample
 from datasets.mesh import Mesh
-from datasets.photographs import Photograph, Photography, turned
+from datasets.photographs import Photography, turned
+from datasets.shot import Shot
 from datasets.textures import PHOTOGRAPHS, TEXTURES, make_texture
 from datasets.truth import Truth
 from tests.tiny import camera_of
@@ -71,11 +72,10 @@ def test_cameras_stand_on_a_circle_and_look_at_the_origin():
 def test_a_point_that_two_views_see_has_one_colour(ball, texture):
     size = 1.0 if texture == "noise" else 4.0
     first, second, *_ = replace(PLAINLY, texture=texture, texture_size=size).take(ball, CAMERA, seed=0)
-    view = first.view
-    points = view.camera.rays().at(view.depth / view.camera.depth(torch.ones(32, 32)))
-    pixels, depth = second.view.camera.project(points)
-    there, _ = sample(second.view.depth[..., None], pixels)
-    both = view.mask & ((there[..., 0] - depth).abs() < 0.01)
+    points = first.camera.rays().at(first.depth / first.camera.depth(torch.ones(32, 32)))
+    pixels, depth = second.camera.project(points)
+    there, _ = sample(second.depth[..., None], pixels)
+    both = first.mask & ((there[..., 0] - depth).abs() < 0.01)
     colours, _ = sample(second.colours, pixels)
     right = (colours - first.colours)[both].abs().mean()
     wrong = (second.colours - first.colours)[both].abs().mean()
@@ -85,7 +85,7 @@ def test_a_point_that_two_views_see_has_one_colour(ball, texture):
 
 def test_the_background_is_grey_or_differs_from_view_to_view(ball):
     first, second, *_ = PLAINLY.take(ball, CAMERA, seed=0)
-    outside = ~(first.view.mask | second.view.mask)
+    outside = ~(first.mask | second.mask)
     outside[1:-1, 1:-1] &= False  # the frame: no pixel there has a part of the ball
     assert (first.colours[outside] == 0.5).all()
     first, second, *_ = replace(PLAINLY, background="noise").take(ball, CAMERA, seed=0)
@@ -95,7 +95,7 @@ def test_the_background_is_grey_or_differs_from_view_to_view(ball):
 def test_noise_blur_and_exposure_change_colours_by_their_amounts(ball):
     plain = PLAINLY.take(ball, CAMERA, seed=0)
     noisy = replace(PLAINLY, noise=0.03).take(ball, CAMERA, seed=0)
-    background = ~plain[0].view.mask
+    background = ~plain[0].mask
     assert (noisy[0].colours - plain[0].colours)[background].std().item() == pytest.approx(0.03, rel=0.2)
     exposed = replace(PLAINLY, exposure=0.2).take(ball, CAMERA, seed=0)
     ratios = [(a.colours[0, 0, 0] / b.colours[0, 0, 0]).log().item() for a, b in zip(exposed, plain, strict=True)]
@@ -106,7 +106,7 @@ def test_noise_blur_and_exposure_change_colours_by_their_amounts(ball):
 
 def test_lambertian_light_is_fixed(ball):
     lit = replace(PLAINLY, texture="plain", shading="lambertian").take(ball, CAMERA, seed=0)
-    bright = [photograph.colours[photograph.view.mask].mean().item() for photograph in lit]
+    bright = [photograph.colours[photograph.mask].mean().item() for photograph in lit]
     assert max(bright) > 1.2 * min(bright)  # the ball has a dark side, which some cameras see
     inner = [photograph.colours[12:20, 12:20] for photograph in lit]  # no outline pixels, which mix with the background
     assert min(part.min() for part in inner) > 0.38 * max(part.max() for part in inner)  # which is not black
@@ -150,5 +150,5 @@ def test_invalid_settings_are_errors(changed, message):
 
 def test_images_have_the_size_of_their_camera(ball):
     first = PLAINLY.take(ball, CAMERA, seed=0)[0]
-    with pytest.raises(ValueError, match=r"colours must have the camera's size, \(32, 32, 3\), not \(16, 32, 3\)"):
-        Photograph(first.view, first.colours[:16])
+    with pytest.raises(ValueError, match=r"colours must have the camera's size, \(32, 32\), not \(16, 32\)"):
+        Shot("0", first.camera, first.colours[:16], None)

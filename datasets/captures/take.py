@@ -1,44 +1,19 @@
-"""A photograph with its camera, as a file's frame becomes it: made smaller, without distortion."""
-
-from dataclasses import dataclass, replace
+"""Reads a file's frame: its photograph, made smaller, without distortion."""
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image, ImageOps, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
-from torch import Tensor
 
 from datasets.captures.formats import Frame
+from datasets.shot import Shot
 from renderers.camera import Camera
 from renderers.checks import BadInput
 
 BACKGROUND = 1.0  # behind an image with an alpha channel: white, as NeRF has it
 LABELS = 32  # a mask whose largest value is below has labels, not grey values
 SAME_SHAPE = 0.01  # most by which width over height of an image may differ from those of its camera, as a share
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A photograph with its camera.
-
-    Args:
-        name: of its file.
-        camera: its resolution is the photograph's.
-        colours: RGB from 0 to 1.
-        mask: true on the object; None where it is not known.
-    """
-
-    name: str
-    camera: Camera
-    colours: Float[Tensor, "height width 3"]
-    mask: Bool[Tensor, "height width"] | None
-
-    def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
-        """The same photograph in a world where the sphere about `centre` is the unit sphere about the origin."""
-        motion = self.camera.world_to_camera.double().clone()
-        motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
-        return replace(self, camera=replace(self.camera, world_to_camera=motion.float()))
 
 
 def take(frame: Frame, longest: int) -> Shot:

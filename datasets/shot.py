@@ -1,0 +1,45 @@
+"""A photograph with its camera, rendered or real."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Camera
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph with its camera.
+
+    Args:
+        name: of its file, or its number.
+        camera: its resolution is the photograph's.
+        colours: RGB from 0 to 1.
+        mask: true on the object; None where it is not known.
+        depth: camera z in scene units, 0 where it is not known; None where it is known nowhere.
+        normals: unit, in world coordinates, 0 where they are not known; None where they are known nowhere.
+    """
+
+    name: str
+    camera: Camera
+    colours: Float[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"] | None
+    depth: Float[Tensor, "height width"] | None = None
+    normals: Float[Tensor, "height width 3"] | None = None
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        for name in ("colours", "mask", "depth", "normals"):
+            part = getattr(self, name)
+            if part is not None and tuple(part.shape[:2]) != size:
+                raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(part.shape[:2])}")
+
+    def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
+        """The same photograph in a world where the sphere about `centre` is the unit sphere about the origin."""
+        motion = self.camera.world_to_camera.double().clone()
+        motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
+        depth = None if self.depth is None else self.depth / radius
+        return replace(self, camera=replace(self.camera, world_to_camera=motion.float()), depth=depth)
