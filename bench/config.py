@@ -28,7 +28,7 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-RESERVED = ("_target_", "_package_", "_prior_", LABEL, ROWS)  # of a node; its other keys are arguments
+RESERVED = ("_target_", "_package_", "_prior_", "_field_", LABEL, ROWS)  # of a node; its other keys are arguments
 OURS = ("renderers", "datasets", "bench")
 
 
@@ -128,8 +128,14 @@ def check_names(config: DictConfig) -> None:
     if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
         raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
     loss, task = config.get("silhouette") or {}, config.get("task") or {}
-    if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {*task, *task.get("fit", {})}:
-        raise ValueError("silhouette is read by task=completion, pose, capacity and stability alone: leave it out")
+    if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {
+        *task,
+        *task.get("fit", {}),
+        *task.get("losses", {}),
+    }:
+        raise ValueError(
+            "silhouette is read by task=completion, pose, capacity, stability and reconstruction alone: leave it out"
+        )
 
 
 def check_top_level(config: DictConfig) -> None:

@@ -7,16 +7,25 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+BANDS = ("red", "green", "blue")
 LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float32
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh, wound outward; `repairs` lists what was repaired, and warnings, one sentence each."""
+    """A triangle mesh, wound outward.
+
+    Args:
+        vertices: in scene units.
+        faces: the vertices of each.
+        repairs: what was repaired, and warnings, one sentence each.
+        colours: of the vertices, RGB from 0 to 1.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     repairs: tuple[str, ...] = ()
+    colours: Float[np.ndarray, "v 3"] | None = None
 
     def __post_init__(self):
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -103,23 +112,29 @@ class Mesh:
     def compact(self) -> "Mesh":
         """The mesh without unused vertices."""
         used, faces = np.unique(self.faces, return_inverse=True)
-        return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3))
+        colours = None if self.colours is None else self.colours[used]
+        return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3), colours=colours)
 
     def save(self, path: str | Path) -> None:
         """Writes a binary .ply file."""
         path = Path(path)
         if path.suffix.lower() != ".ply":
             raise ValueError(f"path: must end in .ply, found '{path.name}'; name it '{path.stem}.ply'")
+        coloured = "" if self.colours is None else "".join(f"property uchar {name}\n" for name in BANDS)
         header = (
             "ply\nformat binary_little_endian 1.0\n"
             f"element vertex {len(self.vertices)}\n"
             "property double x\nproperty double y\nproperty double z\n"
-            f"element face {len(self.faces)}\n"
+            f"{coloured}element face {len(self.faces)}\n"
             "property list uchar int vertex_indices\nend_header\n"
         )
         rows = np.empty(len(self.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
         rows["count"], rows["corners"] = 3, self.faces
-        path.write_bytes(header.encode("ascii") + self.vertices.astype("<f8").tobytes() + rows.tobytes())
+        places = np.empty(len(self.vertices), dtype=[("place", "<f8", 3), ("colour", "u1", 3 if coloured else 0)])
+        places["place"] = self.vertices
+        if self.colours is not None:
+            places["colour"] = (255 * self.colours.clip(0, 1)).round()
+        path.write_bytes(header.encode("ascii") + places.tobytes() + rows.tobytes())
 
 
 def normalise(mesh: Mesh, radius: float) -> Mesh:

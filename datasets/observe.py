@@ -4,22 +4,21 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from datasets.scene import View
 from renderers.checks import BadInput
 
 
-def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "height width"]:
+def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed: int) -> Bool[Tensor, "height width"]:
     """True on the foreground pixels whose depth is given.
 
     Args:
-        view: its mask says what the foreground is.
+        mask: true on the foreground.
         points: "dense" for all, "10%" for a share, 100 for a number.
         seed: of the draw, without replacement.
 
     Raises:
         ValueError: for anything else, or for more points than the foreground has.
     """
-    foreground = view.mask.flatten().nonzero().squeeze(-1)
+    foreground = mask.flatten().nonzero().squeeze(-1)
     available = foreground.numel()
     amount, is_share = parse_amount(points)
     count = max(1, round(available * amount)) if is_share else round(amount)
@@ -27,9 +26,9 @@ def observed_pixels(view: View, points: str | int, seed: int) -> Bool[Tensor, "h
         most = f"points must be at most the {available} pixels of the shape, not {points}"
         raise BadInput(f"{most}: give fewer, or raise view.resolution")
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
-    observed = torch.zeros(view.mask.numel(), dtype=torch.bool)
+    observed = torch.zeros(mask.numel(), dtype=torch.bool)
     observed[foreground[order[:count]]] = True
-    return observed.view(view.mask.shape)
+    return observed.view(mask.shape)
 
 
 def parse_amount(points: str | int) -> tuple[float, bool]:

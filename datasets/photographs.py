@@ -10,6 +10,7 @@ from datasets.scene import see
 from datasets.shot import Shot
 from datasets.textures import TEXTURES, Texture, make_texture
 from datasets.truth import Truth
+from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 
@@ -17,6 +18,7 @@ SUPERSAMPLING = 2  # a pixel's colour is the mean over 2 x 2 rays
 LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT = 0.4  # of the light; the rest comes from one side
 GREY = 0.5
+HIGHEST = 60.0  # degrees
 UNIFORM = 1e-3  # least difference between the quartiles of a surface's colours: below it nothing can be matched
 
 
@@ -25,7 +27,9 @@ class Photography:
     """Settings of photographs.
 
     Args:
-        views: number of cameras, evenly spaced on a circle about the vertical axis; the first is the scene's camera.
+        views: number of cameras.
+        places: "circle": evenly spaced about the vertical axis, the first is the scene's camera. "sphere": all around
+            at its distance, evenly spaced between `HIGHEST` degrees below and above.
         texture: one of `datasets.textures.TEXTURES`.
         texture_size: of its largest parts, in scene units; see `datasets.textures.make_texture`.
         shading: "unlit": the texture's colours; "lambertian": under a fixed light.
@@ -36,6 +40,7 @@ class Photography:
     """
 
     views: int
+    places: str
     texture: str
     texture_size: float
     shading: str
@@ -46,6 +51,7 @@ class Photography:
 
     def __post_init__(self) -> None:
         check_at_least("views", self.views, 2, "views are compared with their neighbours: 24 work")
+        check_choice("places", self.places, ("circle", "sphere"))
         check_choice("texture", self.texture, TEXTURES)
         check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
         check_choice("shading", self.shading, ("unlit", "lambertian"))
@@ -63,7 +69,7 @@ class Photography:
         """
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
-        cameras = [turned(first, 2 * np.pi * index / self.views) for index in range(self.views)]
+        cameras = around(first, self.views) if self.places == "sphere" else circle(first, self.views)
         taken = [self._take_one(str(index), truth, texture, camera, generator) for index, camera in enumerate(cameras)]
         for shot in taken:
             if shot.mask is None or not bool(shot.mask.any()):
@@ -100,6 +106,21 @@ def _spread(shot: Shot) -> float:
     """The interquartile range of the colours on the shape; it ignores outline pixels, which mix with the background."""
     quartiles = shot.colours[shot.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
     return float((quartiles[1] - quartiles[0]).max())
+
+
+def circle(first: Camera, count: int) -> list[Camera]:
+    """Cameras evenly spaced on a circle about the vertical axis."""
+    return [turned(first, 2 * np.pi * index / count) for index in range(count)]
+
+
+def around(first: Camera, count: int) -> list[Camera]:
+    """Cameras that look at the origin from evenly spaced places (a spiral of the golden angle)."""
+    heights = np.sin(np.radians(HIGHEST)) * (1 - (2 * np.arange(count) + 1) / count)
+    turns = np.pi * (3 - 5**0.5) * np.arange(count)
+    flat = np.sqrt(1 - heights**2)
+    places = np.stack([flat * np.sin(turns), heights, flat * np.cos(turns)], axis=1) * float(first.center.norm())
+    motions = [look_at(torch.from_numpy(place).float(), torch.zeros(3)) for place in places]
+    return [Camera(first.intrinsics, motion, first.height, first.width) for motion in motions]
 
 
 def turned(camera: Camera, angle: float) -> Camera:

@@ -157,6 +157,10 @@ class Camera:
         """Camera z of the points at `distance` along each pixel's ray (DIST, Eq. 2)."""
         return distance / torch.linalg.vector_norm(self._bearings(), dim=-1)
 
+    def distance(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+        """The distance along each pixel's ray of the points at camera z `depth`."""
+        return depth * torch.linalg.vector_norm(self._bearings(), dim=-1)
+
     def project(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
         """Where the camera sees points of the world.
 

@@ -221,9 +221,14 @@ def chamfer_only(field: Field, inputs: RunInputs) -> dict[str, float]:
     return {"chamfer_l2": _compare(field, inputs)[1]["chamfer_l2"]}
 
 
-def _compare(field: Field, inputs: RunInputs) -> tuple[Mesh | None, dict[str, float]]:
+def surface_of(field: Field, inputs: RunInputs) -> Mesh | None:
+    """The field's surface, cut off at the unit sphere."""
     inside = Shape(field, field.kind) & sphere(1.0)
-    mesh = extract(inside, grid=inputs.evaluation.grid, reach=REACH, device=inputs.device)
+    return extract(inside, grid=inputs.evaluation.grid, reach=REACH, device=inputs.device)
+
+
+def _compare(field: Field, inputs: RunInputs) -> tuple[Mesh | None, dict[str, float]]:
+    mesh = surface_of(field, inputs)
     found = None if mesh is None else Surface(*sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1))
     truth = true_surface(inputs, inputs.seed)
     return mesh, surface_metrics(found, truth, threshold=inputs.evaluation.fscore_threshold)

@@ -17,6 +17,7 @@ from bench.models.model import FLOAT, Candidate, Model, Seen
 from bench.setup.fields import FREE, parsed
 from bench.shape_prior.autodecoder import initialise_to_sphere
 from renderers.camera import rigid
+from renderers.checks import BadInput
 from renderers.field import Flops, Kind
 from renderers.fields.analytic import Shape, sphere, superquadric
 from renderers.fields.analytic import box as exact_box
@@ -286,8 +287,11 @@ def candidate(name: str) -> Candidate:
 
     Raises:
         ValueError: where no candidate has this name.
+        BadInput: for a field that is learnt from images alone.
     """
     kind, sizes = parsed(name)
+    if sizes and kind not in SIZED:
+        raise BadInput(f"field={name} is learnt from images alone: set task=reconstruction, or another field")
     return SIZED[kind](*sizes) if sizes else OnePart(name)
 
 

@@ -1,13 +1,17 @@
 """Pictures of a run's progress: the view at each checkpoint, as a strip (DIST, Figs. 6 and 9) or an animation."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
+from torch import Tensor
 
+from bench.evaluate.colours import coloured_image
 from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
@@ -16,25 +20,61 @@ from datasets.scene import View, see
 from datasets.truth import Truth
 from renderers.camera import Camera
 from renderers.field import Field
+from renderers.fields.coloured import Coloured
 
 MOST = 9  # columns of a strip
+SILHOUETTE = "silhouette error"  # a row of a strip
 FRAME = 0.73  # grey between the pictures of a strip
 FRAME_SECONDS = 0.25
 LAST_SECONDS = 1.5  # of the last frame
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A picture of a shape: its view, and its colours where it has some.
+
+    Args:
+        view: with the mask that silhouettes are compared with.
+        colours: of all pixels.
+        masked: False where the mask is not known.
+    """
+
+    view: View
+    colours: Float[Tensor, "height width 3"] | None = None
+    masked: bool = True
+
+    def cells(self, truth: "Shown") -> dict[str, Float[np.ndarray, "height width 3"]]:
+        """Pictures of it by the names of their rows: its colours and the error of its mask where the truth has them."""
+        cells = {"normals": normals_image(self.view)}
+        if truth.colours is not None and self.colours is not None:
+            on_white = torch.where(self.view.mask[..., None], self.colours, 1.0)
+            cells = {"colours": (self.colours if self is truth else on_white).clamp(0, 1).numpy()} | cells
+        if truth.masked:
+            cells[SILHOUETTE] = silhouette_image(self.view.mask.numpy(), truth.view.mask.numpy())
+        return cells
+
+    def enlarged(self, camera: Camera) -> "Shown":
+        """The same pixels in another size, that of a camera."""
+        rows = torch.arange(camera.height) * self.view.camera.height // camera.height
+        columns = torch.arange(camera.width) * self.view.camera.width // camera.width
+        parts = [part[rows][:, columns] for part in (self.view.depth, self.view.normals, self.view.mask)]
+        colours = None if self.colours is None else self.colours[rows][:, columns]
+        return Shown(View(camera, *parts), colours, self.masked)
+
+
 class Filmstrip:
     """Collects frames of a run; none where pictures are off."""
 
-    def __init__(self, inputs: RunInputs, over: str = "after iterations"):
+    def __init__(self, inputs: RunInputs, over: str = "after iterations", true: Shown | None = None):
         """Begins without frames.
 
         Args:
             inputs: of the run.
             over: what the frames' names mean, for the title.
+            true: what frames are compared with; None for the scene's shape in its view.
         """
-        self.inputs, self.over = inputs, over
-        self.frames: dict[int | str, View] = {}
+        self.inputs, self.over, self.true = inputs, over, true
+        self.frames: dict[int | str, Shown] = {}
 
     def add(self, name: int | str, field: Field, camera: Camera | None = None) -> None:
         """Adds a frame, rendered at the resolution of pictures.
@@ -46,7 +86,9 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            self.frames[name] = picture_view(field, self._fine(camera), self.inputs)
+            view = picture_view(field, self._fine(camera), self.inputs)
+            colours = coloured_image(field, view, self.inputs.device) if isinstance(field, Coloured) else None
+            self.frames[name] = Shown(view, colours)
 
     @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:
@@ -59,13 +101,19 @@ class Filmstrip:
         """
         if not self.frames:
             return
-        truth = see(Truth(self.inputs.scene.mesh), self._fine(self.inputs.scene.view.camera))
+        truth = self._truth()
         strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
         strip.savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
         if self.inputs.evaluation.film is not None:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
-    def _shown(self, chosen: str | None) -> dict[int | str, View]:
+    def _truth(self) -> Shown:
+        """What frames are compared with, at their size."""
+        if self.true is None:
+            return Shown(see(Truth(self.inputs.scene.mesh), self._fine(self.inputs.scene.view.camera)))
+        return self.true.enlarged(self._fine(self.true.view.camera))
+
+    def _shown(self, chosen: str | None) -> dict[int | str, Shown]:
         """Evenly spaced frames, with the chosen one; without a checkpoint one iteration before the last."""
         names = list(self.frames)
         last = names[-2:]
@@ -78,30 +126,31 @@ class Filmstrip:
         return {names[place]: self.frames[names[place]] for place in places}
 
     def _fine(self, camera: Camera) -> Camera:
-        size = self.inputs.evaluation.picture
-        return camera.resized(size, size)
+        larger = self.inputs.evaluation.picture / max(camera.height, camera.width)
+        return camera.resized(round(larger * camera.height), round(larger * camera.width))
 
 
-def _strip(frames: dict[int | str, View], truth: View, title: str, chosen: str | None) -> Figure:
-    """A figure with a column per frame and one for the truth: normals above, silhouette error below.
+def _strip(frames: dict[int | str, Shown], truth: Shown, title: str, chosen: str | None) -> Figure:
+    """A figure with a column per frame and one for the truth: colours, normals, silhouette error, where known.
 
     It is one image on one axis, since a figure of twenty axes takes a second to draw.
     """
-    shown = {str(name).replace("_", " "): view for name, view in frames.items()} | {"truth": truth}
-    part = window([view.mask.numpy() for view in shown.values()])
-    true = truth.mask.numpy()
-    columns = [(normals_image(view)[part], silhouette_image(view.mask.numpy(), true)[part]) for view in shown.values()]
-    montage = np.concatenate([np.concatenate([_framed(cell) for cell in column], axis=0) for column in columns], axis=1)
-    size = montage.shape[0] / 2
-    figure = Figure(figsize=(1.25 * len(shown) + 0.4, 3.1), layout="constrained")
+    shown = {str(name).replace("_", " "): frame for name, frame in frames.items()} | {"truth": truth}
+    part = window([frame.view.mask.numpy() for frame in shown.values()])
+    columns = [frame.cells(truth) for frame in shown.values()]
+    rows = list(columns[0])
+    parts = [[_framed(column[row][part]) for row in rows] for column in columns]
+    montage = np.concatenate([np.concatenate(column, axis=0) for column in parts], axis=1)
+    size = montage.shape[0] / len(rows)
+    figure = Figure(figsize=(1.25 * len(shown) + 0.4, 0.5 + 1.3 * len(rows)), layout="constrained")
     axis = bare(figure.subplots())
     axis.imshow(montage, interpolation="nearest")
     axis.set_xticks([size * (place + 0.5) for place in range(len(shown))], list(shown))
-    axis.set_yticks([size * 0.5, size * 1.5], ["normals", "silhouette error"], rotation=90, va="center")
+    axis.set_yticks([size * (place + 0.5) for place in range(len(rows))], rows, rotation=90, va="center")
     axis.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
     if chosen is not None:
         axis.xaxis.get_major_ticks()[list(frames).index(chosen)].label2.set_fontweight("bold")
-    figure.suptitle(f"{title} (red missed, blue spurious)")
+    figure.suptitle(f"{title}{' (red missed, blue spurious)' if SILHOUETTE in rows else ''}")
     return figure
 
 
@@ -109,12 +158,9 @@ def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
     return np.pad(picture, ((1, 1), (1, 1), (0, 0)), constant_values=FRAME)
 
 
-def _animate(path: Path, views: list[View], truth: View) -> None:
-    """Writes an animation: normals left, silhouette error right."""
-    true = truth.mask.numpy()
-    pictures = [
-        np.concatenate([normals_image(view), silhouette_image(view.mask.numpy(), true)], axis=1) for view in views
-    ]
+def _animate(path: Path, frames: list[Shown], truth: Shown) -> None:
+    """Writes an animation: the cells of each frame side by side."""
+    pictures = [np.concatenate(list(frame.cells(truth).values()), axis=1) for frame in frames]
     images = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in pictures]
     lasting = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_SECONDS)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=lasting, loop=0)

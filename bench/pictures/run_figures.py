@@ -36,6 +36,10 @@ TERMS = {
     "silhouette": "#d62728",
     "normals": "#2ca02c",
     "code": "#7f7f7f",
+    "colour": "#9467bd",
+    "colour_gradient": "#e377c2",
+    "smoothness": "#17becf",
+    "eikonal": "#bcbd22",
 }
 MOST_PHOTOGRAPHS = 4  # shown, in two rows
 

@@ -14,12 +14,15 @@ from bench.records.record import NOT_RUN, Record, RunStatus
 
 ROWS = (  # metric, its name in the table, factor, which direction is better
     ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),
+    ("seen_chamfer_l1", "Chamfer-L1 of what is seen (x1000)", 1000.0, "lower"),
     ("accuracy", "accuracy (x1000)", 1000.0, "lower"),
     ("completeness", "completeness (x1000)", 1000.0, "lower"),
     ("fscore", "F-score", 1.0, "higher"),
     ("normal_consistency", "normal consistency", 1.0, "higher"),
     ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
     ("mask_iou", "mask IoU", 1.0, "higher"),
+    ("psnr", "PSNR (dB)", 1.0, "higher"),
+    ("ssim", "SSIM", 1.0, "higher"),
     ("rotation_error_deg", "rotation error (degrees)", 1.0, "lower"),
     ("translation_error", "translation error (x1000)", 1000.0, "lower"),
 )

@@ -9,7 +9,12 @@ from renderers.checks import check_at_least, check_choice, check_share
 
 PRIOR = "prior"
 PARTS = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
-SIZED = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+"}  # and what follows the underscore
+SIZED = {
+    "union": "[0-9]+",
+    "network": "[0-9]+x[0-9]+",
+    "grid": "[0-9]+",
+    "occupancy": "[0-9]+",
+}  # and what follows the underscore
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
 FORMS = "union_K, network_LAYERSxWIDTH, grid_N"
 MOST_SAMPLES = 256  # of a grid along an axis: 64 MiB of values

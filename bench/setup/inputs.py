@@ -20,6 +20,7 @@ from bench.setup.fields import FieldChoice
 from bench.shape_prior.autodecoder import Prior
 from bench.shape_prior.store import prior_for, prior_settings
 from datasets.dataset import Dataset, Split
+from datasets.own_photographs import Photographed
 from datasets.scene import Scene, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.adaptive_samples import follow
@@ -46,6 +47,7 @@ class RunInputs:
     field: FieldChoice  # what an unknown shape is made of
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
+    photographed: Photographed | None = None  # the dataset, where it has photographs and no true shape
     trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
 
     @cached_property
@@ -126,7 +128,7 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
     return RunInputs(
         renderer=renderer,
         views=views,
-        scene_name=scene_name(dataset, Split(config.split), config.index),
+        scene_name=_scene_name(dataset, config),
         make_pixel_precise=lambda: _renderer(config, at_pixel_precision(config.renderer), views),
         make_scene=shape_and_view,
         make_prior=make_prior,
@@ -136,8 +138,18 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
         cache=cache,
         field=FieldChoice(config.field, build(config.models, "models", target="bench.setup.fields.ModelSettings")),
         notes=tuple(notes),
+        photographed=dataset if isinstance(dataset, Photographed) else None,
         trained=trained,
     )
+
+
+def _scene_name(dataset: Dataset, config: DictConfig) -> str:
+    """The name of the scene; photographs show one object."""
+    if not isinstance(dataset, Photographed):
+        return scene_name(dataset, Split(config.split), config.index)
+    if config.index:
+        raise ValueError(f"photographs show one object, with index=0, not {config.index}: give another dataset.path")
+    return dataset.name
 
 
 def threads_for(width: int) -> int:

@@ -77,6 +77,7 @@ class CodeProblem:
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
+    shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         self.decoder = self.prior.decoder.to(self.device).requires_grad_(False)

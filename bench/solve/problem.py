@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bench.evaluate.evaluate import Evaluation
+from bench.pictures.filmstrip import Shown
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
 from datasets.scene import Scene
@@ -76,6 +77,11 @@ class Problem(Objective, Protocol):
     tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve
     rays_per_iteration: int
     observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
+
+    @property
+    def shown(self) -> Shown | None:
+        """What the filmstrip's frames are compared with; None for the scene's shape in its view."""
+        ...
 
     def objective(self) -> float | None:
         """The current loss, not counted, where losses of different iterations are not comparable; else None."""

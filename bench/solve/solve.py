@@ -57,7 +57,7 @@ def solve(
     with run.off_clock():
         before = problem.evaluate(inputs)
     record.metrics_start = before.metrics
-    filmstrip = Filmstrip(inputs)
+    filmstrip = Filmstrip(inputs, true=problem.shown)
 
     def errors_at(iteration: int) -> dict[str, float]:
         filmstrip.add(iteration, *problem.frame())

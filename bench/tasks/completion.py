@@ -88,6 +88,6 @@ class Completion:
         self, view: View, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[GivenView, Bool[Tensor, "height width"]]:
         """The given part of a view, and the pixels whose depth is given."""
-        observed = observed_pixels(view, self.points, seed)
+        observed = observed_pixels(view.mask, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
         return GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device), observed

@@ -55,7 +55,7 @@ class DeepSDF:
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape."""
         view = scene.view
-        observed = observed_pixels(view, self.points, seed)
+        observed = observed_pixels(view.mask, self.points, seed)
         rays = view.camera.rays()[observed]
         distance = view.depth[observed] / view.camera.depth(torch.ones(view.depth.shape))[observed]
         shift = self.offset * view.normals[observed]

@@ -192,6 +192,7 @@ class PoseProblem:
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = TRACKED
+    shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         self.cameras = [camera.to(self.device) for camera in self.cameras]

@@ -1,8 +1,9 @@
-"""A distance network of one shape with colours, for shapes that are learnt from images."""
+"""Fields of one shape with colours, for shapes that are learnt from images: each begins as a sphere."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 from math import pi, sqrt
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -10,12 +11,36 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Flops, Kind
+from renderers.field import Field, Flops, Kind
+from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import CHUNK
+from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
 
 SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
 AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
 DIRECTION_OCTAVES = 2  # of the encoding of view directions
+LOGIT_WIDTH = 0.1  # scene units over which a logit of occupancy changes by 1 at its start
+COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size of those of distances
+
+
+@runtime_checkable
+class Coloured(Field, Protocol):
+    """A field whose surface has colours."""
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """Red, green and blue from 0 to 1.
+
+        Args:
+            points: on the surface.
+            normals: the field's gradients there; their graph leads colours to the shape.
+            directions: of the rays that see the points, unit.
+        """
+        ...
 
 
 class ColouredDistance(nn.Module):
@@ -75,13 +100,7 @@ class ColouredDistance(nn.Module):
         normals: Float[Tensor, "*batch 3"],
         directions: Float[Tensor, "*batch 3"],
     ) -> Float[Tensor, "*batch 3"]:
-        """Red, green and blue from 0 to 1.
-
-        Args:
-            points: on the surface.
-            normals: the distance's gradients there; their graph leads colours to the shape.
-            directions: of the rays that see the points, unit; unused unless `directional`.
-        """
+        """See `Coloured`; directions are unused unless `directional`."""
         seen = [encoded(directions, DIRECTION_OCTAVES)] if self.directional else []
         features = torch.cat([self.features(self._hidden(points)), points, normals, *seen], dim=-1)
         *layers, last = self.colour
@@ -117,6 +136,136 @@ class DistanceOf:
         chunks = [flat] if torch.is_grad_enabled() else flat.split(CHUNK)
         values = [self.network.last(self.network._hidden(chunk)) for chunk in chunks]
         return torch.cat(values).view(points.shape[:-1])
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """See `Coloured`."""
+        return self.network.colours(points, normals, directions)
+
+
+class ColouredOccupancy(nn.Module):
+    """DVR's network of one shape. Its colours are those of points alone, whatever normals and directions.
+
+    It begins as a sphere: its blocks add nothing yet, and a sum of many ReLUs of random directions grows with the
+    distance from the origin (Atzmon and Lipman 2020, "SAL", Theorem 1).
+
+    Source: DVR (Niemeyer et al. 2020), Secs. 3.1 and 3.5.
+    Deviates: see `OccupancyNetwork`; the paper does not say how it begins.
+
+    Args:
+        width: neurons per layer.
+        radius: of the sphere that it begins as, in scene units.
+    """
+
+    def __init__(self, *, width: int, radius: float) -> None:
+        super().__init__()
+        check_positive("radius", radius, "0.5 lies within most objects")
+        self.network = OccupancyNetwork(width=width, code_length=0)
+        with torch.no_grad():
+            half = torch.randn(width - width // 2, 3)
+            self.network.first.weight.copy_(torch.cat([half, -half])[:width])
+            self.network.first.bias.zero_()
+            for block in self.network.blocks:
+                block.outer.weight.zero_()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+                block.outer.bias.zero_()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+            head = self.network.occupancy_head
+            head.weight.fill_(-1.0)
+            head.bias.zero_()
+            around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
+            head.weight.mul_(radius / LOGIT_WIDTH / self.field(around).mean())
+            head.bias.fill_(radius / LOGIT_WIDTH)
+
+    @property
+    def field(self) -> "OccupancyOf":
+        """The level set at the current weights."""
+        return OccupancyOf(self.network)
+
+
+@dataclass(frozen=True)
+class OccupancyOf:
+    """The level set p = 1/2 of an occupancy network of one shape (DVR, Sec. 3.1); values are logits of 1 - p."""
+
+    network: OccupancyNetwork
+
+    kind: ClassVar[Kind] = Kind.LEVEL
+    lipschitz: ClassVar[None] = None
+
+    @property
+    def flops(self) -> Flops:
+        """See `BoundOccupancy`."""
+        return self._bound.flops
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return -self._bound.logits(points)
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """See `Coloured`."""
+        return self._bound.colours(points)
+
+    @property
+    def _bound(self) -> BoundOccupancy:
+        return self.network.at(self.network.first.weight.new_empty(0))
+
+
+class ColouredGrid(nn.Module):
+    """Distances and colours on a grid, interpolated linearly; it begins as a sphere.
+
+    Args:
+        samples: per axis.
+        radius: of the sphere, in scene units.
+        reach: half the cube's side, in scene units.
+    """
+
+    def __init__(self, *, samples: int, radius: float, reach: float) -> None:
+        super().__init__()
+        check_at_least("samples", samples, 2, "48 suit one shape")
+        check_positive("radius", radius, "0.5 lies within most objects")
+        axis = torch.linspace(-reach, reach, samples)
+        places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        self.distances = nn.Parameter(torch.linalg.vector_norm(places, dim=-1) - radius)
+        self.logits = nn.Parameter(torch.zeros(3, samples, samples, samples))
+        self.reach = reach
+
+    @property
+    def field(self) -> "GridOf":
+        """The distance at the current values."""
+        return GridOf(self)
+
+
+@dataclass(frozen=True)
+class GridOf:
+    """The distance of a `ColouredGrid`."""
+
+    grid: ColouredGrid
+
+    kind: ClassVar[Kind] = Kind.DISTANCE
+    lipschitz: ClassVar[None] = None
+    flops: ClassVar[Flops] = FLOPS
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return Grid(self.grid.distances, self.grid.reach)(points)
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """See `Coloured`."""
+        places = (points.flip(-1) / self.grid.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
+        sampled = torch.nn.functional.grid_sample(
+            self.grid.logits[None], places, padding_mode="border", align_corners=True
+        )
+        return torch.sigmoid(COLOUR_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
 
 
 def encoded(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:

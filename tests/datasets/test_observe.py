@@ -35,7 +35,7 @@ def view() -> View:
     ],
 )
 def test_an_amount_gives_so_many_pixels_of_the_foreground(view, points, count):
-    observed = observed_pixels(view, points, seed=0)
+    observed = observed_pixels(view.mask, points, seed=0)
     assert observed.shape == (20, 20)
     assert observed.dtype == torch.bool
     assert observed.sum() == count
@@ -44,14 +44,14 @@ def test_an_amount_gives_so_many_pixels_of_the_foreground(view, points, count):
 
 def test_draws_follow_the_seed_and_leave_other_draws_alone(view):
     before = torch.random.get_rng_state()
-    first = observed_pixels(view, 50, seed=1)
-    assert torch.equal(first, observed_pixels(view, 50, seed=1))
-    assert not torch.equal(first, observed_pixels(view, 50, seed=2))
+    first = observed_pixels(view.mask, 50, seed=1)
+    assert torch.equal(first, observed_pixels(view.mask, 50, seed=1))
+    assert not torch.equal(first, observed_pixels(view.mask, 50, seed=2))
     assert torch.equal(before, torch.random.get_rng_state())
 
 
 def test_every_pixel_of_the_foreground_can_be_drawn(view):
-    times = torch.stack([observed_pixels(view, "20%", seed=seed) for seed in range(60)]).sum(0)[view.mask]
+    times = torch.stack([observed_pixels(view.mask, "20%", seed=seed) for seed in range(60)]).sum(0)[view.mask]
     assert times.min() > 0
     assert times.max() < 30  # 12 on average
 
@@ -73,9 +73,9 @@ def test_every_pixel_of_the_foreground_can_be_drawn(view):
 )
 def test_an_invalid_amount_is_an_error_with_a_remedy(view, points, rule):
     with pytest.raises(ValueError, match=f'points {rule}: write "dense", a share such as "10%", or a number'):
-        observed_pixels(view, points, seed=0)
+        observed_pixels(view.mask, points, seed=0)
 
 
 def test_more_points_than_the_shape_has_pixels_are_refused(view):
     with pytest.raises(ValueError, match="at most the 200 pixels of the shape, not 201: give fewer"):
-        observed_pixels(view, 201, seed=0)
+        observed_pixels(view.mask, 201, seed=0)

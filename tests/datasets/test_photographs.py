@@ -17,7 +17,15 @@ from datasets.truth import Truth
 from tests.tiny import camera_of
 
 PLAINLY = Photography(
-    views=8, texture="noise", texture_size=0.5, shading="unlit", background="grey", noise=0.0, blur=0.0, exposure=0.0
+    views=8,
+    places="circle",
+    texture="noise",
+    texture_size=0.5,
+    shading="unlit",
+    background="grey",
+    noise=0.0,
+    blur=0.0,
+    exposure=0.0,
 )
 CAMERA = camera_of(32, angles=(0.0, 20.0))
 

@@ -1,0 +1,41 @@
+"""The colours of a field where a view meets its surface."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from datasets.mesh import Mesh
+from datasets.scene import View
+from renderers.field import autograd_gradients
+from renderers.fields.coloured import Coloured
+
+CHUNK = 16_384  # points at once
+
+
+def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[Tensor, "height width 3"]:
+    """The field's colours where a view meets a surface; black elsewhere."""
+    image = torch.zeros(*view.mask.shape, 3)
+    rays = view.camera.rays()[view.mask]
+    points = rays.at(view.camera.distance(view.depth)[view.mask])
+    image[view.mask] = colours_at(field, points, rays.directions, device)
+    return image
+
+
+def vertex_colours(field: Coloured, mesh: Mesh, device: torch.device) -> Float[np.ndarray, "v 3"]:
+    """The colours of a mesh's vertices, each seen from straight above."""
+    points = torch.from_numpy(mesh.vertices).float()
+    slopes = autograd_gradients(field, points.to(device)).cpu()
+    return colours_at(field, points, -torch.nn.functional.normalize(slopes, dim=-1), device).numpy()
+
+
+def colours_at(
+    field: Coloured, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], device: torch.device
+) -> Float[Tensor, "n 3"]:
+    """The colours of points of the surface, on the CPU."""
+    found = [points.new_zeros(0, 3)]
+    for some, towards in zip(points.to(device).split(CHUNK), directions.to(device).split(CHUNK), strict=True):
+        slopes = autograd_gradients(field, some)
+        with torch.no_grad():
+            found.append(field.colours(some, slopes, towards).cpu())
+    return torch.cat(found)

@@ -1,0 +1,126 @@
+"""Judges a shape with colours: by photographs that were held out, and by the true surface where there is one."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf, log10, nan
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from bench.evaluate.colours import coloured_image, vertex_colours
+from bench.evaluate.evaluate import (
+    DEFINITIONS,
+    OWN,
+    Evaluation,
+    Surface,
+    mask_iou,
+    render_view,
+    surface_metrics,
+    surface_of,
+    unseen,
+)
+from bench.reconstruct.subject import Subject
+from bench.records.record import RunStatus
+from bench.setup.inputs import RunInputs
+from datasets.mesh import Mesh
+from datasets.scene import View, see
+from datasets.shot import Shot
+from datasets.truth import Truth, sample_surface
+from renderers.fields.coloured import Coloured
+
+SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
+SURFACE = (
+    "chamfer_l2",
+    "chamfer_l1",
+    "chamfer_gt_to_pred",
+    "accuracy",
+    "completeness",
+    "fscore",
+    "normal_consistency",
+)
+IMAGES = {
+    "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph, both black outside of the shape"
+    " and the photograph outside of its mask, mean over photographs, in decibels. Without masks: over the pixels that"
+    " the shape covers.",
+    "ssim": "Structural similarity (Wang et al. 2004, scikit-image) of the same images, mean, up to 1.",
+    "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground in at"
+    " least one, mean over held-out photographs, from 0 to 1.",
+    "mask_iou_least": "The same, the least over held-out photographs.",
+}
+OF_MESH = " The shape is seen by exact first hits of the mesh that evaluation.grid gives, for every renderer."
+COLOURED_DEFINITIONS = {
+    **{name: DEFINITIONS[name] for name in SURFACE},
+    **{
+        SEEN + name: f"{DEFINITIONS[name]} Over the points of both surfaces that a given photograph sees: within it,"
+        " and not hidden by the surface itself."
+        for name in SURFACE
+    },
+    **{name: text + OF_MESH for name, text in IMAGES.items()},
+    **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGES.items()},
+}
+
+
+def judge(field: Coloured, subject: Subject, inputs: RunInputs) -> Evaluation:
+    """Compares a field with the held-out photographs, and with the true surface where there is one."""
+    mesh = surface_of(field, inputs)
+    metrics = surface_scores(mesh, subject, inputs) | mesh_scores(field, mesh, subject.held_out, inputs.device)
+    own = [render_view(field, shot.camera, inputs) for shot in subject.held_out]
+    seen = [coloured_image(field, view, inputs.device) for view in own]
+    metrics |= {OWN + name: value for name, value in image_scores(own, seen, subject.held_out).items()}
+    if mesh is None:
+        return Evaluation(metrics, None, (RunStatus.EMPTY, "the field has no surface in the unit sphere"))
+    return Evaluation(metrics, replace(mesh, colours=vertex_colours(field, mesh, inputs.device)))
+
+
+def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> dict[str, float]:
+    """The surface metrics, on all of the surface and on its seen part; none where the truth is not known."""
+    if subject.truth is None:
+        return {}
+    threshold, count = inputs.evaluation.fscore_threshold, inputs.evaluation.points
+    true = sample_surface(subject.truth, count, inputs.seed)
+    found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
+    whole = surface_metrics(None if found is None else Surface(*found), Surface(*true), threshold=threshold)
+    visible = subject.seen(subject.truth, true[0])
+    part = None
+    if mesh is not None and found is not None:
+        there = subject.seen(mesh, found[0])
+        part = Surface(found[0][there], found[1][there])
+    seen = surface_metrics(part, Surface(true[0][visible], true[1][visible]), threshold=threshold)
+    return whole | {SEEN + name: value for name, value in seen.items()}
+
+
+def mesh_scores(field: Coloured, mesh: Mesh | None, shots: Sequence[Shot], device: torch.device) -> dict[str, float]:
+    """The metrics of `IMAGES`, with first hits of a mesh and the field's colours at them."""
+    scene = None if mesh is None else Truth(mesh, closed=False)
+    views = [unseen(shot.camera) if scene is None else see(scene, shot.camera) for shot in shots]
+    return image_scores(views, [coloured_image(field, view, device) for view in views], shots)
+
+
+def image_scores(
+    views: Sequence[View], images: Sequence[Float[Tensor, "height width 3"]], shots: Sequence[Shot]
+) -> dict[str, float]:
+    """The metrics of `IMAGES` of images, black outside of the shape; without masks no `mask_iou`."""
+    pairs = [_against(view, image, shot) for view, image, shot in zip(views, images, shots, strict=True)]
+    scores = {name: float(np.mean([pair[name] for pair in pairs])) for name in ("psnr", "ssim")}
+    overlaps = [pair["mask_iou"] for pair in pairs]
+    if any(shot.mask is None for shot in shots):
+        return scores
+    return scores | {"mask_iou": float(np.mean(overlaps)), "mask_iou_least": float(np.min(overlaps))}
+
+
+def _against(view: View, image: Float[Tensor, "height width 3"], shot: Shot) -> dict[str, float]:
+    known = view.mask if shot.mask is None else shot.mask
+    found, true = image.numpy(), (shot.colours * known[..., None]).numpy()
+    count = 3 * int(known.sum()) if shot.mask is None else true.size
+    error = float(((found - true) ** 2).sum()) / max(count, 1)
+    similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=_window(true.shape))
+    overlap = nan if shot.mask is None else mask_iou(view.mask.numpy(), shot.mask.numpy())
+    return {"psnr": -10 * log10(error) if error else inf, "ssim": float(similar), "mask_iou": overlap}
+
+
+def _window(shape: tuple[int, ...]) -> int:
+    """Side of the window of structural similarity: 7 pixels, an odd number below that in tiny images."""
+    return min(7, (min(shape[:2]) - 1) // 2 * 2 + 1)

@@ -1,0 +1,118 @@
+"""The losses of a reconstruction from images, each a switch (DVR, Sec. 3.4; DIST, B.3; IDR, Sec. 3.4)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.reconstruct.pixels import Pixels
+from bench.solve.latent_code import Terms
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error
+from renderers.boundary import rendered
+from renderers.checks import check_at_least, check_choice
+from renderers.field import Field, Kind, Meter
+from renderers.fields.coloured import Coloured
+from renderers.rendering import Observed, Renderer
+from renderers.silhouette import SilhouetteLoss
+
+ANYWHERE = 512  # points of the cube at which a distance's gradient is measured
+BESIDE = 0.01  # scene units: side of the cube in which a point's neighbour is drawn, as in DVR's official code
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights of the terms; 0 leaves a term out. Sums over rays are divided by the number of all rays.
+
+    Args:
+        colour: of the l1 norm of colours, over hits on the foreground (DVR, Eq. 12).
+        colour_gradient: of the l1 norm of their differences between neighbours, on patches of 2 x 2 pixels (DVR, Sec.
+            3.4, which names it; the sum is that of its official code).
+        depth: of the mean error of given depths over rays that hit (DVR, Eq. 13).
+        depth_loss: "depth", or "points", the distance in space.
+        silhouette: loss of the mask; DVR, Eqs. 14 and 15, are `silhouette=occupancy`.
+        silhouette_weight: of that loss.
+        smoothness: of the difference between unit normals at a hit and beside it (DVR, Eq. 16).
+        normals: of 1 less the cosine between normals and given ones, over hits (DIST, B.3).
+        eikonal: of the squared difference of a distance's slope from 1, at hits and in the whole cube (IDR, Sec. 3.4).
+            A level set has none.
+    """
+
+    colour: float
+    colour_gradient: float
+    depth: float
+    depth_loss: str
+    silhouette: SilhouetteLoss
+    silhouette_weight: float
+    smoothness: float
+    normals: float
+    eikonal: float
+
+    def __post_init__(self) -> None:
+        check_choice("task.losses.depth_loss", self.depth_loss, DEPTH_LOSSES)
+        for name in ("colour", "colour_gradient", "depth", "silhouette_weight", "smoothness", "normals", "eikonal"):
+            check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
+
+    def __call__(self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels) -> Terms:
+        """The weighted terms.
+
+        Args:
+            renderer: at the current iteration.
+            shape: with gradients towards its parameters.
+            metered: the same, counted.
+            pixels: that are compared; for `colour_gradient` in groups of four, see `Pixels.drawn`.
+        """
+        rendering = rendered(renderer, metered, pixels.rays)
+        inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
+        points, rays = rendering.points[inside], len(inside)
+        slopes = slopes_at(metered, points)
+        normals = torch.nn.functional.normalize(slopes, dim=-1)
+        terms: Terms = {}
+        if self.colour or self.colour_gradient:
+            colours = shape.colours(points, slopes, pixels.rays.directions[inside])
+            difference = torch.zeros_like(pixels.colours)
+            difference[inside] = colours - pixels.colours[inside]
+            terms["colour"] = self.colour * difference.abs().sum() / rays
+            if self.colour_gradient:
+                terms["colour_gradient"] = self.colour_gradient * _between_neighbours(difference, inside) / rays
+        if self.depth and pixels.distance is not None:
+            known = rendering.hit & pixels.distance.isfinite()
+            found, given = (
+                rendering.distance[known] * pixels.at_one[known],
+                pixels.distance[known] * pixels.at_one[known],
+            )
+            error = depth_error(self.depth_loss, found, given, pixels.at_one[known])
+            terms["depth"] = self.depth * error.sum() / known.sum().clamp_min(1)
+        if self.silhouette_weight and pixels.mask is not None:
+            observed = Observed(pixels.mask, pixels.guide)
+            loss = self.silhouette(renderer, metered, pixels.rays, rendering, observed)
+            terms["silhouette"] = self.silhouette_weight * loss
+        if self.smoothness:
+            beside = points.detach() + BESIDE * (torch.rand_like(points) - 0.5)
+            neighbours = torch.nn.functional.normalize(slopes_at(metered, beside), dim=-1)
+            terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
+        if self.normals and pixels.normals is not None:
+            known = pixels.normals[inside].square().sum(-1) > 0
+            cosine = (normals * pixels.normals[inside]).sum(-1)[known]
+            terms["normals"] = self.normals * (1 - cosine).sum() / known.sum().clamp_min(1)
+        if self.eikonal and shape.kind is not Kind.LEVEL:
+            anywhere = 2 * torch.rand(ANYWHERE, 3, device=points.device) - 1
+            off = [
+                (torch.linalg.vector_norm(found, dim=-1) - 1).square()
+                for found in (slopes, slopes_at(metered, anywhere))
+            ]
+            terms["eikonal"] = self.eikonal * sum(part.sum() / max(len(part), 1) for part in off)
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+
+def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """The field's gradients at points, with a graph towards its parameters and the points."""
+    points = points if points.requires_grad else points.detach().requires_grad_(True)
+    return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+
+
+def _between_neighbours(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """The l1 norm of differences to the right and below, in patches of 2 x 2 whose pixels are all inside."""
+    patches, whole = difference.view(-1, 2, 2, 3), inside.view(-1, 4).all(-1)
+    across, down = patches[:, :, 1] - patches[:, :, 0], patches[:, 1] - patches[:, 0]
+    return ((across.abs() + down.abs()).sum((1, 2)) * whole).sum()

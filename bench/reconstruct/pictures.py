@@ -1,0 +1,87 @@
+"""Pictures of a reconstruction: held-out photographs beside the shape with its colours. Not part of any timing."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from bench.evaluate.colours import coloured_image
+from bench.evaluate.evaluate import picture_view
+from bench.pictures.run_figures import draw_curve, normals_image
+from bench.pictures.style import SCREEN, bare
+from bench.reconstruct.subject import Subject
+from bench.setup.inputs import RunInputs
+from datasets.shot import Shot
+from renderers.fields.coloured import Coloured
+
+MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
+WORST = 0.3  # mean difference of colours that is shown darkest
+
+
+def draw_reconstruction(
+    folder: Path, inputs: RunInputs, field: Coloured, subject: Subject, curve: list[dict[str, Any]], title: str
+) -> None:
+    """Writes summary.png, input.png and curve.png."""
+    draw_curve(folder / "curve.png", curve)
+    with rc_context(SCREEN):
+        for name, figure in {"summary": _summary(inputs, field, subject, title), "input": _input(subject)}.items():
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+
+
+def _summary(inputs: RunInputs, field: Coloured, subject: Subject, title: str) -> Figure:
+    """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
+    shots = spread(subject.held_out, MOST_HELD_OUT)
+    tall = shots[0].camera.height / shots[0].camera.width
+    figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 0.9), layout="constrained")
+    axes = figure.subplots(len(shots), 4, squeeze=False)
+    for row, shot in zip(axes, shots, strict=True):
+        camera = shot.camera
+        larger = inputs.evaluation.picture / max(camera.height, camera.width)
+        fine = camera.resized(round(larger * camera.height), round(larger * camera.width))
+        view = picture_view(field, fine, inputs)
+        row[0].imshow(shot.colours.numpy(), interpolation="nearest")
+        row[1].imshow(
+            np.where(view.mask[..., None], coloured_image(field, view, inputs.device).numpy(), 1.0).clip(0, 1)
+        )
+        shown = row[2].imshow(_error(inputs, field, shot), cmap="magma_r", vmin=0, vmax=WORST, interpolation="nearest")
+        row[3].imshow(normals_image(view))
+        row[0].set_ylabel(Path(shot.name).stem if Path(shot.name).suffix else f"photograph {shot.name}")
+        for axis in row:
+            bare(axis)
+    for axis, name in zip(axes[0], ("held-out photograph", "rendering", "difference", "normals"), strict=True):
+        axis.set_title(name)
+    figure.colorbar(shown, ax=axes[:, 2], location="bottom", shrink=0.9, pad=0.02, label="of colours from 0 to 1, mean")
+    figure.suptitle(title)
+    return figure
+
+
+def _error(inputs: RunInputs, field: Coloured, shot: Shot) -> Float[np.ndarray, "height width"]:
+    """The mean difference of colours at the photograph's own size; both are black outside of their masks."""
+    view = picture_view(field, shot.camera, inputs)
+    known = view.mask if shot.mask is None else shot.mask
+    found = coloured_image(field, view, inputs.device)
+    return (found - shot.colours * known[..., None]).abs().mean(-1).numpy()
+
+
+def _input(subject: Subject) -> Figure:
+    """Some of the given photographs."""
+    shots = spread(subject.given, MOST_GIVEN)
+    rows = -(-len(shots) // 4)
+    tall = shots[0].camera.height / shots[0].camera.width
+    figure = Figure(figsize=(6.4, 1.6 * tall * rows + 0.4), layout="constrained")
+    axes = figure.subplots(rows, 4, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, shot in zip(axes.flat, shots, strict=False):
+        axis.imshow(shot.colours.numpy())
+    figure.suptitle(f"{len(shots)} of {len(subject.given)} given photographs")
+    return figure
+
+
+def spread(shots: tuple[Shot, ...], most: int) -> list[Shot]:
+    """Evenly spaced ones, at most so many."""
+    places = np.linspace(0, len(shots) - 1, min(most, len(shots))).round().astype(int)
+    return [shots[place] for place in places]

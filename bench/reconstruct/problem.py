@@ -1,0 +1,124 @@
+"""The inverse problem of a shape with colours, learnt from random pixels of photographs."""
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from bench.evaluate.evaluate import Evaluation, surface_of
+from bench.pictures.filmstrip import Shown
+from bench.reconstruct.judge import judge, mesh_scores, surface_scores
+from bench.reconstruct.losses import Losses
+from bench.reconstruct.models import Learnt
+from bench.reconstruct.pictures import draw_reconstruction
+from bench.reconstruct.pixels import Stack
+from bench.reconstruct.subject import Subject
+from bench.setup.inputs import RunInputs
+from bench.solve.latent_code import Terms
+from datasets.scene import View
+from renderers.camera import Camera
+from renderers.field import Counts, Field, Meter
+from renderers.fields.coloured import Coloured
+from renderers.rendering import Renderer, at_iteration
+
+COMPARED = 4096  # pixels of which the loss before and after is made
+
+
+@dataclass
+class ReconstructionProblem:
+    """The problem of learning a field with colours.
+
+    Args:
+        subject: the photographs.
+        stack: all given pixels.
+        model: that is learnt.
+        losses: of its renderings.
+        renderer: that is under test.
+        rays: that are drawn in each iteration.
+        iterations: their number.
+        seed: of what is drawn.
+    """
+
+    subject: Subject
+    stack: Stack
+    model: Learnt
+    losses: Losses
+    renderer: Renderer
+    rays: int
+    iterations: int
+    seed: int
+    counts: Counts = field(default_factory=Counts)
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The parameters of the field and its colours."""
+        return list(self.model.parameters())
+
+    @property
+    def rays_per_iteration(self) -> int:
+        """The drawn pixels."""
+        return self.rays
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """Metrics of checkpoints: of held-out photographs and, where it is known, of the true surface."""
+        return ("psnr", *(["chamfer_l1"] if self.subject.truth is not None else []))
+
+    @property
+    def observed(self) -> Bool[Tensor, "1 n"]:
+        """The pixels whose depth is given, of all photographs in one row."""
+        distance = self.stack.pixels.distance
+        known = torch.zeros_like(self.stack.pixels.at_one).bool() if distance is None else distance.isfinite()
+        return known[None]
+
+    @property
+    def shown(self) -> Shown:
+        """The held-out photograph that the strip shows."""
+        shot = self.subject.held_out[0]
+        blank = torch.zeros(shot.camera.height, shot.camera.width)
+        mask = torch.ones_like(blank).bool() if shot.mask is None else shot.mask
+        normals = blank[..., None].expand(-1, -1, 3) if shot.normals is None else shot.normals
+        return Shown(View(shot.camera, blank, normals, mask), shot.colours, shot.mask is not None)
+
+    def field(self) -> Coloured:
+        """The shape at the current parameters, which stays as it is."""
+        return deepcopy(self.model).requires_grad_(False).field
+
+    def frame(self) -> tuple[Field, Camera]:
+        """The current shape, seen by the first held-out camera."""
+        return self.field(), self.subject.held_out[0].camera
+
+    def evaluate(self, inputs: RunInputs) -> Evaluation:
+        """The current shape against held-out photographs and the truth."""
+        return judge(self.field(), self.subject, inputs)
+
+    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+        """The `tracked` metrics of the current shape."""
+        shape = self.field()
+        mesh = surface_of(shape, inputs)
+        scores = surface_scores(mesh, self.subject, inputs) | mesh_scores(
+            shape, mesh, self.subject.held_out, inputs.device
+        )
+        return {name: scores[name] for name in self.tracked}
+
+    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+        """Writes the pictures of the run; see `bench.solve.problem.Problem`."""
+        draw_reconstruction(folder, inputs, self.field(), self.subject, curve, title)
+
+    def loss(self, iteration: int) -> Terms:
+        """The terms and their sum, over pixels that are drawn anew in each iteration."""
+        patches = self.losses.colour_gradient > 0
+        pixels = self.stack.drawn(self.rays, patches=patches, seed=self.seed * self.iterations + iteration)
+        shape = self.model.field
+        return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
+
+    def objective(self) -> float:
+        """The loss over the same pixels before and after, not counted."""
+        patches, rows = self.losses.colour_gradient > 0, min(COMPARED, 4 * len(self.stack.corners))
+        pixels, shape = self.stack.drawn(rows, patches=patches, seed=self.seed), self.model.field
+        renderer = at_iteration(self.renderer, self.iterations)
+        return float(self.losses(renderer, shape, Meter(shape), pixels)["total"].detach())

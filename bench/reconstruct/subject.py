@@ -1,0 +1,137 @@
+"""What is reconstructed: photographs, some of them held out, and the true surface where there is one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from bench.setup.inputs import RunInputs
+from datasets.captures.hull import hull_mesh
+from datasets.mesh import Mesh
+from datasets.observe import observed_pixels
+from datasets.photographs import Photography
+from datasets.scene import see
+from datasets.shot import Shot
+from datasets.truth import Truth
+from renderers.checks import BadInput, check_at_least
+
+FEWEST = 3  # given photographs
+NONE, GIVEN, HULL = "none", "given", "hull"  # where distances are known; see `Depths`
+GUIDES = (NONE, GIVEN, HULL)
+HULL_SAMPLES = 96  # per axis
+ON_SURFACE = 0.01  # scene units by which a point may lie behind the first hit of its ray, and still be seen
+
+
+@dataclass(frozen=True)
+class Depths:
+    """Which depths are given, and how true they are.
+
+    Args:
+        points: "none"; or the amount in each photograph, see `datasets.observe.observed_pixels`.
+        noise: standard deviation of a depth, in scene units.
+    """
+
+    points: str
+    noise: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.depths.noise", self.noise, 0, "0 gives true depths")
+
+    def of(self, shot: Shot, seed: int) -> Shot:
+        """The photograph with the depths that are given of it, 0 elsewhere."""
+        if self.points == NONE:
+            return replace(shot, depth=None)
+        if shot.depth is None or shot.mask is None:
+            raise BadInput("these photographs have no depths: set task.depths.points=none")
+        chosen = observed_pixels(shot.mask, self.points, seed)
+        noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(seed))
+        return replace(shot, depth=torch.where(chosen, shot.depth + noise, 0.0))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Photographs of one object in the unit sphere.
+
+    Args:
+        given: that a shape is learnt from, with the masks and depths that may be used.
+        held_out: that it is judged by.
+        truth: the true surface, where it is known.
+        found: what there is, in words.
+    """
+
+    given: tuple[Shot, ...]
+    held_out: tuple[Shot, ...]
+    truth: Mesh | None
+    found: str
+
+    def seen(self, surface: Mesh, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points of a surface at least one given photograph sees: within it, and in front of everything else."""
+        scene, seen = Truth(surface, closed=False), np.zeros(len(points), dtype=bool)
+        for shot in self.given:
+            centre = shot.camera.center.double().numpy()
+            distance = np.linalg.norm(points - centre, axis=1)
+            pixels, depth = shot.camera.project(torch.from_numpy(points).float())
+            size = torch.tensor([shot.camera.width, shot.camera.height])
+            inside = ((depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)).numpy()
+            hits = scene.cast(np.broadcast_to(centre, points.shape), points - centre)
+            seen |= inside & (hits.distance > distance - ON_SURFACE)
+        return seen
+
+
+def find_subject(
+    images: Photography, depths: Depths, inputs: RunInputs, *, longest: int, every: int, masks: bool
+) -> Subject:
+    """The photographs of a folder, or those that are taken of the scene's mesh.
+
+    Args:
+        images: settings of photographs that are taken.
+        depths: that are given.
+        inputs: of the run.
+        longest: most pixels along the longer side of a photograph.
+        every: of so many photographs one is held out.
+        masks: whether those that are given have their masks.
+
+    Raises:
+        BadInput: where photographs are missing, too few, or do not fit.
+    """
+    if inputs.photographed is not None:
+        capture = inputs.photographed.capture(longest)
+        shots, truth = capture.shots, None
+        found = "; ".join([capture.summary, *capture.notes])
+    else:
+        scene = inputs.scene
+        camera = scene.view.camera.resized(longest, longest)
+        shots, truth = tuple(images.take(Truth(scene.mesh), camera, seed=scene.seed(inputs.seed))), scene.mesh
+        found = f"{len(shots)} rendered photographs of {longest} x {longest} pixels"
+    held_out, given = shots[::every], tuple(shot for place, shot in enumerate(shots) if place % every)
+    if len(given) < FEWEST:
+        raise BadInput(f"{len(shots)} photographs with every {every}th held out leave {len(given)}: give more")
+    given = tuple(depths.of(shot, inputs.seed + place) for place, shot in enumerate(given))
+    given = given if masks else tuple(replace(shot, mask=None) for shot in given)
+    return Subject(given, held_out, truth, f"{found}; {len(held_out)} of them are held out")
+
+
+def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "height width"]]:
+    """The given distances along each pixel's ray; NaN where there is none."""
+    blank = [torch.full((shot.camera.height, shot.camera.width), torch.nan) for shot in shots]
+    return [
+        unknown if shot.depth is None else torch.where(shot.depth > 0, shot.camera.distance(shot.depth), torch.nan)
+        for shot, unknown in zip(shots, blank, strict=True)
+    ]
+
+
+def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "height width"]]:
+    """The given distances and, where there are none, those to the visual hull; NaN beside it.
+
+    Raises:
+        BadInput: without masks, or where their hull is empty.
+    """
+    hull = hull_mesh(shots, HULL_SAMPLES) if all(shot.mask is not None for shot in shots) else None
+    if hull is None:
+        raise BadInput("the visual hull needs masks that have a point in common: set task.guide=none")
+    scene = Truth(hull, closed=False)
+    views = [see(scene, shot.camera) for shot in shots]
+    behind = [torch.where(view.mask, view.camera.distance(view.depth), torch.nan) for view in views]
+    return [torch.where(g.isfinite(), g, h) for g, h in zip(given_distances(shots), behind, strict=True)]

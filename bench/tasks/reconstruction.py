@@ -1,0 +1,90 @@
+"""Shape and colour from photographs with known cameras, without a prior (DVR, Secs. 3.1 to 3.5, 4.2)."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bench.reconstruct.judge import COLOURED_DEFINITIONS
+from bench.reconstruct.losses import Losses
+from bench.reconstruct.models import Appearance
+from bench.reconstruct.pixels import Stack
+from bench.reconstruct.problem import ReconstructionProblem
+from bench.reconstruct.subject import (
+    GIVEN,
+    GUIDES,
+    HULL,
+    Depths,
+    Subject,
+    find_subject,
+    given_distances,
+    hull_distances,
+)
+from bench.setup.inputs import RunContext
+from bench.solve.problem import OptimiserSettings, check_field_gradient
+from bench.solve.solve import solve
+from datasets.photographs import Photography
+from renderers.checks import check_at_least, check_choice
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A field with colours, from a sphere, such that its renderings are the photographs.
+
+    Args:
+        images: settings of photographs of a dataset of meshes; not read for photographs of one's own.
+        longest: most pixels along the longer side of a photograph.
+        held_out: of so many photographs one is held out.
+        masks: whether the given photographs have their masks, where there are any.
+        depths: that are given; photographs of one's own have none.
+        guide: distances that a silhouette loss may use, such as `silhouette=occupancy` with `occupied_at: depth` (DVR,
+            Sec. 3.4): "none", "given" depths, or where rays meet the visual "hull", and given depths before these.
+        rays: pixels that are drawn in each iteration.
+        appearance: of the field, beside its size.
+        losses: of the renderings.
+        optimiser: iterations and learning rates.
+    """
+
+    images: Photography
+    longest: int
+    held_out: int
+    masks: bool
+    depths: Depths
+    guide: str
+    rays: int
+    appearance: Appearance
+    losses: Losses
+    optimiser: OptimiserSettings
+
+    takes_field: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_at_least("task.longest", self.longest, 8, "96 shows what there is")
+        check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
+        check_choice("task.guide", self.guide, GUIDES)
+        check_at_least("task.rays", self.rays, 4, "1024 work")
+
+    def execute(self, run: RunContext) -> None:
+        """Learns the field, and judges it before and after."""
+        run.record.definitions = dict(COLOURED_DEFINITIONS)
+        subject = find_subject(
+            self.images, self.depths, run.inputs, longest=self.longest, every=self.held_out, masks=self.masks
+        )
+        run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
+        solve(lambda: self.problem(subject, run), self.optimiser, run, COLOURED_DEFINITIONS)
+
+    def problem(self, subject: Subject, run: RunContext) -> ReconstructionProblem:
+        """The problem of photographs."""
+        inputs = run.inputs
+        check_field_gradient(inputs.renderer)
+        model = self.appearance.make(inputs.field.name).to(inputs.device)
+        guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
+        stack = Stack.of(subject.given, guide and guide(subject.given), inputs.device)
+        iterations = self.optimiser.iterations
+        return ReconstructionProblem(
+            subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed
+        )
+
+    def doubts(self, subject: Subject) -> list[str]:
+        """Notes on what the photographs leave open."""
+        if subject.given[0].mask is None:
+            return ["without masks nothing says where the object ends: expect the shape to keep what is behind it"]
+        return []
