@@ -21,7 +21,7 @@ OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean ov
 RATES = (0.04, 0.01, 0.03, 0.02)
 
 
-def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0):
+def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0, family="sofa"):
     """Four draws of a method; the error of a shape is that of its draw times the shape's own."""
     for split, errors in (("validation", VALIDATION), ("test", TEST)):
         for draw, value in enumerate(errors):
@@ -31,12 +31,13 @@ def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), kill
                     results,
                     "tuning",
                     "DIST with mask",
-                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": f"space/{method}"},
+                    **{"task": "completion", "dataset": family, "renderer": "dist", "method": f"space/{method}"},
                     status=status or "ok",
                     metrics={} if status else {"chamfer_l2": scale * value * OWN[index] / 1000},
                     evaluations={"value": 100 * (draw + 1)},
                     settings={
-                        **{"split": split, "draw": draw, "index": index, "dataset": {"name": "sofa"}},
+                        **{"split": split, "draw": draw, "index": index},
+                        "dataset": {"name": family, "ranges": {f"width of a {family}": 1.0}},
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
                         "scale": {"name": "desk"},
@@ -53,6 +54,13 @@ def test_the_best_is_chosen_on_validation_shapes(tmp_path):
     (method,) = tunings(read(tmp_path))
     assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
     assert method.best == 1  # the last draw is better on the test shapes
+    assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
+
+
+def test_what_families_differ_in_is_no_setting(tmp_path):
+    for family in ("sofa", "plane"):
+        drawn(tmp_path, family=family)
+    (method,) = tunings(read(tmp_path))
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
