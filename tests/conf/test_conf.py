@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 import trimesh
@@ -118,7 +119,8 @@ def test_the_default_configuration_builds(compose_config):
 # The cells of the stability experiment are of all stresses but `none`.
 @pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in GROUPS if ("stability", f"{g}={n}") not in SWEEPS])
 def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
-    extra = [f"dataset.path={mesh_path}"] if (group, name) == ("dataset", "mesh") else NEEDS.get(name, [])
+    local = {"mesh": mesh_path, "photos": str(Path(mesh_path).parent)} if group == "dataset" else {}
+    extra = [f"dataset.path={local[name]}"] if name in local else NEEDS.get(name, [])
     new = "+" if group == "method" else ""  # none is chosen by default
     config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -455,7 +457,7 @@ def test_a_target_outside_our_packages_needs_leave(compose_config):
 
 
 def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
-    with pytest.raises(ValueError, match="silhouette is read by task=completion, pose, capacity and stability alone"):
+    with pytest.raises(ValueError, match="silhouette is read by task=completion, pose, capacity, stability and reconstruction alone"):
         check_names(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "pose", "capacity", "stability", "gradients"):
         check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
