@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from datasets.mesh import Mesh
 
@@ -37,7 +37,7 @@ class Truth:
                 f"mesh: must be watertight to have an inside, found {mesh.faces.shape[0]} faces that do not close; "
                 "load it with datasets.meshes.load_mesh, which repairs it"
             )
-        self._tensor = open3d.core.Tensor
+        self._tensor, self._faces = open3d.core.Tensor, mesh.faces
         self._scene = open3d.t.geometry.RaycastingScene()
         vertices = self._tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
         self._scene.add_triangles(vertices, self._tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
@@ -58,6 +58,16 @@ class Truth:
         distance = answer["t_hit"].numpy()
         normals = answer["primitive_normals"].numpy()
         return Hits(distance=distance, normals=normals, hit=np.isfinite(distance))
+
+    def corners(
+        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]:
+        """Gives the first hit of each ray by the corners of its face: their weights, 0 without a hit, and vertices."""
+        answer = self._scene.cast_rays(self._tensor(np.concatenate([origins, directions], axis=-1, dtype=np.float32)))
+        along = answer["primitive_uvs"].numpy().astype(np.float64)
+        hit = np.isfinite(answer["t_hit"].numpy())
+        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1) * hit[:, None]
+        return weights, self._faces[np.where(hit, answer["primitive_ids"].numpy().astype(np.int64), 0)]
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Gives the distance to the surface, negative inside, with the sign by majority over five rays per point."""

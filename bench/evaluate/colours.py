@@ -7,9 +7,12 @@ from torch import Tensor
 
 from datasets.mesh import Mesh
 from datasets.scene import View
+from datasets.truth import Truth
+from renderers.camera import Camera
 from renderers.field import autograd_gradients
 from renderers.fields.coloured import Coloured
 
+GREY = 0.5  # of a mesh without colours
 CHUNK = 16_384  # points at once
 
 
@@ -20,6 +23,20 @@ def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[T
     points = rays.at(view.camera.distance(view.depth)[view.mask])
     image[view.mask] = colours_at(field, points, rays.directions, device)
     return image
+
+
+def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "height width 3"]:
+    """The colours of a mesh's vertices, interpolated over its faces; grey without colours, black outside of it.
+
+    Args:
+        mesh: with or without colours.
+        truth: of the same mesh.
+        camera: that sees it.
+    """
+    colours = np.full_like(mesh.vertices, GREY) if mesh.colours is None else mesh.colours
+    rays = camera.rays()
+    weights, corners = truth.corners(rays.flat().origins.double().numpy(), rays.flat().directions.double().numpy())
+    return np.einsum("nk,nkd->nd", weights, colours[corners]).reshape(*rays.shape, 3).clip(0, 1)
 
 
 def vertex_colours(field: Coloured, mesh: Mesh, device: torch.device) -> Float[np.ndarray, "v 3"]:

@@ -23,6 +23,7 @@ from bench.evaluate.evaluate import (
     unseen,
 )
 from bench.reconstruct.subject import Subject
+from bench.reconstruct.surfaces import mesh_image
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -75,6 +76,17 @@ def judge(field: Coloured, subject: Subject, inputs: RunInputs) -> Evaluation:
     return Evaluation(metrics, replace(mesh, colours=vertex_colours(field, mesh, inputs.device)))
 
 
+def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evaluation:
+    """Compares a mesh with coloured vertices in the same way; no renderer takes part."""
+    metrics = surface_scores(mesh, subject, inputs)
+    cameras = [shot.camera for shot in subject.held_out]
+    blank = [(unseen(camera), torch.zeros(camera.height, camera.width, 3)) for camera in cameras]
+    seen = blank if mesh is None else [mesh_image(mesh, camera) for camera in cameras]
+    metrics |= image_scores([view for view, _ in seen], [image for _, image in seen], subject.held_out)
+    failure = (RunStatus.EMPTY, "no surface was found") if mesh is None else None
+    return Evaluation(metrics, mesh, failure)
+
+
 def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> dict[str, float]:
     """The surface metrics, on all of the surface and on its seen part; none where the truth is not known."""
     if subject.truth is None:
@@ -100,7 +112,7 @@ def mesh_scores(field: Coloured, mesh: Mesh | None, shots: Sequence[Shot], devic
 
 
 def image_scores(
-    views: Sequence[View], images: Sequence[Float[Tensor, "height width 3"]], shots: Sequence[Shot]
+    views: Sequence[View], images: Sequence[Float[Tensor, "_ _ 3"]], shots: Sequence[Shot]
 ) -> dict[str, float]:
     """The metrics of `IMAGES` of images, black outside of the shape; without masks no `mask_iou`."""
     pairs = [_against(view, image, shot) for view, image, shot in zip(views, images, shots, strict=True)]

@@ -10,7 +10,7 @@ from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error
 from renderers.boundary import rendered
-from renderers.checks import check_at_least, check_choice
+from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.field import Field, Kind, Meter
 from renderers.fields.coloured import Coloured
 from renderers.rendering import Observed, Renderer
@@ -72,7 +72,8 @@ class Losses:
             colours = shape.colours(points, slopes, pixels.rays.directions[inside])
             difference = torch.zeros_like(pixels.colours)
             difference[inside] = colours - pixels.colours[inside]
-            terms["colour"] = self.colour * difference.abs().sum() / rays
+            if self.colour:
+                terms["colour"] = self.colour * difference.abs().sum() / rays
             if self.colour_gradient:
                 terms["colour_gradient"] = self.colour_gradient * _between_neighbours(difference, inside) / rays
         if self.depth and pixels.distance is not None:
@@ -102,6 +103,8 @@ class Losses:
                 for found in (slopes, slopes_at(metered, anywhere))
             ]
             terms["eikonal"] = self.eikonal * sum(part.sum() / max(len(part), 1) for part in off)
+        if not terms:
+            raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
 

@@ -1,5 +1,6 @@
 """Pictures of a reconstruction: held-out photographs beside the shape with its colours. Not part of any timing."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,17 +8,23 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from bench.evaluate.colours import coloured_image
 from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import draw_curve, normals_image
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.subject import Subject
+from bench.reconstruct.surfaces import mesh_image
 from bench.setup.inputs import RunInputs
+from datasets.mesh import Mesh
+from datasets.scene import View
 from datasets.shot import Shot
+from renderers.camera import Camera
 from renderers.fields.coloured import Coloured
 
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
+Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
 WORST = 0.3  # mean difference of colours that is shown darkest
 
 
@@ -26,12 +33,27 @@ def draw_reconstruction(
 ) -> None:
     """Writes summary.png, input.png and curve.png."""
     draw_curve(folder / "curve.png", curve)
+
+    def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
+        view = picture_view(field, camera, inputs)
+        return view, coloured_image(field, view, inputs.device)
+
+    _save(folder, seen, inputs, subject, title)
+
+
+def draw_surface(folder: Path, inputs: RunInputs, mesh: Mesh, subject: Subject, title: str) -> None:
+    """Writes summary.png and input.png of a mesh with colours."""
+    _save(folder, lambda camera: mesh_image(mesh, camera), inputs, subject, title)
+
+
+def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:
     with rc_context(SCREEN):
-        for name, figure in {"summary": _summary(inputs, field, subject, title), "input": _input(subject)}.items():
+        figures = {"summary": _summary(seen, inputs, subject, title), "input": _input(subject)}
+        for name, figure in figures.items():
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
 
 
-def _summary(inputs: RunInputs, field: Coloured, subject: Subject, title: str) -> Figure:
+def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:
     """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
     shots = spread(subject.held_out, MOST_HELD_OUT)
     tall = shots[0].camera.height / shots[0].camera.width
@@ -40,13 +62,10 @@ def _summary(inputs: RunInputs, field: Coloured, subject: Subject, title: str) -
     for row, shot in zip(axes, shots, strict=True):
         camera = shot.camera
         larger = inputs.evaluation.picture / max(camera.height, camera.width)
-        fine = camera.resized(round(larger * camera.height), round(larger * camera.width))
-        view = picture_view(field, fine, inputs)
+        view, image = seen(camera.resized(round(larger * camera.height), round(larger * camera.width)))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
-        row[1].imshow(
-            np.where(view.mask[..., None], coloured_image(field, view, inputs.device).numpy(), 1.0).clip(0, 1)
-        )
-        shown = row[2].imshow(_error(inputs, field, shot), cmap="magma_r", vmin=0, vmax=WORST, interpolation="nearest")
+        row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
+        shown = row[2].imshow(_error(seen, shot), cmap="magma_r", vmin=0, vmax=WORST, interpolation="nearest")
         row[3].imshow(normals_image(view))
         row[0].set_ylabel(Path(shot.name).stem if Path(shot.name).suffix else f"photograph {shot.name}")
         for axis in row:
@@ -58,12 +77,11 @@ def _summary(inputs: RunInputs, field: Coloured, subject: Subject, title: str) -
     return figure
 
 
-def _error(inputs: RunInputs, field: Coloured, shot: Shot) -> Float[np.ndarray, "height width"]:
+def _error(seen: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
     """The mean difference of colours at the photograph's own size; both are black outside of their masks."""
-    view = picture_view(field, shot.camera, inputs)
+    view, image = seen(shot.camera)
     known = view.mask if shot.mask is None else shot.mask
-    found = coloured_image(field, view, inputs.device)
-    return (found - shot.colours * known[..., None]).abs().mean(-1).numpy()
+    return (image - shot.colours * known[..., None]).abs().mean(-1).numpy()
 
 
 def _input(subject: Subject) -> Figure:

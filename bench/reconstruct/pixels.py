@@ -57,9 +57,7 @@ class Stack:
     width: Int[Tensor, " n"]
 
     @staticmethod
-    def of(
-        shots: Sequence[Shot], guide: Sequence[Float[Tensor, "height width"]] | None, device: torch.device
-    ) -> "Stack":
+    def of(shots: Sequence[Shot], guide: Sequence[Float[Tensor, "_ _"]] | None, device: torch.device) -> "Stack":
         """The pixels of photographs that are alike in what is known of them.
 
         Args:

@@ -67,17 +67,19 @@ class Subject:
     found: str
 
     def seen(self, surface: Mesh, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points of a surface at least one given photograph sees: within it, and in front of everything else."""
-        scene, seen = Truth(surface, closed=False), np.zeros(len(points), dtype=bool)
-        for shot in self.given:
-            centre = shot.camera.center.double().numpy()
-            distance = np.linalg.norm(points - centre, axis=1)
-            pixels, depth = shot.camera.project(torch.from_numpy(points).float())
-            size = torch.tensor([shot.camera.width, shot.camera.height])
-            inside = ((depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)).numpy()
-            hits = scene.cast(np.broadcast_to(centre, points.shape), points - centre)
-            seen |= inside & (hits.distance > distance - ON_SURFACE)
-        return seen
+        """Which points of a surface at least one given photograph sees; see `visible`."""
+        scene = Truth(surface, closed=False)
+        return np.any([visible(scene, shot, points) for shot in self.given], axis=0)
+
+
+def visible(scene: Truth, shot: Shot, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points of a surface a photograph sees: within it, and in front of everything else."""
+    centre = shot.camera.center.double().numpy()
+    pixels, depth = shot.camera.project(torch.from_numpy(points).float())
+    size = torch.tensor([shot.camera.width, shot.camera.height])
+    inside = ((depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)).numpy()
+    hits = scene.cast(np.broadcast_to(centre, points.shape), points - centre)
+    return inside & (hits.distance > np.linalg.norm(points - centre, axis=1) - ON_SURFACE)
 
 
 def find_subject(
@@ -113,7 +115,7 @@ def find_subject(
     return Subject(given, held_out, truth, f"{found}; {len(held_out)} of them are held out")
 
 
-def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "height width"]]:
+def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
     """The given distances along each pixel's ray; NaN where there is none."""
     blank = [torch.full((shot.camera.height, shot.camera.width), torch.nan) for shot in shots]
     return [
@@ -122,7 +124,7 @@ def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "height w
     ]
 
 
-def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "height width"]]:
+def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
     """The given distances and, where there are none, those to the visual hull; NaN beside it.
 
     Raises:

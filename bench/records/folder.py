@@ -22,7 +22,15 @@ from bench.rows import own_row
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
-    *("bench/report", "bench/trackers", "bench/merge", "bench/tune", "bench/progress.py"),
+    *(
+        "bench/report",
+        "bench/trackers",
+        "bench/merge",
+        "bench/tune",
+        "bench/photos",
+        "bench/turntable",
+        "bench/progress.py",
+    ),
     *("bench/run/sweep.py", "bench/run/summary.py"),
     *("bench/records/format.py", "bench/records/read.py"),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),

@@ -16,7 +16,7 @@ SIZED = {
     "occupancy": "[0-9]+",
 }  # and what follows the underscore
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
-FORMS = "union_K, network_LAYERSxWIDTH, grid_N"
+FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
 MOST_SAMPLES = 256  # of a grid along an axis: 64 MiB of values
 STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.models.model.Size`
 SIZE_WORDS = {STORED: "stored numbers", FREE: "free numbers", BYTES: "bytes"}

@@ -457,7 +457,9 @@ def test_a_target_outside_our_packages_needs_leave(compose_config):
 
 
 def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
-    with pytest.raises(ValueError, match="silhouette is read by task=completion, pose, capacity, stability and reconstruction alone"):
+    with pytest.raises(
+        ValueError, match="silhouette is read by task=completion, pose, capacity, stability and reconstruction alone"
+    ):
         check_names(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "pose", "capacity", "stability", "gradients"):
         check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))

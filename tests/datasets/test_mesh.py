@@ -88,6 +88,45 @@ def test_save_writes_what_others_read(tmp_path):
         mesh.save(tmp_path / "a.obj")
 
 
+def coloured(mesh: Mesh) -> Mesh:
+    """The mesh with another colour for each vertex."""
+    shares = np.linspace(0, 1, len(mesh.vertices))
+    return Mesh(mesh.vertices, mesh.faces, colours=np.stack([shares, 1 - shares, shares**2], axis=1))
+
+
+def test_colours_are_saved_with_their_vertices(tmp_path):
+    mesh = coloured(box())
+    assert mesh.colours is not None
+    mesh.save(tmp_path / "a.ply")
+    read = trimesh.load_mesh(tmp_path / "a.ply", process=False)
+    assert np.array_equal(read.vertices, mesh.vertices) and np.array_equal(read.faces, mesh.faces)
+    assert read.visual.kind == "vertex"
+    assert np.array_equal(read.visual.vertex_colors[:, :3], np.round(255 * mesh.colours))
+    assert (read.visual.vertex_colors[:, 3] == 255).all()
+    beyond = Mesh(mesh.vertices, mesh.faces, colours=3 * mesh.colours - 1)
+    beyond.save(tmp_path / "b.ply")
+    found = trimesh.load_mesh(tmp_path / "b.ply", process=False).visual.vertex_colors[:, :3]
+    assert np.array_equal(found, np.round(255 * (3 * mesh.colours - 1).clip(0, 1)))
+    box().save(tmp_path / "c.ply")
+    assert trimesh.load_mesh(tmp_path / "c.ply", process=False).visual.kind is None
+
+
+def test_compact_keeps_colours_with_their_vertices():
+    mesh = coloured(box())
+    order = np.array([5, 0, 7, 2, 4, 1, 3, 6])
+    assert mesh.colours is not None
+    padded = Mesh(
+        np.concatenate([[[9.0, 9.0, 9.0]], mesh.vertices[order], [[8.0, 8.0, 8.0]]]),
+        np.argsort(order)[mesh.faces] + 1,
+        colours=np.concatenate([[[0.3, 0.3, 0.3]], mesh.colours[order], [[0.4, 0.4, 0.4]]]),
+    )
+    small = padded.compact()
+    assert small.colours is not None and small.colours.shape == (8, 3)
+    known = {tuple(vertex): tuple(colour) for vertex, colour in zip(mesh.vertices, mesh.colours, strict=True)}
+    assert {tuple(v): tuple(c) for v, c in zip(small.vertices, small.colours, strict=True)} == known
+    assert box().compact().colours is None
+
+
 def test_normalise_centres_the_box_and_reaches_the_radius():
     mesh = box()
     moved = normalise(Mesh(5 * mesh.vertices + [7, 8, 9], mesh.faces, repairs=("1 hole closed",)), 0.9)

@@ -10,7 +10,7 @@ import trimesh
 
 from bench.tasks.photographs import sample
 from datasets.mesh import Mesh
-from datasets.photographs import Photography, turned
+from datasets.photographs import HIGHEST, Photography, around, turned
 from datasets.shot import Shot
 from datasets.textures import PHOTOGRAPHS, TEXTURES, make_texture
 from datasets.truth import Truth
@@ -74,6 +74,36 @@ def test_cameras_stand_on_a_circle_and_look_at_the_origin():
     assert pixels[0].tolist() == pytest.approx([16.0, 16.0], abs=1e-3)
     four = turned(turned(turned(quarter, pi / 2), pi / 2), pi / 2)
     assert torch.allclose(four.world_to_camera, CAMERA.world_to_camera, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [2, 7, 40])
+def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
+    cameras = around(CAMERA, count)
+    centres = torch.stack([camera.center for camera in cameras])
+    torch.testing.assert_close(centres.norm(dim=-1), torch.full((count,), 2.5), rtol=1e-5, atol=0)
+    for camera in cameras:
+        pixels, depth = camera.project(torch.zeros(1, 3))
+        assert pixels[0].tolist() == pytest.approx([16.0, 16.0], abs=1e-3) and depth.item() == pytest.approx(2.5)
+        assert camera.project(torch.tensor([[0.0, 0.1, 0.0]]))[0][0, 1] < 16  # y is up
+        assert torch.equal(camera.intrinsics, CAMERA.intrinsics) and (camera.height, camera.width) == (32, 32)
+    heights = centres[:, 1] / 2.5
+    highest = np.sin(np.radians(HIGHEST))
+    assert heights.abs().max() <= highest and heights.sum().item() == pytest.approx(0.0, abs=1e-4)
+    assert heights.max().item() == pytest.approx(highest * (1 - 1 / count), abs=1e-4)
+    apart = torch.cdist(centres, centres) + 9 * torch.eye(count)
+    assert apart.min() > 2.5 * 1.5 / count**0.5  # evenly spaced, no two close to each other
+    sides = {(bool(x > 0), bool(z > 0)) for x, _, z in centres.tolist()}
+    assert len(sides) == min(count, 4) or count < 7
+
+
+def test_places_choose_between_a_circle_and_all_around(ball):
+    circle, sphere = (replace(PLAINLY, places=places).take(ball, CAMERA, seed=0) for places in ("circle", "sphere"))
+    assert len(circle) == len(sphere) == 8
+    assert np.ptp([shot.camera.center[1].item() for shot in circle]) < 1e-4
+    assert np.ptp([shot.camera.center[1].item() for shot in sphere]) > 3.0
+    assert torch.equal(circle[0].camera.world_to_camera, CAMERA.world_to_camera)
+    with pytest.raises(ValueError, match="places must be one of circle, sphere"):
+        replace(PLAINLY, places="cube")
 
 
 @pytest.mark.parametrize("texture", ["noise", "astronaut"])

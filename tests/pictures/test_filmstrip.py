@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from matplotlib.figure import Figure
 from PIL import Image
 
 from bench.config import load
-from bench.pictures.filmstrip import MOST, Filmstrip
+from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
+from datasets.scene import Scene, View, see
 from datasets.truth import Truth
 from renderers.fields.analytic import sphere
+from tests.reconstruct.test_losses import ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, run_of
 
 CAMERA = camera_of(16)
@@ -77,3 +79,69 @@ def test_nothing_is_drawn_where_pictures_are_off(inputs, tmp_path):
     filmstrip.add(0, sphere(0.5), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert not list(tmp_path.glob("*.*"))
+
+
+def photograph(height: int, width: int, *, masked: bool = True) -> Shown:
+    """A coloured ball, photographed in another size than that of pictures."""
+    shot = shot_of(ball(0.7, (0.0, 0.0, 0.0)), camera_of(16).resized(height, width))
+    mask = shot.mask if masked else torch.ones_like(shot.mask)
+    return Shown(View(shot.camera, shot.depth, shot.normals, mask), shot.colours, masked)
+
+
+def drawn_strip(inputs, tmp_path, monkeypatch, true: Shown) -> Figure:
+    """The figure of a strip of two coloured frames, seen by the photograph's camera."""
+    drawn, pictures = [], replace(inputs, evaluation=replace(inputs.evaluation, picture=32))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    filmstrip = Filmstrip(pictures, true=true)
+    for iteration, radius in enumerate((0.3, 0.7)):
+        filmstrip.add(iteration, cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), true.view.camera)
+    filmstrip.save(tmp_path, "a ball")
+    return drawn[0]
+
+
+@pytest.mark.parametrize("size", [(16, 16), (10, 20), (24, 15)])
+@pytest.mark.parametrize("masked", [True, False])
+def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, monkeypatch, size, masked):
+    figure = drawn_strip(inputs, tmp_path, monkeypatch, photograph(*size, masked=masked))
+    axis = figure.axes[0]
+    rows = [label.get_text() for label in axis.get_yticklabels()]
+    assert rows == ["colours", "normals", *([SILHOUETTE] if masked else [])]
+    assert ("red missed" in figure.get_suptitle()) == masked
+    montage = np.asarray(axis.get_images()[0].get_array())
+    height, width = montage.shape[0] / len(rows), montage.shape[1] / 3
+    assert height == int(height) and width == int(width)
+    labels = [tick.label2.get_text() for tick in axis.xaxis.get_major_ticks()]
+    assert labels == ["0", "1", "truth"]
+    assert axis.get_xticks() == pytest.approx([width * (place + 0.5) for place in range(3)])
+    assert axis.get_yticks() == pytest.approx([height * (place + 0.5) for place in range(len(rows))])
+    cells = montage[: int(height)].reshape(int(height), 3, int(width), 3).transpose(1, 0, 2, 3)
+    middle = int(height) // 2, int(width) // 2
+    assert (cells[0, 2, 2] == 1.0).all() and cells[2, 2, 2] == pytest.approx(0.5)  # on white, and as it was taken
+    assert np.abs(cells[1] - cells[2])[middle] == pytest.approx(0.0, abs=0.1)
+    if masked:
+        errors = montage[2 * int(height) :].reshape(int(height), 3, int(width), 3).transpose(1, 0, 2, 3)
+        missed = [((error[..., 0] > 0.7) & (error[..., 1] < 0.4)).sum() for error in errors]
+        assert missed[0] > 20 and missed[0] > 5 * max(missed[1:])
+
+
+def test_a_photograph_is_enlarged_with_its_parts_in_place():
+    true = photograph(10, 20)
+    large = true.enlarged(true.view.camera.resized(30, 60))
+    assert large.colours is not None and true.colours is not None
+    assert torch.equal(large.colours[1::3, 1::3], true.colours)
+    assert torch.equal(large.view.mask[::3, 2::3], true.view.mask)
+    assert torch.equal(large.view.normals[2::3, ::3], true.view.normals)
+    assert torch.equal(large.view.depth[2::3, ::3], true.view.depth)
+    small = true.enlarged(true.view.camera.resized(5, 10))
+    assert small.colours is not None and small.colours.shape == (5, 10, 3) and small.masked
+
+
+def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    for true in (None, photograph(16, 16)):
+        filmstrip = Filmstrip(inputs, true=true)
+        filmstrip.add(0, sphere(0.5), CAMERA)
+        filmstrip.save(tmp_path, "a ball")
+        labels = [label.get_text() for label in drawn[-1].axes[0].get_yticklabels()]
+        assert labels == ["normals", SILHOUETTE]

@@ -1,11 +1,20 @@
-"""The distance network with colours: its start, its values, its gradients in float64, and where its colours lead."""
+"""Fields with colours: their start, their values, their gradients in float64, and where their colours lead."""
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from renderers.field import Field, Meter, autograd_gradients
-from renderers.fields.coloured import CHUNK, ColouredDistance, encoded
+from renderers.field import Field, Kind, Meter, autograd_gradients
+from renderers.fields.coloured import (
+    CHUNK,
+    COLOUR_SCALE,
+    LOGIT_WIDTH,
+    Coloured,
+    ColouredDistance,
+    ColouredGrid,
+    ColouredOccupancy,
+    encoded,
+)
 
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
 
@@ -121,3 +130,96 @@ def test_settings_that_cannot_be_are_refused(setting, value, remedy):
     good = {"layers": 2, "width": 16, "octaves": 2, "radius": 0.5, "directional": True}
     with pytest.raises(ValueError, match=f"{setting} must be .*{remedy}"):
         ColouredDistance(**good | {setting: value})
+
+
+def on_sphere(count: int = 500) -> Tensor:
+    return torch.nn.functional.normalize(draw(count).float(), dim=-1)
+
+
+@pytest.mark.parametrize("radius", [0.5, 0.8])
+@pytest.mark.parametrize("width", [128, 255])
+def test_an_occupancy_network_begins_as_a_sphere_and_is_negative_inside(width, radius):
+    torch.manual_seed(0)
+    field, points = ColouredOccupancy(width=width, radius=radius).field, on_sphere()
+    assert isinstance(field, Coloured) and field.kind is Kind.LEVEL
+    inside, on, outside = (field(share * radius * points).detach() for share in (0.5, 1.0, 1.5))
+    assert on.mean().item() == pytest.approx(0.0, abs=0.2) and on.std() < 0.25 * radius / LOGIT_WIDTH
+    assert (inside < 0).all() and (outside > 0).all()
+    assert inside.mean().item() == pytest.approx(-0.5 * radius / LOGIT_WIDTH, rel=0.1)
+    assert field(torch.zeros(3)).item() == pytest.approx(-radius / LOGIT_WIDTH, rel=1e-5)
+    assert field(points.view(5, 100, 3)).shape == (5, 100)
+
+
+def test_colours_of_occupancy_are_those_of_points_and_their_weights_have_a_gradient():
+    torch.manual_seed(0)
+    network = ColouredOccupancy(width=32, radius=0.5)
+    points = 0.5 * on_sphere(20)
+    first, second = (network.field.colours(points, other, other) for other in (points, -points))
+    assert torch.equal(first, second) and first.shape == (20, 3)
+    assert ((first > 0) & (first < 1)).all() and first.std(dim=0).min() > 0
+    first.sum().backward()
+    assert network.network.texture_head.weight.grad is not None
+    assert network.network.texture_head.weight.grad.abs().sum() > 0
+    assert network.network.occupancy_head.weight.grad is None
+    meter = Meter(network.field)
+    meter(points)
+    assert meter.counts.value == 20 and network.field.flops.gradient == 2 * network.field.flops.value
+
+
+def make_grid(samples: int = 9, reach: float = 1.0) -> ColouredGrid:
+    return ColouredGrid(samples=samples, radius=0.5, reach=reach)
+
+
+def test_a_grid_begins_as_a_sphere_of_one_grey():
+    grid, points = make_grid(49, 1.05), on_sphere()
+    field = grid.field
+    assert isinstance(field, Coloured) and field.kind is Kind.DISTANCE
+    for radius in (0.3, 0.5, 1.0):
+        assert field(radius * points).sub(radius - 0.5).abs().max() < 0.005
+    assert torch.equal(field.colours(points, points, points), torch.full((500, 3), 0.5))
+
+
+@pytest.mark.parametrize("corner", [(0, 0, 0), (8, 0, 0), (0, 8, 0), (0, 0, 8), (5, 2, 7)])
+def test_a_grids_colours_have_the_axes_x_y_and_z(corner):
+    grid = make_grid()
+    with torch.no_grad():
+        grid.logits[:, *corner] = torch.tensor([1.0, 2.0, -1.0]) / COLOUR_SCALE
+        grid.distances[corner] += 1.0
+    place = torch.tensor(corner) / 4 - 1  # of the corner, in scene units
+    aside = place - 0.25 * place.sign()  # the next sample, in all three axes
+    colours = grid.field.colours(torch.stack([place, aside]), torch.zeros(2, 3), torch.zeros(2, 3))
+    torch.testing.assert_close(colours[0], torch.tensor([1.0, 2.0, -1.0]).sigmoid())
+    torch.testing.assert_close(colours[1], torch.full((3,), 0.5))
+    assert (grid.field(place) - place.norm() + 0.5).item() == pytest.approx(1.0, abs=1e-5)  # distances have the same
+
+
+def test_a_grids_colours_are_interpolated_linearly_and_kept_outside():
+    grid = make_grid()
+    axis = torch.linspace(-1, 1, 9)
+    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+    with torch.no_grad():
+        grid.logits.copy_(torch.stack([x, 2 * y - 0.3, 0.5 * z + x * y]) / COLOUR_SCALE)
+    points = torch.rand(3, 7, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    colours = grid.field.colours(points, points, points)
+    u, v, w = points.unbind(-1)
+    torch.testing.assert_close(colours[..., 0], u.sigmoid(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(colours[..., 1], (2 * v - 0.3).sigmoid(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(colours[..., 2], (0.5 * w + u * v).sigmoid(), rtol=0, atol=1e-5)
+    outside = grid.field.colours(torch.tensor([[3.0, 0.0, 0.0]]), points[0, :1], points[0, :1])
+    assert outside[0, 0].item() == pytest.approx(torch.tensor(1.0).sigmoid().item(), abs=1e-6)
+    (gradient,) = torch.autograd.grad(colours[..., 0].sum(), grid.logits)
+    assert gradient[0].abs().sum() > 0 and not gradient[1:].any()
+
+
+@pytest.mark.parametrize(
+    ("make", "setting", "remedy"),
+    [
+        (lambda: ColouredOccupancy(width=8, radius=0.0), "radius", "0.5 lies"),
+        (lambda: ColouredOccupancy(width=0, radius=0.5), "width", "128 suits"),
+        (lambda: ColouredGrid(samples=1, radius=0.5, reach=1.0), "samples", "48 suit"),
+        (lambda: ColouredGrid(samples=8, radius=-1.0, reach=1.0), "radius", "0.5 lies"),
+    ],
+)
+def test_settings_of_other_fields_are_checked_as_well(make, setting, remedy):
+    with pytest.raises(ValueError, match=f"{setting} must be .*{remedy}"):
+        make()

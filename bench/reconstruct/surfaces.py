@@ -1,0 +1,99 @@
+"""Surfaces of photographs without a renderer: depths fused by screened Poisson, and colours from photographs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import map_coordinates
+
+from bench.evaluate.colours import GREY, painted
+from bench.reconstruct.stereo import Cloud
+from bench.reconstruct.subject import visible
+from datasets.mesh import Mesh
+from datasets.scene import View, see
+from datasets.shot import Shot
+from datasets.truth import Truth
+from renderers.camera import Camera
+
+NEIGHBOURS = 16  # points whose plane gives a normal
+OUTLYING = 2.0  # standard deviations of the mean distance to neighbours, beyond which a point is left out
+FACING = 4.0  # power of the cosine between normal and view direction, by which photographs are weighted
+
+
+def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
+    """The points of all given depths."""
+    clouds = []
+    for shot in shots:
+        if shot.depth is not None:
+            points = shot.camera.rays().at(shot.camera.distance(shot.depth))[shot.depth > 0]
+            clouds.append(Cloud(points.double().numpy(), shot.camera))
+    return clouds
+
+
+def fused(clouds: Sequence[Cloud]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """All points but outliers, and normals of their neighbourhoods that look at their cameras."""
+    import open3d
+
+    points = np.concatenate([np.zeros((0, 3)), *(cloud.points for cloud in clouds)])
+    centres = [np.broadcast_to(cloud.camera.center.double().numpy(), cloud.points.shape) for cloud in clouds]
+    if len(points) < NEIGHBOURS:
+        return points, np.zeros_like(points)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    _, kept = cloud.remove_statistical_outlier(NEIGHBOURS, OUTLYING)
+    cloud = cloud.select_by_index(kept)
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    facing = (normals * (np.concatenate(centres)[kept] - points)).sum(axis=1, keepdims=True)
+    return points, np.where(facing < 0, -normals, normals)
+
+
+def poisson(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], *, depth: int, trim: float
+) -> Mesh | None:
+    """The surface of points by screened Poisson reconstruction (Kazhdan and Hoppe 2013); None without one.
+
+    Args:
+        points: in scene units.
+        normals: outward.
+        depth: of the octree.
+        trim: least depth of the octree's leaf whose points support a vertex; 0 keeps all. DVR's Table 2 has 0, 5 and 7.
+    """
+    import pymeshlab
+
+    if len(points) < NEIGHBOURS:
+        return None
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
+    made = meshes.current_mesh()
+    faces = made.face_matrix()
+    if trim and len(faces):
+        faces = faces[(made.vertex_scalar_array() >= trim)[faces].all(axis=1)]
+    return Mesh(made.vertex_matrix(), faces).compact() if len(faces) else None
+
+
+def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
+    """The mesh with the mean colours of the photographs that see a vertex, those that face it before all others."""
+    scene = Truth(mesh, closed=False)
+    normals = np.zeros_like(mesh.vertices)
+    np.add.at(normals, mesh.faces.ravel(), np.repeat(mesh.crosses, 3, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    total, weights = np.zeros_like(mesh.vertices), np.zeros((len(mesh.vertices), 1))
+    for shot in shots:
+        towards = shot.camera.center.double().numpy() - mesh.vertices
+        cosine = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        weight = (visible(scene, shot, mesh.vertices) * cosine.clip(0) ** FACING)[:, None]
+        pixels = shot.camera.project(torch.from_numpy(mesh.vertices).float())[0].double().numpy() - 0.5
+        places = np.nan_to_num(pixels).T[::-1]
+        image = shot.colours.numpy()
+        seen = [map_coordinates(image[..., band], places, order=1, mode="nearest") for band in range(3)]
+        total, weights = total + weight * np.stack(seen, axis=1), weights + weight
+    return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), GREY))
+
+
+def mesh_image(mesh: Mesh, camera: Camera) -> tuple[View, Float[torch.Tensor, "height width 3"]]:
+    """A mesh's view, and its colours as `bench.evaluate.colours.painted` has them."""
+    scene = Truth(mesh, closed=False)
+    return see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float()

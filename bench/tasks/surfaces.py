@@ -1,0 +1,127 @@
+"""The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
+from bench.reconstruct.pictures import draw_surface
+from bench.reconstruct.stereo import Matching, stereo_clouds
+from bench.reconstruct.subject import Depths, Subject, find_subject
+from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
+from bench.setup.inputs import RunContext
+from bench.solve.solve import COSTS, note_result
+from datasets.captures.hull import hull_mesh
+from datasets.mesh import Mesh
+from datasets.photographs import Photography
+from renderers.checks import BadInput, check_at_least
+
+
+@dataclass(frozen=True)
+class _Photographs:
+    """What the photographs are; see `bench.tasks.reconstruction.Reconstruction`."""
+
+    images: Photography
+    longest: int
+    held_out: int
+    masks: bool
+    depths: Depths
+
+    def __post_init__(self) -> None:
+        check_at_least("task.longest", self.longest, 8, "96 shows what there is")
+        check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
+
+    def make(self, run: RunContext, surface: Callable[[Subject], Mesh | None]) -> None:
+        """Makes a surface of the given photographs, gives it their colours, and judges it by the others."""
+        inputs, record = run.inputs, run.record
+        record.definitions = COLOURED_DEFINITIONS | COSTS
+        subject = find_subject(
+            self.images, self.depths, inputs, longest=self.longest, every=self.held_out, masks=self.masks
+        )
+        record.notes = [*record.notes, subject.found, "no renderer took part"]
+        clock = time.perf_counter()
+        mesh = surface(subject)
+        mesh = None if mesh is None else with_colours(mesh, subject.given)
+        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        record.evaluations = {"value": 0, "gradient": 0}
+        with run.off_clock():
+            note_result(run, judge_mesh(mesh, subject, inputs))
+            if inputs.evaluation.picture is not None and mesh is not None:
+                title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
+                draw_surface(run.folder, inputs, mesh, subject, title)
+
+
+@dataclass(frozen=True)
+class Hull(_Photographs):
+    """The visual hull of the masks (Laurentini 1994).
+
+    Args:
+        samples: per axis.
+    """
+
+    samples: int
+
+    def __post_init__(self) -> None:
+        check_at_least("task.samples", self.samples, 8, "96 are as fine as a pixel at 96 x 96")
+        super().__post_init__()
+
+    def execute(self, run: RunContext) -> None:
+        """Carves the hull."""
+        self.make(run, self._surface)
+
+    def _surface(self, subject: Subject) -> Mesh | None:
+        if any(shot.mask is None for shot in subject.given):
+            raise BadInput("the visual hull needs masks: set task.masks=true, or another task")
+        return hull_mesh(subject.given, self.samples)
+
+
+@dataclass(frozen=True)
+class Poisson(_Photographs):
+    """Given depths, fused by screened Poisson reconstruction.
+
+    Args:
+        octree, trim: see `bench.reconstruct.surfaces.poisson`.
+    """
+
+    octree: int
+    trim: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.octree", self.octree, 2, "8 has 256 cells per axis")
+        check_at_least("task.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
+        super().__post_init__()
+
+    def execute(self, run: RunContext) -> None:
+        """Fuses the points of the given depths."""
+        self.make(run, self._surface)
+
+    def _surface(self, subject: Subject) -> Mesh | None:
+        if all(shot.depth is None for shot in subject.given):
+            raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task=stereo")
+        return poisson(*fused(given_clouds(subject.given)), depth=self.octree, trim=self.trim)
+
+
+@dataclass(frozen=True)
+class Stereo(_Photographs):
+    """Points that neighbouring photographs agree on, fused by screened Poisson reconstruction.
+
+    Args:
+        matching: of neighbouring photographs.
+        octree, trim: see `bench.reconstruct.surfaces.poisson`.
+    """
+
+    matching: Matching
+    octree: int
+    trim: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.octree", self.octree, 2, "8 has 256 cells per axis")
+        check_at_least("task.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
+        super().__post_init__()
+
+    def execute(self, run: RunContext) -> None:
+        """Matches the photographs, and fuses what is found."""
+        self.make(run, self._surface)
+
+    def _surface(self, subject: Subject) -> Mesh | None:
+        return poisson(*fused(stereo_clouds(subject.given, self.matching)), depth=self.octree, trim=self.trim)

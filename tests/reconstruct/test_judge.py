@@ -1,0 +1,183 @@
+"""The judge of a reconstruction, by a coloured sphere that is known, and by errors of known size."""
+
+from dataclasses import replace
+from math import inf, log10
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, IMAGES, OWN, SEEN, SURFACE, image_scores, judge
+from bench.reconstruct.subject import Subject
+from bench.records.record import RunStatus
+from datasets.mesh import Mesh
+from datasets.photographs import around
+from datasets.scene import View
+from datasets.shot import Shot
+from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
+from tests.tiny import ball_prior, camera_of, run_of
+
+CENTRE = (0.1, -0.05, 0.15)
+MASK_IOU = ("mask_iou", "mask_iou_least")
+
+
+def painted(*, red: float = 0.0, radius: float = 0.6) -> Ball:
+    """A sphere of colours that change with the place, of which red is `red` more."""
+    paint = torch.zeros(3, 10)
+    paint[0, 9], paint[1, 1], paint[2, 0] = torch.tensor(0.5 + red).logit(), 2.0, 2.0
+    return cast(ball(radius, CENTRE, paint), torch.float32)
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    """Photographs of a sphere from all around."""
+    made = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
+    shots = [shot_of(painted(), camera, str(number)) for number, camera in enumerate(around(camera_of(24), 8))]
+    truth = Mesh(np.array(made.vertices) + CENTRE, np.array(made.faces))
+    return Subject(tuple(shots[1:7]), (shots[0], shots[7]), truth, "a sphere")
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    inputs = run_of(tmp_path, load("renderer", "idr", steps=300), ball_prior(), camera_of(24)).inputs
+    return replace(inputs, evaluation=replace(inputs.evaluation, grid=48, points=2000))
+
+
+def without_masks(subject: Subject) -> Subject:
+    return replace(subject, held_out=tuple(replace(shot, mask=None) for shot in subject.held_out))
+
+
+def test_the_truth_scores_high(subject, inputs):
+    found = judge(painted(), subject, inputs)
+    assert found.failure is None and set(found.metrics) == set(COLOURED_DEFINITIONS)
+    metrics = found.metrics
+    assert metrics["own_psnr"] > 60 and metrics["own_ssim"] > 0.9999 and metrics["own_mask_iou"] == 1.0
+    assert metrics["psnr"] > 25 and metrics["ssim"] > 0.95 and metrics["mask_iou_least"] > 0.94
+    assert metrics["mask_iou_least"] <= metrics["mask_iou"] <= 1.0
+    assert metrics["chamfer_l1"] < 0.03 and metrics["seen_chamfer_l1"] < 0.03
+    assert metrics["normal_consistency"] > 0.99 and metrics["fscore"] > 0.4
+    assert found.mesh is not None and found.mesh.colours is not None
+
+
+def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inputs):
+    shape = cast(ball(0.6, CENTRE), torch.float32)  # whose colours change with the direction
+    mesh = judge(shape, subject, inputs).mesh
+    assert mesh is not None and mesh.colours is not None
+    points = torch.from_numpy(mesh.vertices).float()
+    normals = torch.nn.functional.normalize(points - shape.centre, dim=-1)
+    expected = shape.colours(points, normals, -normals).numpy()
+    np.testing.assert_allclose(mesh.colours, expected, atol=1e-4)
+
+
+def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
+    metrics = judge(painted(red=0.2), subject, inputs).metrics
+    shares = [shot.mask.float().mean().item() for shot in subject.held_out]
+    expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])  # of three colours one is wrong
+    assert metrics["own_psnr"] == pytest.approx(expected, abs=0.01)
+    assert metrics["own_ssim"] < 0.999 and metrics["own_mask_iou"] == 1.0
+
+
+def test_without_masks_psnr_is_over_covered_pixels_and_there_is_no_overlap(subject, inputs):
+    metrics = judge(painted(red=0.2), without_masks(subject), inputs).metrics
+    assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)
+    assert not {*MASK_IOU, *(OWN + name for name in MASK_IOU)} & set(metrics)
+    assert set(metrics) == set(COLOURED_DEFINITIONS) - {*MASK_IOU, *(OWN + name for name in MASK_IOU)}
+    exact = judge(painted(), without_masks(subject), inputs).metrics
+    assert exact["own_psnr"] > 60
+
+
+def test_a_smaller_sphere_scores_worse_by_all(subject, inputs):
+    true, small = (judge(painted(radius=radius), subject, inputs).metrics for radius in (0.6, 0.5))
+    assert small["chamfer_l1"] == pytest.approx(0.1, abs=0.02)
+    assert small["seen_completeness"] == pytest.approx(0.1, abs=0.02)
+    for prefix in ("", OWN):
+        assert small[prefix + "psnr"] < true[prefix + "psnr"] - 5
+        assert small[prefix + "mask_iou"] < 0.8
+    assert small["own_mask_iou"] == pytest.approx((0.5 / 0.6) ** 2, abs=0.1)
+
+
+def test_the_seen_part_is_judged_alone(subject, inputs):
+    """Photographs from one side do not see a dent of the other one."""
+    side = tuple(shot_of(painted(), camera_of(24, angles=(across, 0.0))) for across in (-30.0, 0.0, 30.0))
+    shifted = replace(painted(), centre=painted().centre - torch.tensor([0.0, 0.0, 0.2]), radius=torch.tensor(0.6))
+    both = Wider(painted(), shifted)
+    metrics = judge(both, replace(subject, given=side), inputs).metrics
+    assert metrics["seen_chamfer_l1"] < 0.75 * metrics["chamfer_l1"]
+
+
+class Wider:
+    """The union of two spheres, in the colours of the first."""
+
+    lipschitz, flops = None, None
+
+    def __init__(self, first: Ball, second: Ball) -> None:
+        self.first, self.second, self.kind = first, second, first.kind
+        self.colours = first.colours
+
+    def __call__(self, points):
+        return torch.minimum(self.first(points), self.second(points))
+
+
+def test_photographs_without_a_truth_have_metrics_of_images_alone(subject, inputs):
+    metrics = judge(painted(), replace(subject, truth=None), inputs).metrics
+    assert set(metrics) == {prefix + name for prefix in ("", OWN) for name in IMAGES}
+
+
+def test_no_surface_is_empty_and_scores_worst(subject, inputs):
+    found = judge(painted(radius=-0.5), subject, inputs)
+    assert found.mesh is None and found.failure is not None and found.failure[0] is RunStatus.EMPTY
+    metrics = found.metrics
+    assert set(metrics) == set(COLOURED_DEFINITIONS)
+    assert metrics["chamfer_l1"] == metrics["seen_chamfer_l1"] == inf and metrics["fscore"] == 0.0
+    assert [metrics[prefix + name] for prefix in ("", OWN) for name in MASK_IOU] == [0.0] * 4
+    assert 0 < metrics["psnr"] < 15 and metrics["psnr"] == pytest.approx(metrics["own_psnr"])
+
+
+def test_images_are_compared_black_outside_of_their_masks():
+    mask = torch.zeros(2, 4, dtype=torch.bool)
+    mask[:, :2] = True
+    covered = mask.roll(1, 1)  # half of the mask
+    image = 0.6 * covered[..., None].float().expand(-1, -1, 3)
+    larger = [part.repeat_interleave(4, 0).repeat_interleave(4, 1) for part in (mask, covered, image)]
+    camera = camera_of(16).resized(8, 16)
+    shot = Shot("0", camera, torch.full((8, 16, 3), 0.8), larger[0])
+    view = View(camera, torch.zeros(8, 16), torch.zeros(8, 16, 3), larger[1])
+    missed, both, spurious = 0.8**2, 0.2**2, 0.6**2  # a quarter of the pixels each
+    scores = image_scores([view], [larger[2]], [shot])
+    assert scores["psnr"] == pytest.approx(-10 * log10((missed + both + spurious) / 4), abs=1e-4)
+    assert scores["mask_iou"] == pytest.approx(1 / 3)
+    blind = image_scores([view], [larger[2]], [replace(shot, mask=None)])
+    assert set(blind) == {"psnr", "ssim"}
+    assert blind["psnr"] == pytest.approx(-10 * log10(both), abs=1e-4)  # of the pixels that the shape covers
+
+
+def test_the_same_image_has_the_best_scores():
+    shot = shot_of(painted(), camera_of(12))
+    assert shot.mask is not None and not shot.mask.all()
+    scores = image_scores([_view(shot)], [shot.colours * shot.mask[..., None]], [shot])
+    assert scores["psnr"] == inf and scores["ssim"] == pytest.approx(1.0)
+    assert scores["mask_iou"] == scores["mask_iou_least"] == 1.0
+
+
+def _view(shot) -> View:
+    return View(shot.camera, shot.depth, shot.normals, shot.mask)
+
+
+def test_means_and_the_least_are_over_photographs_of_any_size():
+    shots = [shot_of(painted(), camera) for camera in (camera_of(16), camera_of(24).resized(12, 24))]
+    views = [_view(shots[0]), replace(_view(shots[1]), mask=torch.zeros(12, 24, dtype=torch.bool))]
+    images = [shots[0].colours * shots[0].mask[..., None], torch.zeros(12, 24, 3)]
+    images[0] = images[0] + 0.1
+    for _ in range(5):  # types are checked of a part that is drawn
+        scores = image_scores(views, images, shots)
+    lost = ((shots[1].colours * shots[1].mask[..., None]) ** 2).mean().item()
+    assert scores["psnr"] == pytest.approx((20.0 - 10 * log10(lost)) / 2, abs=1e-4)
+    assert (scores["mask_iou"], scores["mask_iou_least"]) == (0.5, 0.0)
+
+
+def test_every_metric_is_defined():
+    assert set(COLOURED_DEFINITIONS) == {
+        *SURFACE, *(SEEN + name for name in SURFACE), *IMAGES, *(OWN + name for name in IMAGES)
+    }  # fmt: skip

@@ -1,0 +1,304 @@
+"""The losses of a reconstruction on a sphere in closed form: their values, and their gradients in float64."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from bench.reconstruct.losses import ANYWHERE, BESIDE, Losses
+from bench.reconstruct.pixels import Pixels
+from bench.solve.latent_code import Terms
+from datasets.shot import Shot
+from renderers.camera import Camera, Rays
+from renderers.field import Kind, Meter
+from renderers.fields.coloured import Coloured
+from renderers.silhouette import Own
+from tests.renderers.analytic_cases import vector
+from tests.tiny import camera_of
+
+RENDERERS = {
+    "idr": load("renderer", "idr", epsilon=1e-12, steps=300),
+    "newton": load("renderer", "newton", steps=300, march_epsilon=1e-9, warm=False),
+    "dvr": load("renderer", "dvr", doublings=[], refinement_steps=60),
+}
+OFF = {"colour": 0.0, "colour_gradient": 0.0, "depth": 0.0, "smoothness": 0.0, "normals": 0.0, "eikonal": 0.0}
+BACKGROUND = 0.5
+PAINT = torch.linspace(-0.9, 0.8, 30).sin().view(3, 10)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere whose colours are sigmoids of a linear map of the point, the field's gradient and the direction.
+
+    Args:
+        paint: the map; its last column is added.
+        slope: by which the distance is multiplied.
+    """
+
+    radius: Tensor
+    centre: Tensor
+    paint: Tensor
+    slope: float = 1.0
+    kind: Kind = Kind.DISTANCE
+    lipschitz: float | None = None
+    flops: None = None
+
+    def __call__(self, points: Tensor) -> Tensor:
+        return self.slope * (torch.linalg.vector_norm(points - self.centre, dim=-1) - self.radius)
+
+    def colours(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
+        seen = torch.cat([points, normals, directions, torch.ones_like(points[..., :1])], dim=-1)
+        return torch.sigmoid(seen @ self.paint.T)
+
+    def distance(self, rays: Rays) -> Tensor:
+        """Along each ray to the surface; NaN where it misses."""
+        towards = self.centre - rays.origins
+        along = (towards * rays.directions).sum(-1)
+        return along - (self.radius**2 - towards.square().sum(-1) + along**2).sqrt()
+
+    def normals(self, points: Tensor) -> Tensor:
+        """Unit normals of the surface at its points."""
+        return (points - self.centre) / self.radius
+
+
+def ball(
+    radius: float = 0.6, centre: tuple[float, ...] = (0.1, -0.05, 0.15), paint: Tensor | None = None, **more: Any
+) -> Ball:
+    return Ball(torch.tensor(radius).double(), vector(centre), (PAINT if paint is None else paint).double(), **more)
+
+
+def cast(shape: Ball, dtype: torch.dtype) -> Ball:
+    return replace(shape, radius=shape.radius.to(dtype), centre=shape.centre.to(dtype), paint=shape.paint.to(dtype))
+
+
+def shot_of(shape: Ball, camera: Camera, name: str = "0") -> Shot:
+    """The exact photograph of a sphere on grey, with all that can be known of it."""
+    shape, rays = cast(shape, torch.float64), camera.double().rays()
+    distance = shape.distance(rays)
+    mask, points = distance.isfinite(), rays.at(distance)
+    normals = shape.normals(points)
+    colours = torch.where(mask[..., None], shape.colours(points, normals, rays.directions), BACKGROUND)
+    depth = torch.where(mask, camera.double().depth(distance), 0.0)
+    return Shot(name, camera, colours.float(), mask, depth.float(), torch.where(mask[..., None], normals, 0.0).float())
+
+
+def pixels_of(camera: Camera, **known: Tensor) -> Pixels:
+    """All pixels of a camera in float64, by rows, with colours that rise from the first to the last."""
+    camera, count = camera.double(), camera.height * camera.width
+    at_one = camera.depth(torch.ones(camera.height, camera.width, dtype=torch.float64)).flatten()
+    colours = torch.linspace(0, 1, 3 * count, dtype=torch.float64).view(count, 3)
+    known = {"colours": colours, "mask": None, "distance": None, "guide": None, "normals": None} | known
+    return Pixels(rays=camera.rays().flat(), at_one=at_one, **known)
+
+
+def losses(**weights: Any) -> Losses:
+    return Losses(**({"depth_loss": "depth", "silhouette": Own(), "silhouette_weight": 0.0} | OFF | weights))
+
+
+def terms_of(settings: Losses, shape: Coloured, pixels: Pixels, renderer: str = "idr") -> Terms:
+    return settings(RENDERERS[renderer], shape, Meter(shape), pixels)
+
+
+CAMERA = camera_of(8, field_of_view=32.0)
+HALF = (torch.arange(64) % 8 < 4).bool()  # a mask: the left half of the image
+BALL = ball()
+PIXELS = pixels_of(CAMERA)
+DISTANCE = BALL.distance(PIXELS.rays)  # NaN on some pixels
+POINTS = PIXELS.rays.at(DISTANCE)
+
+
+def test_the_ball_is_a_coloured_field_and_some_pixels_miss_it():
+    assert isinstance(BALL, Coloured)
+    hit = DISTANCE.isfinite()
+    assert 10 < int(hit.sum()) < 50 and 10 < int((hit & HALF).sum()) < int(hit.sum())
+    for renderer in RENDERERS.values():
+        rendering = renderer.render(BALL, PIXELS.rays)
+        assert torch.equal(rendering.hit, hit)
+        torch.testing.assert_close(rendering.distance[hit], DISTANCE[hit], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("mask", [None, HALF], ids=["no mask", "mask"])
+def test_the_colour_term_is_the_sum_over_hits_on_the_foreground_over_all_rays(mask):
+    expected = 0.0
+    for pixel in range(64):
+        if DISTANCE[pixel].isfinite() and (mask is None or mask[pixel]):
+            normal = BALL.normals(POINTS[pixel])
+            seen = torch.cat([POINTS[pixel], normal, PIXELS.rays.directions[pixel], vector((1,))])
+            expected += float((1 / (1 + (-BALL.paint @ seen).exp()) - PIXELS.colours[pixel]).abs().sum())
+    terms = terms_of(losses(colour=3.0), BALL, replace(PIXELS, mask=mask))
+    assert set(terms) == {"total", "colour"}
+    assert terms["colour"].item() == pytest.approx(3.0 * expected / 64, rel=1e-9)
+    assert torch.equal(terms["total"], terms["colour"])
+
+
+@pytest.mark.parametrize("weight", [0.0, 2.0])
+def test_the_colour_gradient_term_compares_neighbours_of_whole_patches(weight):
+    camera = camera_of(12, field_of_view=32.0)
+    corners = torch.tensor([12 * row + column for row in range(0, 12, 2) for column in range(0, 12, 2)])
+    pixels = pixels_of(camera)[(corners[:, None] + torch.tensor([0, 1, 12, 13])).flatten()]
+    pixels = replace(pixels, colours=pixels.colours.flip(0).square())
+    distance = BALL.distance(pixels.rays)
+    points = pixels.rays.at(distance)
+    off = BALL.colours(points, BALL.normals(points), pixels.rays.directions) - pixels.colours
+    expected, whole = 0.0, 0
+    for patch in off.split(4):
+        if bool(patch.isfinite().all()):
+            pairs = ((0, 1), (2, 3), (0, 2), (1, 3))  # to the right, and below
+            expected += sum(float((patch[second] - patch[first]).abs().sum()) for first, second in pairs)
+            whole += 1
+    partly = sum(bool(patch.isfinite().any()) for patch in off.split(4)) - whole
+    assert whole > 3 and partly > 3
+    terms = terms_of(losses(colour=weight, colour_gradient=1.5), BALL, pixels)
+    assert terms["colour_gradient"].item() == pytest.approx(1.5 * expected / 144, rel=1e-9)
+    assert ("colour" in terms) == (weight > 0)
+
+
+@pytest.mark.parametrize("kind", ["depth", "points"])
+def test_the_depth_term_is_the_mean_error_over_hits_with_a_depth(kind):
+    given = torch.where(HALF, DISTANCE + torch.linspace(-0.2, 0.3, 64, dtype=torch.float64), torch.nan)
+    known = given.isfinite()  # some of them miss the ball: given there too, they do not count
+    given = torch.where(DISTANCE.isnan() & HALF, 2.0, given)
+    error = (DISTANCE - given).abs() * (PIXELS.at_one if kind == "depth" else 1.0)
+    pixels = replace(PIXELS, distance=given, mask=~HALF)  # which has no say in depths
+    terms = terms_of(losses(depth=2.0, depth_loss=kind), BALL, pixels)
+    assert set(terms) == {"total", "depth"} and 10 < int(known.sum()) < 50
+    assert terms["depth"].item() == pytest.approx(2.0 * error[known].mean().item(), rel=1e-9)
+
+
+@dataclass
+class Noting:
+    """A silhouette loss that keeps what it is given."""
+
+    asked: list = field(default_factory=list)
+
+    def __call__(self, renderer, field, rays, rendering, observed):
+        self.asked.append((renderer, field, rays, rendering, observed))
+        return 0.7 + 0 * rendering.closest.sum()
+
+
+def test_the_silhouette_term_is_the_weighted_loss_of_the_mask_and_the_guide():
+    noting, guide = Noting(), torch.where(HALF, DISTANCE, torch.nan)
+    terms = terms_of(losses(silhouette=noting, silhouette_weight=4.0), BALL, replace(PIXELS, mask=HALF, guide=guide))
+    assert terms["silhouette"].item() == pytest.approx(2.8)
+    ((renderer, asked, rays, rendering, observed),) = noting.asked
+    assert renderer is RENDERERS["idr"] and isinstance(asked, Meter) and rays is PIXELS.rays
+    assert torch.equal(rendering.hit, DISTANCE.isfinite())
+    assert observed.mask is HALF and observed.distance is guide
+
+
+def test_without_a_mask_or_weight_there_is_no_silhouette_term():
+    noting = Noting()
+    both = losses(colour=1.0, silhouette=noting, silhouette_weight=4.0)
+    assert set(terms_of(both, BALL, PIXELS)) == {"total", "colour"}
+    without = losses(colour=1.0, silhouette=noting)
+    assert set(terms_of(without, BALL, replace(PIXELS, mask=HALF))) == {"total", "colour"}
+    assert not noting.asked
+
+
+def test_the_smoothness_term_compares_normals_with_those_beside():
+    torch.manual_seed(3)
+    terms = terms_of(losses(smoothness=5.0), BALL, PIXELS)
+    torch.manual_seed(3)
+    points = POINTS[DISTANCE.isfinite()]
+    beside = points + BESIDE * (torch.rand(len(points), 3, dtype=torch.float64) - 0.5)
+    away = beside - BALL.centre
+    off = (BALL.normals(points) - away / away.norm(dim=-1, keepdim=True)).norm(dim=-1)
+    assert 0 < off.max() < BESIDE / 0.6
+    assert terms["smoothness"].item() == pytest.approx(5.0 * off.sum().item() / 64, rel=1e-6)
+
+
+def test_the_normals_term_is_of_the_cosine_with_given_normals():
+    true = BALL.normals(POINTS)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.4, 0.2], [0.4, 0, 0.3], [-0.2, -0.3, 0]]).double())
+    given = torch.where((HALF & DISTANCE.isfinite())[:, None], true @ turn, 0.0)
+    expected = 1 - (true * given).sum(-1)[HALF & DISTANCE.isfinite()]
+    terms = terms_of(losses(normals=2.0), BALL, replace(PIXELS, normals=given))
+    assert terms["normals"].item() == pytest.approx(2.0 * expected.mean().item(), rel=1e-7)
+    steep = terms_of(losses(normals=2.0), replace(BALL, slope=1.5), replace(PIXELS, normals=given))
+    assert steep["normals"].item() == pytest.approx(terms["normals"].item(), rel=1e-6)
+    exact = terms_of(losses(normals=2.0), BALL, replace(PIXELS, normals=true.nan_to_num(0.0)))
+    assert exact["normals"].item() == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.7, 1.3])
+def test_the_eikonal_term_is_of_the_slope_at_hits_and_anywhere(slope):
+    shape = ball(slope=slope)
+    meter = Meter(shape)
+    terms = losses(eikonal=0.5)(RENDERERS["dvr"], shape, meter, PIXELS)
+    assert terms["eikonal"].item() == pytest.approx(
+        0.5 * 2 * (slope - 1) ** 2, abs=1e-7
+    )  # points anywhere are in float32
+    assert meter.counts.value > ANYWHERE
+
+
+def test_a_level_set_has_no_eikonal_term():
+    settings, level = losses(eikonal=0.5, colour=1.0), ball(slope=1.3, kind=Kind.LEVEL)
+    assert set(terms_of(settings, level, PIXELS, "dvr")) == {"total", "colour"}
+
+
+def test_what_is_not_given_has_no_term_and_the_total_is_the_sum():
+    settings = losses(colour=1.0, depth=1.0, normals=1.0, smoothness=1.0, eikonal=1.0, silhouette_weight=1.0)
+    assert set(terms_of(settings, BALL, PIXELS)) == {"total", "colour", "smoothness", "eikonal"}
+    known = replace(PIXELS, mask=HALF, distance=DISTANCE + 0.1, normals=BALL.normals(POINTS).nan_to_num(0.0))
+    terms = terms_of(settings, ball(radius=0.5), known)
+    assert set(terms) == {"total", "colour", "depth", "silhouette", "normals", "smoothness", "eikonal"}
+    total = terms.pop("total").item()
+    assert total == pytest.approx(sum(term.item() for term in terms.values()))
+
+
+def test_a_surface_that_no_ray_meets_has_finite_terms():
+    settings = losses(colour=1.0, depth=1.0, normals=1.0, smoothness=1.0, eikonal=1.0, silhouette_weight=1.0)
+    known = replace(PIXELS, mask=HALF, distance=DISTANCE, normals=BALL.normals(POINTS).nan_to_num(0.0))
+    radius = torch.tensor(-0.5, dtype=torch.float64, requires_grad=True)
+    terms = terms_of(settings, replace(BALL, radius=radius), known)
+    assert [terms[name].item() for name in ("colour", "depth", "normals", "smoothness")] == [0.0] * 4
+    (gradient,) = torch.autograd.grad(terms["total"], radius)
+    assert gradient.isfinite() and gradient < 0  # the mask loss makes it larger
+
+
+@pytest.mark.parametrize("weights", [{"depth_loss": "depths"}, {"colour": -1.0}, {"silhouette_weight": -1.0}])
+def test_weights_that_cannot_be_are_refused(weights):
+    with pytest.raises(ValueError, match=f"task.losses.{next(iter(weights))} must be"):
+        losses(**weights)
+
+
+INNER = pixels_of(camera_of(6, field_of_view=18.0))  # away from the outline, so that all hit and go on to do so
+TARGETS = torch.rand(36, 3, generator=torch.Generator().manual_seed(0)).round().double()  # no difference changes sign
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize(
+    "weights", [{"colour": 1.0}, {"depth": 1.0}, {"normals": 1.0}, {"colour_gradient": 1.0}], ids=str
+)
+@pytest.mark.parametrize("slope", [1.0, 0.8])
+def test_the_gradient_towards_shape_and_colours_is_that_of_differences(renderer, weights, slope):
+    """DVR, Eqs. 3 to 8: through the colours at the hit, and through the hit's place."""
+    settings, first = losses(**weights), ball(slope=slope)
+    given = first.normals(INNER.rays.at(first.distance(INNER.rays))).roll(1, 0)
+    pixels = replace(INNER, colours=TARGETS, distance=first.distance(INNER.rays) - 0.2, normals=given)
+
+    def loss(radius: Tensor, centre: Tensor, paint: Tensor) -> Tensor:
+        shape = replace(first, radius=radius, centre=centre, paint=paint)
+        return terms_of(settings, shape, pixels, renderer)["total"]
+
+    leaves = [part.clone().requires_grad_() for part in (first.radius, first.centre, first.paint)]
+    found = torch.autograd.grad(loss(*leaves), leaves, allow_unused=True)
+    step, precision = 1e-5, 1e-4 if renderer == "newton" else 1e-6  # its last step may be long
+    for place, (leaf, gradient) in enumerate(zip(leaves, found, strict=True)):
+        expected = torch.zeros(leaf.numel(), dtype=torch.float64)
+        for entry in range(0, leaf.numel(), 1 if leaf.numel() < 10 else 7):
+            moved = torch.zeros(leaf.numel(), dtype=torch.float64)
+            moved[entry] = step
+            ends = []
+            for sign in (1, -1):
+                parts = [part.detach() for part in leaves]
+                parts[place] = parts[place] + sign * moved.view(leaf.shape)
+                ends.append(loss(*parts).item())
+            expected[entry] = (ends[0] - ends[1]) / (2 * step)
+        asked = expected != 0
+        flat = torch.zeros(leaf.numel(), dtype=torch.float64) if gradient is None else gradient.flatten()
+        torch.testing.assert_close(flat[asked], expected[asked], rtol=precision, atol=1e-9)
+        assert asked.any() == ("colour" in str(weights) or leaf.numel() < 10)

@@ -1,0 +1,121 @@
+"""The pixels of photographs of two sizes: which are drawn, that patches are neighbours, and what is known of them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.reconstruct.pixels import Stack
+from datasets.shot import Shot
+from renderers.camera import sphere_span
+from renderers.checks import BadInput
+from tests.reconstruct.test_losses import ball, shot_of
+from tests.tiny import CPU, camera_of
+
+WIDE, TALL = camera_of(16).resized(12, 20), camera_of(16, angles=(90.0, 10.0)).resized(18, 8)
+SIZES = [(12, 20), (18, 8)]
+
+
+def numbered(camera, photograph: int) -> Shot:
+    """A photograph whose colours are its number and the row and the column of each pixel, over 100."""
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    colours = torch.stack([torch.full_like(rows, photograph), rows, columns], dim=-1) / 100
+    return Shot(str(photograph), camera, colours, (rows + columns) % 3 == 0)
+
+
+SHOTS = [numbered(WIDE, 0), numbered(TALL, 1)]
+
+
+def places(pixels) -> torch.Tensor:
+    """Photograph, row and column of pixels, from their colours."""
+    return (100 * pixels.colours).round().long()
+
+
+def test_pixels_stand_in_one_row_with_their_own_rays():
+    stack = Stack.of(SHOTS, None, CPU)
+    assert len(stack.pixels.colours) == 12 * 20 + 18 * 8
+    for shot, (photograph, row, column) in ((SHOTS[0], (0, 3, 7)), (SHOTS[1], (1, 11, 5))):
+        place = photograph * 12 * 20 + row * SIZES[photograph][1] + column
+        assert places(stack.pixels)[place].tolist() == [photograph, row, column]
+        assert stack.width[place] == SIZES[photograph][1]
+        rays = shot.camera.rays()
+        assert torch.equal(stack.pixels.rays.directions[place], rays.directions[row, column])
+        assert torch.equal(stack.pixels.rays.origins[place], rays.origins[row, column])
+        assert stack.pixels.mask is not None and stack.pixels.mask[place] == ((row + column) % 3 == 0)
+        depth = stack.pixels.at_one[place] * stack.pixels.rays.directions[place]
+        forward = shot.camera.world_to_camera[2, :3]
+        assert stack.pixels.at_one[place].item() == pytest.approx((rays.directions[row, column] @ forward).item())
+        assert depth.isfinite().all()
+
+
+def test_patches_are_neighbours_in_one_photograph():
+    drawn = places(Stack.of(SHOTS, None, CPU).drawn(2000, patches=True, seed=0)).view(-1, 4, 3)
+    assert len(drawn) == 500 and set(drawn[:, 0, 0].tolist()) == {0, 1}
+    offsets = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]])
+    assert (drawn == drawn[:, :1] + offsets).all()
+    for photograph, (height, width) in enumerate(SIZES):
+        there = drawn[drawn[:, 0, 0] == photograph]
+        assert (there[..., 1] < height).all() and (there[..., 2] < width).all()
+
+
+def test_the_same_seed_draws_the_same_pixels_and_another_seed_others():
+    stack = Stack.of(SHOTS, None, CPU)
+    for patches in (False, True):
+        first, again, other = (places(stack.drawn(64, patches=patches, seed=seed)) for seed in (5, 5, 6))
+        assert torch.equal(first, again) and not torch.equal(first, other)
+        assert first.shape == (64, 3)
+
+
+def test_draws_leave_the_random_numbers_of_others_alone():
+    stack = Stack.of(SHOTS, None, CPU)
+    before = torch.random.get_rng_state()
+    stack.drawn(64, patches=True, seed=5)
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_only_rays_that_meet_the_unit_sphere_are_drawn_and_all_of_them():
+    wide = [numbered(camera_of(16, field_of_view=100.0), 0), numbered(camera_of(9, field_of_view=90.0), 1)]
+    stack = Stack.of(wide, None, CPU)
+    meets = sphere_span(stack.pixels.rays)[2]
+    assert 0.1 < meets.float().mean() < 0.5
+    assert torch.equal(stack.useful, meets.nonzero().squeeze(-1))
+    drawn = stack.drawn(4000, patches=False, seed=0)
+    assert sphere_span(drawn.rays)[2].all()
+    assert len(torch.unique(places(drawn), dim=0)) == int(meets.sum())
+    patches = stack.drawn(4000, patches=True, seed=0)
+    assert sphere_span(patches.rays)[2][::4].all()  # the upper left pixel of each
+
+
+def test_cameras_that_look_away_are_told():
+    camera = camera_of(8, field_of_view=30.0)
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    away = replace(camera, world_to_camera=turn @ camera.world_to_camera)
+    with pytest.raises(BadInput, match="no ray meets the unit sphere"):
+        Stack.of([numbered(away, 0)], None, CPU)
+
+
+def test_given_depths_are_distances_along_rays_and_nan_elsewhere():
+    shape, cameras = ball(), (WIDE, TALL)
+    shots = [shot_of(shape, camera) for camera in cameras]
+    stack = Stack.of(shots, None, CPU)
+    true = torch.cat([shape.distance(camera.double().rays()).flatten() for camera in cameras]).float()
+    assert stack.pixels.distance is not None and 20 < int(true.isfinite().sum()) < len(true)
+    torch.testing.assert_close(stack.pixels.distance, true, rtol=0, atol=1e-5, equal_nan=True)
+    torch.testing.assert_close(
+        stack.pixels.rays.at(true)[true.isfinite()].sub(shape.centre).norm(dim=-1).float(),
+        torch.full((int(true.isfinite().sum()),), 0.6), rtol=0, atol=1e-5,
+    )  # fmt: skip
+    assert stack.pixels.normals is not None and stack.pixels.normals.shape == (len(true), 3)
+    alone = Stack.of([shots[0], replace(shots[1], depth=None)], None, CPU).pixels.distance
+    assert alone is not None and alone[12 * 20 :].isnan().all() and alone[: 12 * 20].isfinite().any()
+
+
+def test_a_guide_is_kept_in_its_order_and_what_is_not_known_is_none():
+    guide = [torch.full(size, 1.0 + number) for number, size in enumerate(SIZES)]
+    for _ in range(8):  # types are checked of a part that is drawn
+        pixels = Stack.of([replace(shot, mask=None) for shot in SHOTS], guide, CPU).pixels
+    assert pixels.guide is not None and pixels.guide.tolist() == [1.0] * 240 + [2.0] * 144
+    assert (pixels.mask, pixels.distance, pixels.normals) == (None, None, None)
+    some = pixels[torch.tensor([239, 240])]
+    assert some.guide is not None and some.guide.tolist() == [1.0, 2.0] and some.mask is None
+    assert Stack.of(SHOTS, None, CPU).pixels.guide is None

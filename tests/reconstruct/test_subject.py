@@ -1,0 +1,211 @@
+"""What is reconstructed: photographs held out, given depths, what is seen, and distances of the visual hull."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import binary_dilation
+
+from bench.reconstruct.subject import (
+    HULL_SAMPLES,
+    ON_SURFACE,
+    Depths,
+    Subject,
+    find_subject,
+    given_distances,
+    hull_distances,
+)
+from datasets.mesh import Mesh
+from datasets.own_photographs import OwnPhotographs
+from datasets.photographs import around
+from datasets.scene import Scene, see
+from datasets.truth import Truth, sample_surface
+from renderers.checks import BadInput
+from tests.datasets.test_captures import nerf
+from tests.datasets.test_photographs import PLAINLY
+from tests.reconstruct.test_losses import RENDERERS, ball, shot_of
+from tests.tiny import ball_prior, camera_of, run_of
+
+NO_DEPTHS = Depths("none", 0.0)
+CAMERA = camera_of(24, angles=(0.0, 20.0))
+IMAGES = replace(PLAINLY, places="sphere", views=9)
+
+
+def icosphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
+    made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return Mesh(np.array(made.vertices) + centre, np.array(made.faces))
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    mesh = icosphere(0.6)
+    scene = Scene("ball", mesh, see(Truth(mesh), CAMERA))
+    return run_of(tmp_path, RENDERERS["idr"], ball_prior(), CAMERA, make_scene=lambda: scene).inputs
+
+
+def found(inputs, depths: Depths = NO_DEPTHS, *, longest: int = 16, every: int = 4, masks: bool = True) -> Subject:
+    return find_subject(IMAGES, depths, inputs, longest=longest, every=every, masks=masks)
+
+
+@pytest.mark.parametrize("every", [2, 3, 4])
+def test_every_nth_photograph_is_held_out(inputs, every):
+    subject = found(inputs, every=every)
+    assert [shot.name for shot in subject.held_out] == [str(number) for number in range(0, 9, every)]
+    assert [shot.name for shot in subject.given] == [str(number) for number in range(9) if number % every]
+    assert subject.truth is inputs.scene.mesh
+    assert "9 rendered photographs of 16 x 16 pixels" in subject.found
+    assert subject.found.endswith(f"{len(subject.held_out)} of them are held out")
+    assert all(shot.colours.shape == (16, 16, 3) for shot in subject.given)
+
+
+def test_without_masks_those_held_out_keep_theirs(inputs):
+    subject = found(inputs, masks=False)
+    assert all(shot.mask is None for shot in subject.given)
+    assert all(shot.mask is not None for shot in subject.held_out)
+
+
+def test_too_few_photographs_are_told(inputs):
+    few = replace(IMAGES, views=4)
+    with pytest.raises(BadInput, match="4 photographs with every 2th held out leave 2: give more"):
+        find_subject(few, NO_DEPTHS, inputs, longest=16, every=2, masks=True)
+    assert len(find_subject(few, NO_DEPTHS, inputs, longest=16, every=4, masks=True).given) == 3
+
+
+def test_photographs_of_ones_own_have_no_truth_and_no_depths(inputs, tmp_path):
+    nerf(tmp_path)
+    inputs = replace(inputs, photographed=OwnPhotographs(str(tmp_path), True, "stated"))
+    subject = found(inputs, every=5, longest=24)
+    assert subject.truth is None and (len(subject.given), len(subject.held_out)) == (8, 2)
+    assert subject.given[0].colours.shape == (20, 24, 3) and subject.given[0].mask is not None
+    with pytest.raises(BadInput, match=r"have no depths: set task\.depths\.points=none"):
+        found(inputs, Depths("dense", 0.0))
+
+
+@pytest.mark.parametrize(("points", "count"), [("dense", None), ("25%", None), ("30", 30)])
+def test_depths_are_given_in_the_amount_that_is_asked_for(points, count):
+    shot = shot_of(ball(), CAMERA)
+    given = Depths(points, 0.0).of(shot, 3).depth
+    assert shot.mask is not None and given is not None and shot.depth is not None
+    foreground = int(shot.mask.sum())
+    expected = count or round(foreground * (0.25 if "%" in points else 1))
+    known = given > 0
+    assert int(known.sum()) == expected and not (known & ~shot.mask).any()
+    assert torch.equal(given[known], shot.depth[known])
+    again, other = (Depths(points, 0.0).of(shot, seed).depth for seed in (3, 4))
+    assert torch.equal(given, again) and torch.equal(given, other) == (points == "dense")
+
+
+def test_depths_have_noise_of_the_standard_deviation():
+    shot = shot_of(ball(), camera_of(64))
+    assert shot.mask is not None and shot.depth is not None
+    given = Depths("dense", 0.05).of(shot, 0).depth
+    assert given is not None and (given[~shot.mask] == 0).all()
+    off = (given - shot.depth)[shot.mask]
+    assert off.std().item() == pytest.approx(0.05, rel=0.1) and abs(off.mean().item()) < 0.01
+    assert NO_DEPTHS.of(shot, 0).depth is None
+    with pytest.raises(ValueError, match=r"task\.depths\.noise must be at least 0"):
+        Depths("dense", -0.1)
+
+
+def test_depths_of_photographs_without_any_are_refused():
+    shot = shot_of(ball(), CAMERA)
+    for without in (replace(shot, depth=None), replace(shot, mask=None)):
+        with pytest.raises(BadInput, match=r"no depths: set task\.depths\.points=none"):
+            Depths("dense", 0.0).of(without, 0)
+        assert NO_DEPTHS.of(without, 0).depth is None
+
+
+def test_depths_differ_from_photograph_to_photograph(inputs):
+    subject = found(inputs, Depths("10", 0.0))
+    known = [shot.depth > 0 for shot in subject.given]  # type: ignore[operator]
+    assert all(int(one.sum()) == 10 for one in known) and not torch.equal(known[0], known[1])
+
+
+def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
+    shots = tuple(shot_of(ball(), camera) for camera in cameras)
+    return Subject(shots, (), surface, "").seen(surface, points)
+
+
+def test_of_a_sphere_the_side_towards_the_cameras_is_seen():
+    surface = icosphere(0.6)
+    points, _ = sample_surface(surface, 3000, 0)
+    cameras = [camera_of(16), camera_of(16, angles=(120.0, 30.0))]
+    expected, near = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+    for camera in cameras:
+        centre = camera.center.numpy().astype(float)
+        height = points @ centre / np.linalg.norm(centre)
+        rim = 0.6**2 / np.linalg.norm(centre)  # of the part that is seen
+        expected |= height > rim
+        near |= np.abs(height - rim) < 0.1  # where a point lies behind the first hit by less than `ON_SURFACE`
+    found = seen_by(*cameras, surface=surface, points=points)
+    assert near.mean() < 0.5 and 0.2 < expected.mean() < 0.8
+    assert np.array_equal(found[~near], expected[~near])
+    alone = seen_by(cameras[0], surface=surface, points=points)
+    assert alone.sum() < found.sum() and not (alone & ~found).any()
+
+
+def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
+    front, back = icosphere(0.3, (0.0, 0.0, 0.6)), icosphere(0.25, (0.0, 0.0, -0.5))
+    both = Mesh(
+        np.concatenate([front.vertices, back.vertices]),
+        np.concatenate([front.faces, back.faces + len(front.vertices)]),
+    )
+    towards = np.array([[0.0, 0.0, 0.9], [0.05, 0.0, -0.5 + np.sqrt(0.25**2 - 0.05**2)]])  # one on each, at z = 2.5
+    camera, aside = camera_of(16), camera_of(16, angles=(60.0, 0.0))
+    assert seen_by(camera, surface=both, points=towards).tolist() == [True, False]
+    assert seen_by(camera, surface=back, points=towards[1:]).tolist() == [True]
+    assert seen_by(camera, aside, surface=both, points=towards).tolist() == [True, True]
+    narrow = camera_of(16, field_of_view=10.0)  # 0.16 to each side at this height
+    points = np.array([[0.1, 0.0, 0.6 + np.sqrt(0.3**2 - 0.1**2)], [0.2, 0.0, 0.6 + np.sqrt(0.3**2 - 0.2**2)]])
+    assert seen_by(narrow, surface=front, points=points).tolist() == [True, False]
+    assert seen_by(camera, surface=front, points=points).tolist() == [True, True]
+    within = points[:1] - [0.0, 0.0, 5 * ON_SURFACE]
+    assert seen_by(narrow, surface=front, points=within).tolist() == [False]
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """Exact photographs of a sphere from all around, without depths."""
+    return [replace(shot_of(ball(), camera), depth=None) for camera in around(camera_of(32), 12)]
+
+
+def test_the_hull_lies_in_front_of_the_surface_and_beside_the_mask_there_is_none(shots):
+    spacing = 2 / (HULL_SAMPLES - 1)
+    pixel = 2.5 * 2 * np.tan(np.radians(25)) / 32  # in scene units, at the sphere
+    for shot, hull in zip(shots, hull_distances(shots), strict=True):
+        true = ball().distance(shot.camera.double().rays())
+        assert (hull.isfinite() & shot.mask).sum() > 0.9 * shot.mask.sum()
+        inner = torch.from_numpy(~binary_dilation(~shot.mask.numpy(), iterations=3))  # rays that are not grazing
+        assert int(inner.sum()) > 20 and hull[inner].isfinite().all()
+        behind = (hull - true)[inner]
+        assert behind.max() < pixel / 2 + spacing  # a mask is known up to half a pixel
+        assert behind.min() > -4 * pixel and behind.mean() < pixel / 4
+        beside = torch.from_numpy(~binary_dilation(shot.mask.numpy()))
+        assert hull[beside].isnan().all()
+
+
+def test_given_depths_win_over_the_hull(shots):
+    plain = hull_distances(shots)
+    assert shots[2].mask is not None
+    row, column = (int(place) for place in shots[2].mask.nonzero()[40])
+    depth = torch.zeros(32, 32)
+    depth[row, column] = 1.7
+    given = [*shots[:2], replace(shots[2], depth=depth), *shots[3:]]
+    mixed = hull_distances(given)
+    expected = plain[2].clone()
+    expected[row, column] = shots[2].camera.distance(depth)[row, column]
+    torch.testing.assert_close(mixed[2], expected, equal_nan=True)
+    torch.testing.assert_close(mixed[3], plain[3], equal_nan=True)
+    alone = given_distances(given)
+    assert alone[0].isnan().all() and int(alone[2].isfinite().sum()) == 1
+    assert alone[2][row, column] == expected[row, column]
+
+
+def test_without_masks_or_with_an_empty_hull_the_remedy_is_told(shots):
+    blind = [*shots[:3], replace(shots[3], mask=None)]
+    empty = [replace(shot, mask=torch.zeros(32, 32, dtype=torch.bool)) for shot in shots[:4]]
+    for wrong in (blind, empty):
+        with pytest.raises(BadInput, match=r"the visual hull needs masks .*: set task\.guide=none"):
+            hull_distances(wrong)

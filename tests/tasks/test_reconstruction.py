@@ -1,0 +1,253 @@
+"""Reconstruction from photographs on disk and of a mesh: it improves, leaves a coloured mesh, and tells mistakes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.reconstruct.judge import COLOURED_DEFINITIONS
+from bench.reconstruct.losses import Losses
+from bench.reconstruct.models import Appearance
+from bench.reconstruct.subject import Depths
+from bench.setup.fields import FieldChoice
+from bench.setup.inputs import RunContext
+from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.tasks.reconstruction import Reconstruction
+from datasets.mesh import Mesh
+from datasets.own_photographs import OwnPhotographs
+from datasets.scene import Scene, see
+from datasets.truth import Truth
+from renderers.checks import BadInput
+from renderers.silhouette import Own
+from tests.datasets.test_captures import nerf
+from tests.datasets.test_photographs import PLAINLY
+from tests.run.driving import command, record_of
+from tests.tiny import Blind, altered, ball_prior, camera_of, run_of
+
+PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
+SETTINGS = Reconstruction(
+    images=replace(PLAINLY, places="sphere", views=7, texture_size=1.0),
+    longest=24,
+    held_out=4,
+    masks=True,
+    depths=Depths("none", 0.0),
+    guide="none",
+    rays=192,
+    appearance=Appearance(octaves=2, directional=False, radius=0.5),
+    losses=Losses(
+        colour=1.0, colour_gradient=0.0, depth=1.0, depth_loss="depth", silhouette=Own(), silhouette_weight=0.3,
+        smoothness=0.0, normals=0.0, eikonal=0.3,
+    ),
+    optimiser=OptimiserSettings(20, 0.02, "ramped"),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """An ellipsoid, larger than the sphere that fields begin as."""
+    made = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    mesh = Mesh(np.array(made.vertices) * [0.8, 0.65, 0.6], np.array(made.faces))
+    camera = camera_of(24)
+    return Scene("ellipsoid", mesh, see(Truth(mesh), camera))
+
+
+def run_in(folder: Path, scene: Scene | None, *, renderer: str = "idr", field: str = "grid_12", **more) -> RunContext:
+    """A run under way, of a scene or of photographs on disk, which are written first."""
+    if scene is None:
+        nerf(folder)
+        more |= {"photographed": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated")}
+    else:
+        more |= {"make_scene": lambda: scene}
+    more |= {"field": FieldChoice(field, None)}
+    fewer = {"steps": 20} if renderer == "idr" else {}  # for speed
+    return run_of(folder, load("renderer", renderer, **fewer), ball_prior(), camera_of(24), **more)
+
+
+def executed(run: RunContext, **changed):
+    """The record of a run of the task with changed settings."""
+    torch.manual_seed(0)
+    altered(SETTINGS, changed).execute(run)
+    return run.record
+
+
+def assert_coloured_mesh(folder: Path) -> np.ndarray:
+    """The colours of the mesh that a run has left, which are not all alike."""
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    assert mesh.visual.kind == "vertex"
+    colours = np.asarray(mesh.visual.vertex_colors[:, :3], dtype=float)
+    assert len(colours) == len(mesh.vertices) > 50
+    return colours
+
+
+def test_a_rendered_mesh_is_learnt_with_its_colours(scene, tmp_path):
+    run = run_in(tmp_path, scene)
+    run = replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, every=10)))
+    record = executed(run)
+    assert (record.status, record.reason) == ("ok", "")
+    first, last = record.metrics_start, record.metrics
+    assert set(first) == set(last) == set(COLOURED_DEFINITIONS) <= set(record.definitions)
+    for name in ("psnr", "own_psnr"):
+        assert last[name] > first[name] + 2
+    assert last["mask_iou"] > first["mask_iou"] + 0.1 and last["chamfer_l1"] < 0.8 * first["chamfer_l1"]
+    assert assert_coloured_mesh(tmp_path).std(axis=0).max() > 5
+    for name in PICTURES:
+        assert (tmp_path / name).stat().st_size > 2000, name
+    assert "7 rendered photographs of 24 x 24 pixels; 2 of them are held out" in record.notes
+    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert len(lines) == 20 and {"colour", "silhouette", "eikonal"} < set(lines[0]) and "depth" not in lines[0]
+    checked = [line for line in lines if "psnr" in line]
+    assert [line["iteration"] for line in checked] == [0, 10, 19]
+    assert checked[0]["psnr"] == first["psnr"] < checked[-1]["psnr"] and checked[-1]["chamfer_l1"] < first["chamfer_l1"]
+    assert record.evaluations["rays_per_iteration"] == 192 and record.evaluations["observed"] == 0
+
+
+def without_pictures(run: RunContext) -> RunContext:
+    return replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, picture=None)))
+
+
+@pytest.mark.parametrize(("masks", "margin"), [("stored", 2.0), ("not used", 0.3), ("none", 2.0)])
+def test_photographs_on_disk_are_learnt(tmp_path, masks, margin):
+    run = run_in(tmp_path, None, stored_masks=masks != "none")
+    run = run if masks == "none" else without_pictures(run)
+    record = executed(run, masks=masks == "stored", longest=32)
+    assert record.status == "ok", record.reason
+    assert record.metrics["psnr"] > record.metrics_start["psnr"] + margin
+    blind = any("without masks nothing says where the object ends" in note for note in record.notes)
+    assert blind == (masks != "stored")
+    assert ("mask_iou" in record.metrics) == (masks != "none")
+    assert not {"chamfer_l1", "seen_chamfer_l1"} & set(record.metrics)
+    colours = assert_coloured_mesh(tmp_path)
+    assert masks == "none" or colours[:, 0].mean() > colours[:, 2].mean() + 15  # the ball is orange
+    assert all((tmp_path / name).is_file() == (masks == "none") for name in PICTURES)
+    assert any(note.endswith("3 of them are held out") for note in record.notes)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "field"), [("dvr", "occupancy_32"), ("newton", "network_2x16"), ("dist", "network_1x16")]
+)
+def test_fields_of_each_kind_are_learnt_by_renderers_that_take_them(scene, tmp_path, renderer, field):
+    run = without_pictures(run_in(tmp_path, scene, renderer=renderer, field=field))
+    more = {"losses.depth": 1.0, "losses.smoothness": 0.01, "losses.normals": 0.1, "losses.colour_gradient": 0.1}
+    record = executed(run, depths=Depths("20%", 0.001), **more, **{"optimiser.iterations": 6})
+    assert record.status in ("ok", "not_reached") and "mesh.ply" in {path.name for path in tmp_path.iterdir()}
+    line = json.loads((tmp_path / "curve.jsonl").read_text().splitlines()[0])
+    terms = {"colour", "colour_gradient", "depth", "silhouette", "smoothness", "normals"}
+    assert terms < set(line) and ("eikonal" in line) == (field != "occupancy_32")
+    assert record.evaluations["observed"] > 100
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
+    run = run_in(tmp_path, scene, renderer="dvr", field="occupancy_16")
+    for guide, known in (("none", None), ("hull", True), ("given", True)):
+        settings = replace(SETTINGS, guide=guide, depths=Depths("dense", 0.0))
+        problem = settings.problem(_subject(settings, run), run)
+        found = problem.stack.pixels.guide
+        assert (found is None) == (known is None)
+        assert found is None or 0.05 < found.isfinite().float().mean() < 0.6
+    with pytest.raises(BadInput, match="the visual hull needs masks"):
+        executed(run, guide="hull", masks=False)
+
+
+def _subject(settings: Reconstruction, run: RunContext):
+    from bench.reconstruct.subject import find_subject
+
+    return find_subject(settings.images, settings.depths, run.inputs, longest=24, every=4, masks=True)
+
+
+def test_the_same_seed_gives_the_same_result(scene, tmp_path):
+    totals = []
+    for seed in (0, 0, 1):
+        run = run_in(tmp_path, scene, seed=seed)
+        settings = replace(SETTINGS, optimiser=OptimiserSettings(4, 0.02, "constant"))
+        problem = settings.problem(_subject(settings, run), run)
+        torch.manual_seed(0)
+        totals.append([problem.loss(iteration)["total"].item() for iteration in range(2)])
+    assert totals[0] == totals[1] and totals[0] != totals[2] and totals[0][0] != totals[0][1]
+
+
+def test_a_level_set_and_a_renderer_of_distances_are_unsupported(scene, tmp_path):
+    with pytest.raises(Unsupported, match="DIST needs a distance or bound field, not a level field"):
+        executed(run_in(tmp_path, scene, renderer="dist", field="occupancy_32"))
+
+
+def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
+    run = run_in(tmp_path, scene)
+    run = replace(run, inputs=replace(run.inputs, renderer=Blind()))
+    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
+        executed(run)
+
+
+@pytest.mark.parametrize("field", ["union_3", "prior", "auto", "sphere"])
+def test_a_field_without_colours_is_told(scene, tmp_path, field):
+    words = f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
+    with pytest.raises(BadInput, match=words):
+        executed(run_in(tmp_path, scene, field=field))
+
+
+def test_depths_of_photographs_on_disk_are_refused(tmp_path):
+    with pytest.raises(BadInput, match=r"have no depths: set task\.depths\.points=none"):
+        executed(run_in(tmp_path, None), depths=Depths("dense", 0.0))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"longest": 4}, "task.longest must be at least 8"),
+        ({"held_out": 1}, "task.held_out must be at least 2"),
+        ({"guide": "truth"}, "task.guide must be one of none, given, hull"),
+        ({"rays": 2}, "task.rays must be at least 4"),
+        ({"appearance.octaves": -1}, "task.appearance.octaves must be at least 0"),
+        ({"appearance.radius": 0.0}, "task.appearance.radius must be positive"),
+    ],
+)
+def test_settings_that_cannot_be_are_told(changed, message):
+    with pytest.raises(ValueError, match=message):
+        altered(SETTINGS, changed)
+
+
+TINY = (
+    "dataset=photos", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=16", "evaluation.points=100",
+    "evaluation.every=null", "evaluation.picture=null",
+)  # fmt: skip
+
+
+def run_command(folder: Path, *arguments: str):
+    nerf(folder)
+    return command(*TINY, f"dataset.path={folder}", f"results_dir={folder / 'results'}", *arguments)
+
+
+def test_a_command_learns_photographs(tmp_path):
+    small = ("task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
+    code, out, err = run_command(tmp_path, "task=reconstruction", "renderer=idr", *small, "dataset.masks=false")
+    assert code == 0 or "did not fall" in err, err
+    record = record_of(out)
+    assert record["scene"] == tmp_path.name and record["task"] == "reconstruction"
+    assert "psnr" in record["metrics"] and "mask_iou" not in record["metrics"]
+    assert any("without masks" in note for note in record["notes"])
+
+
+def test_another_task_of_photographs_is_refused_with_the_remedy(tmp_path):
+    code, out, err = run_command(tmp_path, "task=completion", "renderer=idr", "task.points=20")
+    assert code != 0
+    assert "photographs have no true shape: set task=reconstruction, or another dataset" in out + err
+    assert "Traceback" not in out + err
+
+
+def test_photographs_show_one_object(tmp_path):
+    code, out, err = run_command(tmp_path, "task=reconstruction", "renderer=idr", "index=1")
+    assert code == 2 and out == ""
+    assert len(err.strip().splitlines()) == 1 and "photographs show one object, with index=0, not 1" in err
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    missing = tmp_path / "none"
+    with pytest.raises(ValueError, match="is no folder: give the folder that has the photographs"):
+        OwnPhotographs(str(missing), True, "stated")
+    with pytest.raises(ValueError, match=r"dataset\.axes must be one of"):
+        OwnPhotographs(str(tmp_path), True, "up")
