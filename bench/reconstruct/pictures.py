@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bench.evaluate.colours import coloured_image
 from bench.evaluate.evaluate import picture_view
-from bench.pictures.run_figures import draw_curve, normals_image
+from bench.pictures.run_figures import draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import mesh_image
@@ -31,7 +31,7 @@ WORST = 0.3  # mean difference of colours that is shown darkest
 def draw_reconstruction(
     folder: Path, inputs: RunInputs, field: Coloured, subject: Subject, curve: list[dict[str, Any]], title: str
 ) -> None:
-    """Writes summary.png, input.png and curve.png."""
+    """Writes summary.png, input.png, curve.png and images.npz."""
     draw_curve(folder / "curve.png", curve)
 
     def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
@@ -42,7 +42,7 @@ def draw_reconstruction(
 
 
 def draw_surface(folder: Path, inputs: RunInputs, mesh: Mesh, subject: Subject, title: str) -> None:
-    """Writes summary.png and input.png of a mesh with colours."""
+    """Writes summary.png, input.png and images.npz of a mesh with colours."""
     _save(folder, lambda camera: mesh_image(mesh, camera), inputs, subject, title)
 
 
@@ -51,6 +51,17 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
         figures = {"summary": _summary(seen, inputs, subject, title), "input": _input(subject)}
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+    shot = subject.held_out[len(subject.held_out) // 2]
+    view, image = seen(_larger(shot.camera, inputs))
+    arrays = {"photograph": shot.colours, "colours": image, "normals": picture_normals(view), "hit": view.mask}
+    plain = {name: (array if name == "hit" else array.half()).numpy() for name, array in arrays.items()}
+    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
+
+
+def _larger(camera: Camera, inputs: RunInputs) -> Camera:
+    """The camera at the size of pictures."""
+    larger = inputs.evaluation.picture / max(camera.height, camera.width)
+    return camera.resized(round(larger * camera.height), round(larger * camera.width))
 
 
 def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:
@@ -60,9 +71,7 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 0.9), layout="constrained")
     axes = figure.subplots(len(shots), 4, squeeze=False)
     for row, shot in zip(axes, shots, strict=True):
-        camera = shot.camera
-        larger = inputs.evaluation.picture / max(camera.height, camera.width)
-        view, image = seen(camera.resized(round(larger * camera.height), round(larger * camera.width)))
+        view, image = seen(_larger(shot.camera, inputs))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
         row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
         shown = row[2].imshow(_error(seen, shot), cmap="magma_r", vmin=0, vmax=WORST, interpolation="nearest")

@@ -66,7 +66,7 @@ class ReconstructionProblem:
     @property
     def tracked(self) -> tuple[str, ...]:
         """Metrics of checkpoints: of held-out photographs and, where it is known, of the true surface."""
-        return ("psnr", *(["chamfer_l1"] if self.subject.truth is not None else []))
+        return ("psnr", *(["seen_chamfer_l1"] if self.subject.truth is not None else []))
 
     @property
     def observed(self) -> Bool[Tensor, "1 n"]:

@@ -1,0 +1,166 @@
+"""Pieces that the pages on shapes from photographs share: lines of the table, curves, pictures."""
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import curves
+from bench.report.data.experiments import Experiment
+from bench.report.data.records import (
+    Record,
+    Row,
+    error,
+    family,
+    grouped,
+    index,
+    loop_seconds,
+    measured,
+    median_of_known,
+    row_of,
+    value_evaluations,
+)
+from bench.report.data.statistics import median
+from bench.report.write import chart, pictures
+from bench.report.write.table import Column, text
+
+ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
+CLOSE = {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
+MOST_COLUMNS = 7
+HIGHER = ("psnr", "ssim", "mask_iou", "seen_fscore")  # of which more is better
+COST = (
+    text("failed", "Failed"),
+    Column("seconds", "Loop", show=format.seconds),
+    Column("evaluations", "Evaluations", show=lambda value: format.count(value) if value else "none"),
+)
+
+
+def lines_of(experiment: Experiment, names: Sequence[str]) -> list[dict[str, Any]]:
+    """A line per row with the medians of metrics over scenes, what failed and what it cost; failed runs are worst."""
+    return [{"method": row.name, **_line(records, names)} for row, records in experiment.rows().items()]
+
+
+def _line(records: list[Record], names: Sequence[str]) -> dict[str, Any]:
+    finished = [record for record in records if record["status"] == "ok"]
+    return {
+        **{name: _middle(records, name) for name in names},
+        "failed": f"{len(records) - len(finished)} of {len(records)}",
+        "seconds": median_of_known(map(loop_seconds, finished)),
+        "evaluations": median_of_known(map(value_evaluations, finished)),
+    }
+
+
+def _middle(records: list[Record], name: str) -> float | None:
+    """The median of a metric, with failed runs worst; None where no run has it."""
+    if all(measured(record, name) is None for record in records):
+        return None
+    if name in HIGHER:
+        found = [measured(record, name) if record["status"] == "ok" else 0.0 for record in records]
+        return float(median([value or 0.0 for value in found]))
+    return float(median([error(record, name) for record in records]))
+
+
+def history(experiment: Experiment, record: Record, name: str) -> list[tuple[float, float, float]]:
+    """Seconds, field values and a metric, at the checkpoints of a run and at its end.
+
+    A line of a curve has the metric before its step, but the costs after it, so a checkpoint gets the costs of the line
+    before it.
+    """
+    found, spent = [], (0.0, 0.0)
+    for line in curves.lines(experiment.folder(record)) or []:
+        if isinstance(line.get(name), int | float):
+            found.append((*spent, float(line[name])))
+        spent = float(line.get("seconds", spent[0])), float(line.get("value_evaluations", spent[1]))
+    last = measured(record, name)
+    return found if last is None else [*found, (*spent, float(last))]
+
+
+@style.styled
+def draw_curves(experiment: Experiment, name: str, label: str, scale: float) -> Figure:
+    """A column per scene: the metric over seconds above, over field values below; rows without a loop as levels."""
+    scenes = grouped(experiment.records, scene_of)
+    figure, axes = chart.sheet(4.4, 2, len(scenes), sharey="col")
+    for column, (scene, records) in zip(axes.T, scenes.items(), strict=True):
+        column[0].set_title(scene)
+        for record in records:
+            _draw_run(experiment, record, column, name, scale)
+        for axis, unit in zip(column, ("seconds in the loop", "field values"), strict=True):
+            axis.set(xscale="log", xlabel=unit)
+            if scale != 1:
+                axis.set_yscale("log")
+    for axis in axes[:, 0]:
+        axis.set_ylabel(label)
+    style.legend_below(figure, *axes.flat)
+    return figure
+
+
+def _draw_run(experiment: Experiment, record: Record, column: Any, name: str, scale: float) -> None:
+    row, points = row_of(record), history(experiment, record, name)
+    last = measured(record, name)
+    if record["evaluations"].get("value"):
+        for axis, part in zip(column, (0, 1), strict=True):
+            shown = [(point[part], scale * point[2]) for point in points if point[part] > 0]
+            if shown:
+                chart.line(axis, row.preset, *zip(*shown, strict=True), ms=3, label=row.name)
+    elif last is not None and record["status"] == "ok":
+        look = style.look(row.preset)
+        for axis in column:
+            axis.axhline(scale * last, color=look.colour, ls=look.line, lw=0.9, label=row.name)
+
+
+def scene_of(record: Record) -> str:
+    """The name of a run's scene, for titles."""
+    return family(record) if setting_path(record) else f"{family(record)} {index(record)}"
+
+
+def setting_path(record: Record) -> bool:
+    """Whether the scene is of files of the user's."""
+    return bool(record["config"].get("dataset", {}).get("path"))
+
+
+@style.styled
+def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[str]) -> tuple[Figure, list[str]]:
+    """For each scene the held-out photograph and each row's colours, normals below; and a note for each that is missing."""
+    blocks, notes = [], []
+    for scene in scenes:
+        cells, missing = _cells(experiment, rows, scene)
+        blocks += [cells[start : start + MOST_COLUMNS] for start in range(0, len(cells), MOST_COLUMNS)]
+        notes += missing
+    columns = max(map(len, blocks), default=1)
+    figure, axes = chart.sheet(2.1 * style.WIDTH / columns * len(blocks), 2 * max(len(blocks), 1), columns)
+    figure.get_layout_engine().set(**CLOSE)
+    for axis in axes.flat:
+        axis.axis("off")
+    for place, cells in enumerate(blocks):
+        for (title, images), above, below in zip(cells, axes[2 * place], axes[2 * place + 1], strict=False):
+            above.set_title("\n".join(textwrap.wrap(title, 16)), fontsize=6)
+            _pair(above, below, images)
+    return figure, notes
+
+
+def _cells(experiment: Experiment, rows: Sequence[Row], scene: str) -> tuple[list[Any], list[str]]:
+    cells, notes = [], []
+    for row in rows:
+        record = next((r for r in experiment.records if scene_of(r) == scene and row_of(r) == row), None)
+        found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), ARRAYS)
+        if why:
+            notes.append(f"No pictures of {row.name}, {scene}: {why}.")
+        elif not cells:
+            cells.append((f"{scene}, held out", {"colours": found["photograph"]}))
+        cells.append((row.name, found))
+    return cells, notes
+
+
+def _pair(above: Any, below: Any, images: dict[str, np.ndarray]) -> None:
+    if not images:
+        chart.say(above, "no picture", color="#777777")
+        return
+    hit = images.get("hit")
+    colours = images["colours"].astype(float)
+    above.imshow(colours if hit is None else np.where(hit[..., None], colours, 1.0).clip(0, 1), interpolation="auto")
+    if hit is not None:
+        below.imshow(pictures.coloured(images["normals"].astype(float), hit), interpolation="auto")
