@@ -40,6 +40,7 @@ COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
 CHOSEN = {"renderer", "dataset", "stress", "method", "silhouette"}  # groups that experiments sweep over
+ASKED = {"photos": [f"dataset.path={CONF}"]}  # by experiments: any folder
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 # What a choice needs on the command line.
 NEEDS = {
@@ -133,7 +134,7 @@ def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
-    for extra in ([], ["scale=paper", "dataset=mesh", f"dataset.path={mesh_path}"]):
+    for extra in (ASKED.get(name, []), ["scale=paper", "dataset=mesh", f"dataset.path={mesh_path}"]):
         config = compose_config(f"+experiment={name}", *extra)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         for part in PARTS:
@@ -147,7 +148,8 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, s
     method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
     draw = [f"draw={rows['draw']}"] if "draw" in rows else []
     key, _, value = swept.removeprefix("+").partition("=")
-    config = compose_config(*method, *draw, *([swept] if key in CHOSEN else []), f"+experiment={name}")
+    chosen = [swept] if key in CHOSEN else []
+    config = compose_config(*method, *draw, *chosen, f"+experiment={name}", *ASKED.get(name, []))
     if key not in CHOSEN:  # a value of a key that is there, which is cheaper to set than to compose
         OmegaConf.update(config, key, yaml.safe_load(value), force_add=False)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)

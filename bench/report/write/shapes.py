@@ -32,10 +32,17 @@ ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
 CLOSE = {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
 MOST_COLUMNS = 7
 HIGHER = ("psnr", "ssim", "mask_iou", "seen_fscore")  # of which more is better
+
+
+def _values(value: float | None) -> str:
+    """A number of field values; a method without a field needs none."""
+    return "none" if value == 0 else format.count(value)
+
+
 COST = (
     text("failed", "Failed"),
     Column("seconds", "Loop", show=format.seconds),
-    Column("evaluations", "Evaluations", show=lambda value: format.count(value) if value else "none"),
+    Column("evaluations", "Evaluations", show=_values),
 )
 
 
@@ -124,7 +131,7 @@ def setting_path(record: Record) -> bool:
 
 @style.styled
 def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[str]) -> tuple[Figure, list[str]]:
-    """For each scene the held-out photograph and each row's colours, normals below; and a note for each that is missing."""
+    """For each scene a held-out photograph and each row's colours, normals below; a note for each missing one."""
     blocks, notes = [], []
     for scene in scenes:
         cells, missing = _cells(experiment, rows, scene)

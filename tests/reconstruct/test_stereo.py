@@ -1,0 +1,146 @@
+"""Points that photographs of a textured sphere agree on: they lie on it, and those outside of masks are left out."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.reconstruct import stereo
+from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
+from datasets import photographs
+from datasets.shot import Shot
+from datasets.truth import Truth
+from renderers.checks import BadInput
+from tests.datasets.test_photographs import PLAINLY
+from tests.reconstruct.test_losses import ball, shot_of
+from tests.reconstruct.test_subject import icosphere
+from tests.tiny import camera_of
+
+RADIUS = 0.7
+PIXELS = 64
+NEAR = 0.03  # scene units
+ALL = Matching(3, 45.0)
+SETTINGS = replace(PLAINLY, texture_size=0.15)
+
+
+@pytest.fixture(scope="module")
+def sphere() -> Truth:
+    pytest.importorskip("cv2", reason="points of photographs need OpenCV")
+    return Truth(icosphere(RADIUS))
+
+
+def taken(sphere: Truth, *angles: tuple[float, float]) -> list[Shot]:
+    """Photographs from these angles in degrees, about the vertical axis and above the horizon."""
+    cameras = [camera_of(PIXELS, angles=one) for one in angles]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photographs, "circle", lambda first, count: cameras)
+        return replace(SETTINGS, views=len(cameras)).take(sphere, cameras[0], seed=0)
+
+
+def points_of(shots: list[Shot], matching: Matching = ALL) -> np.ndarray:
+    return np.concatenate([cloud.points for cloud in stereo_clouds(shots, matching)])
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        [(0.0, 0.0), (15.0, 0.0)],
+        [(0.0, 0.0), (0.0, 12.0)],
+        [(100.0, 20.0), (115.0, 20.0), (108.0, 35.0)],
+    ],
+    ids=["side by side", "above one another", "three"],
+)
+def test_points_lie_on_the_sphere_where_photographs_see_it(sphere, angles):
+    shots = taken(sphere, *angles)
+    clouds = stereo_clouds(shots, ALL)
+    assert len(clouds) == len(shots) * (len(shots) - 1)
+    for cloud in clouds:
+        off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)
+        assert len(off) > 1000 and (off < NEAR).mean() > 0.9, (len(off), (off < NEAR).mean())
+        towards = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
+        facing = towards @ cloud.camera.center.double().numpy() / 2.5
+        assert (facing > 0.2).mean() > 0.95  # on the side that the camera sees
+        assert np.median(facing) < 0.97  # not its middle alone
+    centres = [tuple(cloud.camera.center.tolist()) for cloud in clouds]
+    assert set(centres) == {tuple(shot.camera.center.tolist()) for shot in shots}
+
+
+def test_photographs_that_are_not_square_give_points_too(sphere):
+    shots = taken(sphere, (0.0, 0.0), (15.0, 0.0))
+    low = PIXELS // 4
+    intrinsics = shots[0].camera.intrinsics.clone()
+    intrinsics[1, 2] -= low
+    cut = [
+        Shot(shot.name, replace(shot.camera, intrinsics=intrinsics, height=2 * low), shot.colours[low:-low], None)
+        for shot in shots
+    ]
+    points = points_of(cut)
+    assert len(points) > 1000 and (np.abs(np.linalg.norm(points, axis=1) - RADIUS) < NEAR).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("matching", "pairs"),
+    [
+        (Matching(2, 45.0), ["0-10", "0-25", "1-10", "1-25", "10-1", "10-0", "25-10", "25-1", "60-25"]),
+        (Matching(1, 45.0), ["0-10", "1-10", "10-1", "25-10", "60-25"]),
+        (Matching(4, 12.0), ["0-10", "1-10", "10-1", "10-0"]),
+        (Matching(4, 5.0), []),
+    ],
+)
+def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, matching, pairs):
+    shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0)), f"{turn:g}") for turn in (0.0, 1.0, 10.0, 25.0, 60.0)]
+    found = []
+
+    def matched(shot: Shot, other: Shot) -> Cloud:
+        found.append(f"{shot.name}-{other.name}")
+        return Cloud(np.zeros((0, 3)), shot.camera)
+
+    monkeypatch.setattr(stereo, "_matched", matched)
+    clouds = stereo_clouds(shots, matching)
+    assert found == pairs and len(clouds) == len(pairs)
+
+
+def test_points_outside_of_a_mask_are_left_out(sphere):
+    shots = taken(sphere, (0.0, 0.0), (15.0, 0.0))
+    free = points_of([replace(shot, mask=None) for shot in shots])
+    upper = torch.zeros(PIXELS, PIXELS, dtype=torch.bool)
+    upper[: PIXELS // 2] = True
+    halved = points_of([replace(shots[0], mask=None), replace(shots[1], mask=upper)])
+    above = free[:, 1] > 0  # y is up, and both cameras look along the horizon
+    assert 0.3 < above.mean() < 0.7
+    np.testing.assert_allclose(halved, free[above])
+
+
+def test_a_photograph_beside_which_a_point_lies_does_not_exclude_it(sphere):
+    shots = taken(sphere, (0.0, 0.0), (15.0, 0.0))
+    narrow = camera_of(8, field_of_view=5.0, angles=(90.0, 0.0))  # too far for a neighbour
+    everything = Shot("narrow", narrow, torch.zeros(8, 8, 3), torch.ones(8, 8, dtype=torch.bool))
+    nothing = replace(everything, mask=torch.zeros(8, 8, dtype=torch.bool))
+    alone = points_of(shots)
+    np.testing.assert_array_equal(points_of([*shots, everything]), alone)
+    fewer = points_of([*shots, nothing])
+    assert 0.5 * len(alone) < len(fewer) < len(alone)
+
+
+def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
+    """In a world that is half as large, the same photographs show a sphere of radius 1.4."""
+    shots = [shot.within(np.zeros(3), 0.5) for shot in taken(sphere, (0.0, 0.0), (15.0, 0.0))]
+    assert all((np.linalg.norm(cloud.points, axis=1) < 1).all() for cloud in stereo_clouds(shots, ALL))
+
+
+def test_without_opencv_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0))) for turn in (0.0, 10.0)]
+    with pytest.raises(BadInput, match=r"task=stereo needs OpenCV: type pip install -e '\.\[stereo\]'"):
+        stereo_clouds(shots, ALL)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [((0, 45.0), "task.matching.neighbours must be at least 1"), ((3, 0.0), "task.matching.most_degrees must be pos")],
+)
+def test_settings_that_cannot_be_are_told(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Matching(*settings)

@@ -1,0 +1,200 @@
+"""Surfaces without a renderer, on spheres and triangles in closed form: points, Poisson, colours, pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.evaluate.colours import GREY, painted
+from bench.reconstruct import surfaces
+from bench.reconstruct.stereo import Cloud
+from bench.reconstruct.surfaces import fused, given_clouds, mesh_image, poisson, with_colours
+from datasets.mesh import Mesh
+from datasets.truth import Truth
+from tests.reconstruct.test_judge import CENTRE
+from tests.reconstruct.test_judge import painted as coloured_ball
+from tests.reconstruct.test_losses import ball, shot_of
+from tests.reconstruct.test_subject import icosphere
+from tests.tiny import camera_of
+
+RADIUS = 0.6
+FRONT, BACK = camera_of(24), camera_of(24, angles=(180.0, 0.0))  # at z = 2.5 and at z = -2.5
+
+
+def directions(count: int) -> np.ndarray:
+    """Evenly spaced unit vectors."""
+    heights = 1 - (2 * np.arange(count) + 1) / count
+    turns, flat = np.pi * (3 - 5**0.5) * np.arange(count), np.sqrt(1 - heights**2)
+    return np.stack([flat * np.cos(turns), flat * np.sin(turns), heights], axis=1)
+
+
+def halves(points: np.ndarray, front=FRONT, back=BACK) -> list[Cloud]:
+    """The points of either side with the camera of their side."""
+    return [Cloud(points[points[:, 2] > 0], front), Cloud(points[points[:, 2] <= 0], back)]
+
+
+def off_sphere(points: np.ndarray, radius: float = RADIUS) -> np.ndarray:
+    return np.abs(np.linalg.norm(points, axis=1) - radius)
+
+
+def test_given_depths_become_points_of_the_surface():
+    shot = shot_of(ball(), camera_of(24, angles=(30.0, 20.0)))
+    known = replace(shot, depth=shot.depth * (torch.arange(24) < 12))
+    clouds = given_clouds([replace(shot, depth=None), known])
+    assert [cloud.camera for cloud in clouds] == [shot.camera]
+    assert len(clouds[0].points) == int((known.depth > 0).sum()) > 50
+    assert off_sphere(clouds[0].points - np.array(CENTRE)).max() < 1e-4
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_normals_look_at_the_camera_of_their_cloud(outward):
+    towards = directions(600)
+    cameras = (FRONT, BACK) if outward else (BACK, FRONT)
+    points, normals = fused(halves(RADIUS * towards, *cameras))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    cosines = (normals * points).sum(axis=1) / RADIUS * (1 if outward else -1)
+    steep = np.abs(points[:, 2]) > 0.3  # where the plane of the neighbours is clearly in front of or behind a camera
+    assert steep.mean() > 0.4 and cosines[steep].min() > 0.98
+
+
+def test_outliers_go_and_the_others_stay():
+    sphere = RADIUS * directions(600)
+    far = np.array([[0.0, 0, 0.95], [0.9, 0, 0.1], [0, -0.9, -0.2]])
+    points, normals = fused(halves(np.concatenate([sphere, far])))
+    assert off_sphere(points).max() < 1e-6
+    assert len(points) == len(normals) > 0.95 * len(sphere)
+
+
+def test_too_few_points_have_no_surface():
+    few = surfaces.NEIGHBOURS - 1
+    for clouds, count in (([], 0), ([Cloud(directions(few), FRONT)], few)):
+        points, normals = fused(clouds)
+        assert points.shape == normals.shape == (count, 3) and not normals.any()
+        assert poisson(points, normals, depth=4, trim=0.0) is None
+
+
+def test_points_of_a_sphere_give_a_sphere():
+    towards = directions(1500)
+    centre = np.array(CENTRE)
+    mesh = poisson(RADIUS * towards + centre, towards, depth=5, trim=0.0)
+    assert mesh is not None and mesh.watertight
+    assert off_sphere(mesh.vertices - centre).max() < 0.02
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)  # positive: wound outward
+
+
+def test_trimming_removes_what_no_point_supports():
+    towards = directions(3000)
+    upper = towards[towards[:, 2] > 0]
+    whole, trimmed = (poisson(RADIUS * upper, upper, depth=5, trim=trim) for trim in (0.0, 4.0))
+    assert whole is not None and trimmed is not None
+    assert whole.watertight and whole.vertices[:, 2].min() < -0.2
+    assert not trimmed.watertight and trimmed.vertices[:, 2].min() > -0.15
+    assert set(np.unique(trimmed.faces)) == set(range(len(trimmed.vertices)))  # no vertex is left unused
+    assert trimmed.vertices[:, 2].max() == pytest.approx(RADIUS, abs=0.02)
+    above = trimmed.vertices[:, 2] > 0.05
+    assert off_sphere(trimmed.vertices[above]).max() < 0.03
+    area = trimmed.area / (2 * np.pi * RADIUS**2)
+    assert 0.9 < area < 1.3
+    assert poisson(RADIUS * upper, upper, depth=5, trim=99.0) is None
+
+
+def test_vertices_have_the_colours_of_photographs_and_are_grey_where_none_sees_them():
+    shape, mesh = coloured_ball(), icosphere(RADIUS, CENTRE)
+    cameras = [camera_of(96, angles=(across, 0.0)) for across in (-40.0, 0.0, 40.0)]
+    found = with_colours(mesh, [shot_of(shape, camera) for camera in cameras])
+    assert found.colours is not None and found.faces is mesh.faces
+    points, normals = torch.from_numpy(mesh.vertices).float(), (mesh.vertices - CENTRE) / RADIUS
+    expected = shape.colours(points, points, points).numpy()
+    cosines = []
+    for camera in cameras:
+        towards = camera.center.numpy() - mesh.vertices
+        cosines.append((normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1))
+    best = np.max(cosines, axis=0)
+    seen, unseen = best > 0.3, best < -0.1
+    assert seen.sum() > 1000 and unseen.sum() > 400
+    assert expected[seen].std(axis=0)[1:].min() > 0.1  # so that a wrong place would be a wrong colour
+    assert np.abs(found.colours - expected)[seen].max() < 0.02
+    assert (found.colours[unseen] == GREY).all()
+
+
+def test_a_photograph_that_a_vertex_faces_counts_most():
+    mesh = icosphere(RADIUS)
+    front, aside = (shot_of(ball(RADIUS, (0.0, 0.0, 0.0)), camera_of(32, angles=(turn, 0.0))) for turn in (0.0, 60.0))
+    white, black = (replace(shot, colours=torch.full((32, 32, 3), c)) for shot, c in ((front, 1.0), (aside, 0.0)))
+    colours = with_colours(mesh, [white, black]).colours
+    assert colours is not None
+    nearest = np.argmax(mesh.vertices[:, 2])
+    middle = np.argmax(mesh.vertices @ [np.sin(np.radians(30)), 0, np.cos(np.radians(30))])
+    other = np.argmax(mesh.vertices @ aside.camera.center.numpy())
+    assert 0.9 < colours[nearest, 0] < 1 and 0 < colours[other, 0] < 0.1
+    assert colours[middle, 0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_hidden_vertex_has_no_colour_of_what_hides_it():
+    front, back = icosphere(0.3, (0.0, 0.0, 0.6)), icosphere(0.2, (0.0, 0.0, -0.5))
+    both = Mesh(
+        np.concatenate([front.vertices, back.vertices]),
+        np.concatenate([front.faces, back.faces + len(front.vertices)]),
+    )
+    shot = replace(shot_of(ball(), FRONT), colours=torch.ones(24, 24, 3))
+    colours = with_colours(both, [shot]).colours
+    alone = with_colours(back, [shot]).colours
+    assert colours is not None and alone is not None
+    assert (colours[len(front.vertices) :] == GREY).all()
+    assert (alone[back.vertices[:, 2] > -0.4] == 1).all()
+    assert (colours[: len(front.vertices)][front.vertices[:, 2] > 0.8] == 1).all()
+
+
+TRIANGLE = Mesh(np.array([[-0.7, -0.5, 0.1], [0.6, -0.4, -0.2], [0.1, 0.6, 0.3]]), np.array([[0, 1, 2]]))
+PAINT = np.array([[1.0, 0.1, 0.0], [0.2, 0.9, 0.3], [0.0, 0.2, 0.8]])
+
+
+def weights_of(mesh: Mesh, camera) -> np.ndarray:
+    """The weights of a triangle's corners where rays meet its plane, [height, width, 3]."""
+    rays = camera.double().rays()
+    origin, towards = rays.origins.numpy()[..., None], rays.directions.numpy()
+    steps = np.stack([*(mesh.vertices[1:] - mesh.vertices[0])], axis=1)
+    left = np.concatenate([np.broadcast_to(steps, (*towards.shape[:2], 3, 2)), -towards[..., None]], axis=-1)
+    along = np.linalg.solve(left, origin - mesh.vertices[0][:, None])[..., :2, 0]
+    return np.concatenate([1 - along.sum(axis=-1, keepdims=True), along], axis=-1)
+
+
+def test_a_triangle_is_painted_with_the_colours_between_its_corners():
+    mesh, camera = replace(TRIANGLE, colours=PAINT), camera_of(33, angles=(20.0, 10.0)).resized(29, 33)
+    weights = weights_of(mesh, camera)
+    inside, outside = weights.min(axis=-1) > 1e-4, weights.min(axis=-1) < -1e-4
+    assert inside.sum() > 60 and outside.sum() > 200
+    view, image = mesh_image(mesh, camera)
+    assert image.shape == (29, 33, 3) and image.dtype == torch.float32
+    assert view.mask.numpy()[inside].all() and not view.mask.numpy()[outside].any()
+    np.testing.assert_allclose(image.numpy()[inside], (weights @ PAINT)[inside], atol=1e-4)
+    assert (image.numpy()[outside] == 0).all()
+
+
+def test_a_mesh_without_colours_is_grey_and_colours_stay_below_1():
+    truth, camera = Truth(TRIANGLE, closed=False), camera_of(24)
+    inside = weights_of(TRIANGLE, camera).min(axis=-1) > 1e-4
+    plain = painted(TRIANGLE, truth, camera)
+    np.testing.assert_allclose(plain[inside], GREY)
+    assert set(np.unique(plain.round(6))) == {0.0, GREY}
+    bright = painted(replace(TRIANGLE, colours=np.full((3, 3), 1.5)), truth, camera)
+    assert (bright[inside] == 1).all()
+
+
+def test_weights_of_corners_give_the_hit_points_and_are_0_beside_the_mesh():
+    mesh = icosphere(RADIUS, CENTRE)
+    truth, generator = Truth(mesh), np.random.default_rng(0)
+    origins = 2 * directions(400)
+    towards = generator.uniform(-0.9, 0.9, (400, 3)) - origins
+    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    weights, corners = truth.corners(origins, towards)
+    hits = truth.cast(origins, towards)
+    assert 100 < hits.hit.sum() < 380
+    np.testing.assert_allclose(weights[hits.hit].sum(axis=1), 1, atol=1e-6)
+    assert weights.min() > -1e-5 and (weights[~hits.hit] == 0).all()
+    points = np.einsum("nk,nkd->nd", weights, mesh.vertices[corners])
+    np.testing.assert_allclose(points[hits.hit], (origins + hits.distance[:, None] * towards)[hits.hit], atol=1e-5)
+    faces = {tuple(face) for face in mesh.faces.tolist()}
+    assert all(tuple(face) in faces for face in corners.tolist())
+    assert (points[~hits.hit] == 0).all()

@@ -1,0 +1,133 @@
+"""Surfaces of photographs without a renderer: they end with colours and metrics, and what they need is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN
+from bench.reconstruct.stereo import Matching
+from bench.reconstruct.subject import Depths
+from bench.solve.solve import COSTS
+from bench.tasks.surfaces import Hull, Poisson, Stereo
+from renderers.checks import BadInput
+from tests.datasets.test_photographs import PLAINLY
+from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
+from tests.tiny import altered
+
+SHARED = {
+    "images": replace(PLAINLY, places="sphere", views=9),
+    "longest": 24,
+    "held_out": 4,
+    "masks": True,
+    "depths": Depths("none", 0.0),
+}
+HULL = Hull(**SHARED, samples=32)
+POISSON = Poisson(**SHARED | {"depths": Depths("dense", 0.0)}, octree=5, trim=0.0)
+NEAR = replace(PLAINLY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
+STEREO = Stereo(
+    **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), octree=5, trim=0.0
+)
+TASKS = {"hull": HULL, "poisson": POISSON, "stereo": STEREO}
+ARRAYS = {"photograph": (8, 8, 3), "colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}
+BEST = {"hull": 0.1, "poisson": 0.08, "stereo": 0.12}  # largest Chamfer-L1 of what is seen
+SCORES = {name for name in COLOURED_DEFINITIONS if not name.startswith(OWN)}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tmp_path, name):  # noqa: F811
+    if name == "stereo":
+        pytest.importorskip("cv2", reason="task=stereo needs OpenCV")
+    run = run_in(tmp_path, scene)
+    task = TASKS[name]
+    task.execute(run)
+    record, metrics = run.record, run.record.metrics
+    assert (record.status, record.reason) == ("ok", "")
+    assert set(metrics) == SCORES and record.definitions == COLOURED_DEFINITIONS | COSTS
+    assert record.evaluations == {"value": 0, "gradient": 0}
+    assert record.seconds["forward"] > 0 and record.seconds["backward"] == 0 and record.seconds["evaluation"] > 0
+    assert metrics[SEEN + "chamfer_l1"] < BEST[name] and metrics["mask_iou"] > 0.85 and metrics["psnr"] > 15
+    assert assert_coloured_mesh(tmp_path).std(axis=0).max() > 5
+    count, size = task.images.views, task.longest
+    found = f"{count} rendered photographs of {size} x {size} pixels; {-(-count // task.held_out)} of them are held out"
+    assert {found, "no renderer took part"} <= set(record.notes)
+    for picture in ("summary.png", "input.png"):
+        assert (tmp_path / picture).stat().st_size > 2000
+    with np.load(tmp_path / "images.npz") as arrays:
+        assert {key: arrays[key].shape for key in arrays} == ARRAYS
+        assert 0.1 < arrays["hit"].mean() < 0.9 and arrays["colours"][arrays["hit"]].std() > 0.02
+        assert not arrays["colours"][~arrays["hit"]].any()
+    assert not (tmp_path / "curve.jsonl").exists()
+
+
+def without_pictures(run):
+    return replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, picture=None)))
+
+
+def test_without_pictures_there_is_the_mesh_alone(scene, tmp_path):  # noqa: F811
+    run = without_pictures(run_in(tmp_path, scene))
+    HULL.execute(run)
+    assert run.record.status == "ok" and (tmp_path / "mesh.ply").is_file()
+    assert not list(tmp_path.glob("*.png")) and not (tmp_path / "images.npz").exists()
+
+
+def test_photographs_on_disk_have_a_hull_and_no_chamfer(tmp_path):
+    run = without_pictures(run_in(tmp_path, None))
+    altered(HULL, {"longest": 32}).execute(run)
+    assert run.record.status == "ok"
+    assert set(run.record.metrics) == {"psnr", "ssim", "mask_iou", "mask_iou_least"}
+    assert run.record.metrics["mask_iou"] > 0.85
+    colours = assert_coloured_mesh(tmp_path)
+    assert colours[:, 0].mean() > colours[:, 2].mean() + 15  # the ball is orange
+
+
+def test_the_hull_is_as_fine_as_its_samples(scene, tmp_path):  # noqa: F811
+    counts = []
+    for samples in (16, 32):
+        run = without_pictures(run_in(tmp_path, scene))
+        altered(HULL, {"samples": samples}).execute(run)
+        counts.append(len(trimesh.load_mesh(tmp_path / "mesh.ply").vertices))
+    assert counts[1] > 2.5 * counts[0]
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        (altered(HULL, {"masks": False}), "the visual hull needs masks: set task.masks=true"),
+        (
+            altered(POISSON, {"depths": Depths("none", 0.0)}),
+            "screened Poisson needs depths: set task.depths.points=dense, or task=stereo",
+        ),
+    ],
+    ids=["masks", "depths"],
+)
+def test_what_a_surface_needs_is_told(scene, tmp_path, task, message):  # noqa: F811
+    with pytest.raises(BadInput, match=message):
+        task.execute(run_in(tmp_path, scene))
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
+    run = run_in(tmp_path, scene)
+    altered(POISSON, {"trim": 99.0}).execute(run)
+    record = run.record
+    assert (record.status, record.reason) == ("empty", "no surface was found")
+    assert set(record.metrics) == SCORES
+    assert record.metrics["seen_chamfer_l1"] == np.inf and record.metrics["mask_iou"] == 0
+    assert {path.name for path in tmp_path.iterdir()}.isdisjoint({"mesh.ply", "images.npz", "summary.png"})
+
+
+@pytest.mark.parametrize(
+    ("task", "changed", "message"),
+    [
+        ("hull", {"samples": 4}, "task.samples must be at least 8"),
+        ("hull", {"longest": 4}, "task.longest must be at least 8"),
+        ("stereo", {"held_out": 1}, "task.held_out must be at least 2"),
+        *((task, {"octree": 1}, "task.octree must be at least 2") for task in ("poisson", "stereo")),
+        *((task, {"trim": -1.0}, "task.trim must be at least 0") for task in ("poisson", "stereo")),
+    ],
+)
+def test_settings_that_cannot_be_are_told(task, changed, message):
+    with pytest.raises(ValueError, match=message):
+        altered(TASKS[task], changed)
