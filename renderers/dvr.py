@@ -28,9 +28,8 @@ class DVR:
         code), which is the unit sphere; a ray that begins occupied has STARTED_INSIDE. Rays have a gradient, which the
         official code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as in the official
         clamp. `early_stop` is ours. L_occupancy (Eq. 15) is at a random point also where depth is given, unless
-        `occupied_at` is "depth", and never at the depth of the visual hull, which the paper takes where it trains
-        single-view reconstruction by masks of several views: here, views with masks have dense depth as well, the
-        photographs of task=multiview have no mask, and the hull of one mask begins where the ray enters the sphere.
+        `occupied_at` is "depth"; the depth of the visual hull, which the paper takes with several masks of one object,
+        is such a depth where a task gives it (`task.guide=hull` of task=reconstruction).
 
     Args:
         n_ray_samples: n, equally spaced between where a ray enters and leaves the sphere, its ends among them.

@@ -151,7 +151,7 @@ class Occupancy:
         sphere_radius: of the sphere about the origin on whose chords points are drawn.
         occupied_at: the point of L_occupancy. "random": drawn, as in Eq. 15. "depth": at the observed distance, where
             the ray has one within the sphere, as the paper does with depth supervision; drawn on other rays. The
-            paper's third, the depth of the visual hull, is not built: see `renderers.dvr.DVR`.
+            paper's third, the depth of the visual hull, is such a distance where a task gives it.
     """
 
     width: float

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +13,7 @@ from renderers.field import Field
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.reference import trace
 
+NEURONS = 16  # of the paint
 STEP = 1e-6  # of a central difference, in units of the parameter: a network has few kinks within so short a step
 ROOT_STEPS = 6  # of the secant method, from the undisturbed root
 RESIDUAL = 1e-12  # |field| above which the secant method has not converged
@@ -64,6 +66,82 @@ def differences(
             columns.append((ahead - behind)[0] / (2 * STEP))
             valid &= ok[0] & ok_too[0]
     return Differences(by_code, torch.stack(columns, dim=1), valid)
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Smooth colours of points and normals, of a small network with given weights, in float64.
+
+    Args:
+        weights: all of them in one row, see `size`.
+    """
+
+    weights: Float[Tensor, " n"]
+
+    size: ClassVar[int] = (6 + 3) * NEURONS
+
+    @staticmethod
+    def drawn(generator: torch.Generator) -> "Paint":
+        """Random colours that change over a fraction of a unit."""
+        return Paint(torch.randn(Paint.size, generator=generator, dtype=torch.float64))
+
+    def __call__(
+        self, points: Float[Tensor, "*batch 3"], normals: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        first, second = self.weights.split([6 * NEURONS, 3 * NEURONS])
+        hidden = torch.sin(torch.cat([points, normals], dim=-1) @ first.view(6, NEURONS))
+        return torch.sigmoid(hidden @ second.view(NEURONS, 3))
+
+
+@dataclass(frozen=True)
+class ColourDifferences:
+    """Derivatives of the three colours of m pixels, a row for each, and which pixels they hold for."""
+
+    code: Float[Tensor, "m 3 directions"]
+    camera: Float[Tensor, "m 3 6"]
+    texture: Float[Tensor, "m 3 weights"]
+    valid: Bool[Tensor, " m"]
+
+
+def colour_differences(
+    decoder: Decoder,
+    code: Float[Tensor, " code_length"],
+    directions: Float[Tensor, "code_length directions"],
+    paint: Paint,
+    *,
+    camera: Camera,
+    pixels: Int[Tensor, " m"],
+    distance: Float[Tensor, " m"],
+) -> ColourDifferences:
+    """Central differences of the colours at the hits, which move and turn with the code and the camera.
+
+    Args:
+        decoder, code, directions, camera, pixels, distance: see `differences`.
+        paint: of the surface.
+    """
+    rays = camera.rays().flat()[pixels]
+    truth = differences(decoder, code, directions, camera=camera, pixels=pixels, distance=distance)
+    shifts = STEP * torch.cat([directions.T, -directions.T])
+    moved, _ = _roots(decoder.at(code + shifts), rays, distance)
+    seen = _painted(decoder.at(code + shifts), rays, moved, paint)
+    by_code = (seen[: len(shifts) // 2] - seen[len(shifts) // 2 :]) / (2 * STEP)
+    by_camera = []
+    for twist in STEP * torch.eye(6, dtype=torch.float64):
+        ends = []
+        for sign in (1, -1):
+            turned = camera.moved(sign * twist).rays().flat()[pixels]
+            found, _ = _roots(decoder.at(code[None]), turned, distance)
+            ends.append(_painted(decoder.at(code[None]), turned, found, paint)[0])
+        by_camera.append((ends[0] - ends[1]) / (2 * STEP))
+    by_weight = []
+    for weight in STEP * torch.eye(Paint.size, dtype=torch.float64):
+        ends = [
+            _painted(decoder.at(code[None]), rays, distance[None], Paint(paint.weights + sign * weight))[0]
+            for sign in (1, -1)
+        ]
+        by_weight.append((ends[0] - ends[1]) / (2 * STEP))
+    columns = (by_code.permute(1, 2, 0), *(torch.stack(by, dim=-1) for by in (by_camera, by_weight)))
+    return ColourDifferences(*columns, truth.valid)
 
 
 def image_differences(
@@ -128,6 +206,17 @@ def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, " m"]) -> tuple
         first, first_value, second = second, second_value, torch.where(still, second, third)
         second_value = values(second)
     return second, (second_value.abs() < RESIDUAL) & ((second - start).abs() < CLEAR)
+
+
+def _painted(
+    field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"], paint: Paint
+) -> Float[Tensor, "codes m 3"]:
+    """The colours of the points at distances along m rays, by the normals of a batch of fields."""
+    points = (rays.origins + distance[..., None] * rays.directions).detach().requires_grad_(True)
+    with torch.enable_grad():
+        (normals,) = torch.autograd.grad(field(points).sum(), points)
+    with torch.no_grad():
+        return paint(points, normals)
 
 
 def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:

@@ -7,7 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.evaluate.finite_differences import Differences, differences, image_differences
+from bench.evaluate.finite_differences import (
+    Differences,
+    Paint,
+    colour_differences,
+    differences,
+    image_differences,
+)
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
@@ -24,7 +30,8 @@ OTHER_SURFACE = 0.01  # scene units: a hit further from the true one is on anoth
 
 DEFINITIONS = {
     "BAND": "angle between ray and inward normal: frontal to 30 degrees, oblique to 70, grazing beyond; silhouette: "
-    "pixels next to the outline",
+    "pixels next to the outline; colour: frontal and oblique pixels, of which not distances but colours are compared, "
+    "a row per pixel and channel (DVR, Eqs. 3 to 8): those of a random smooth paint of the point and the normal there",
     "pixels, excluded": "pixels evaluated; pixels drawn but not evaluated, since visibility changes there, the root is "
     "not found again, or the renderer does not hit that surface",
     "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and the true one, median over pixels; "
@@ -37,6 +44,8 @@ DEFINITIONS = {
     "over pixels",
     "code_median_error, code_p99_error, camera_median_error, camera_p99_error": "length of the difference over the "
     "length of the true gradient: median and 99th percentile over pixels",
+    "texture_cosine, texture_pooled_cosine, texture_pooled_scale, texture_scale, texture_median_error, "
+    "texture_p99_error": "the same towards the weights of the paint",
     "image_cosine, image_scale": "pooled cosine and scale of the gradient of the image of distances, with the far side "
     "of the unit sphere as background, for the code, against differences of a supersampled image, in which visibility "
     "changes",
@@ -86,15 +95,19 @@ class Gradients:
         axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
         directions = torch.linalg.qr(axes).Q
         metrics: dict[str, float] = {}
-        for number, (band, pixels) in enumerate(_bands(reference, subject.camera).items()):
-            run.progress("comparing gradients", number, len(BANDS) + 1)
+        bands = _bands(reference, subject.camera)
+        for number, (band, pixels) in enumerate(bands.items()):
+            run.progress("comparing gradients", number, len(BANDS) + 2)
             drawn = _draw(pixels, self.pixels, generator)
             numbers = self._evaluate(subject, drawn, reference.distance.flatten()[drawn], directions)
             metrics |= {f"{band}.{name}": value for name, value in numbers.items()}
         outline = _draw(_outline(reference.hit), self.outline, generator)
         numbers = self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         metrics |= {f"silhouette.{name}": value for name, value in numbers.items()}
-        record.metrics = metrics
+        run.progress("comparing gradients", len(BANDS) + 1, len(BANDS) + 2)
+        seen = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
+        numbers = self._evaluate_colours(subject, seen, reference.distance.flatten()[seen], directions, generator)
+        record.metrics = metrics | {f"colour.{name}": value for name, value in numbers.items()}
         record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}
         record.status, record.reason = RunStatus.OK, ""
 
@@ -118,6 +131,31 @@ class Gradients:
             numbers |= _compare((by_code @ directions)[valid], truth.code[valid], "code")
             if subject.renderer.capabilities.ray_gradient:
                 numbers |= _compare(by_camera[valid], truth.camera[valid], "camera")
+        return numbers
+
+    def _evaluate_colours(
+        self,
+        subject: "Subject",
+        pixels: Int[Tensor, " m"],
+        distance: Float[Tensor, " m"],
+        directions: Float[Tensor, "code_length directions"],
+        generator: torch.Generator,
+    ) -> dict[str, float]:
+        """The metrics of colours at the hits."""
+        if not pixels.numel():
+            return {"pixels": 0, "excluded": 0}
+        paint = Paint.drawn(generator)
+        truth = colour_differences(
+            subject.decoder, subject.code, directions, paint, camera=subject.camera, pixels=pixels, distance=distance
+        )
+        by_code, by_camera, by_weight, found, hit = subject.colour_gradients(pixels, paint)
+        valid = truth.valid & hit & ((found - distance).abs() < OTHER_SURFACE)
+        numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
+        if valid.any():
+            numbers |= _compare((by_code @ directions)[valid].flatten(0, 1), truth.code[valid].flatten(0, 1), "code")
+            numbers |= _compare(by_weight[valid].flatten(0, 1), truth.texture[valid].flatten(0, 1), "texture")
+            if subject.renderer.capabilities.ray_gradient:
+                numbers |= _compare(by_camera[valid].flatten(0, 1), truth.camera[valid].flatten(0, 1), "camera")
         return numbers
 
     def _evaluate_outline(
@@ -176,6 +214,41 @@ class Subject:
                 if gradient is not None:
                     table[row] = gradient
         return by_code, by_camera, rendering.distance.detach(), rendering.hit
+
+    def colour_gradients(
+        self, pixels: Int[Tensor, " m"], paint: Paint
+    ) -> tuple[
+        Float[Tensor, "m 3 code_length"],
+        Float[Tensor, "m 3 6"],
+        Float[Tensor, "m 3 weights"],
+        Float[Tensor, " m"],
+        Bool[Tensor, " m"],
+    ]:
+        """For each pixel the gradients of its colours for code, camera and paint, the distance, and whether it hits.
+
+        The colours are those of the paint at the renderer's points, by the field's gradients there, as a
+        reconstruction asks for them.
+        """
+        code, weights = (one.clone().requires_grad_(True) for one in (self.code, paint.weights))
+        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        rays = self.camera.moved(twist).rays().flat()
+        field = Meter(self.decoder.at(code), self.counts)
+        rendering = rendered(self.renderer, field, rays[pixels])
+        tables = [torch.zeros(len(pixels), 3, len(one), dtype=torch.float64) for one in (code, twist, weights)]
+        rows = rendering.hit.nonzero().squeeze(-1)
+        points = rendering.points[rows]
+        if len(rows):
+            normals = torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+            colours = Paint(weights)(points, normals)
+            for place, row in enumerate(rows.tolist()):
+                for channel in range(3):
+                    found = torch.autograd.grad(
+                        colours[place, channel], (code, twist, weights), retain_graph=True, allow_unused=True
+                    )
+                    for table, gradient in zip(tables, found, strict=True):
+                        if gradient is not None:
+                            table[row, channel] = gradient
+        return *tables, rendering.distance.detach(), rendering.hit
 
 
 def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str) -> dict[str, float]:

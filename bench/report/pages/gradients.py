@@ -17,10 +17,16 @@ from bench.report.write.table import IDENTITY, Column, shown, text, through, to_
 
 PLACE = 200
 READS = (Selection("gradients", ("gradients",)),)
-BANDS = ("frontal", "oblique", "grazing", "silhouette")
+ANGLES = ("frontal", "oblique", "grazing")
+BANDS = (*ANGLES, "silhouette", "colour")
 ERRORS = ("pooled_cosine", "pooled_scale", "cosine", "scale", "median_error", "p99_error")
 COUNTS = ("pixels", "excluded")
-NUMBERS = (*COUNTS, *(f"{of}_{e}" for of in ("code", "camera") for e in ERRORS), "image_cosine", "image_scale")
+NUMBERS = (
+    *COUNTS,
+    *(f"{of}_{e}" for of in ("code", "camera", "texture") for e in ERRORS),
+    "image_cosine",
+    "image_scale",
+)
 NOTES = (
     "A pooled number compares the gradients of all pixels of a band at once, as one long vector: a factor that differs "
     "between pixels lowers the pooled cosine. A pixel's own cosine cannot show this: it is 1 for any positive multiple "
@@ -28,6 +34,8 @@ NOTES = (
     "Errors are relative to the length of the true gradient. Pixels are frontal, oblique or grazing by the angle "
     "between ray and normal; the silhouette is evaluated as one image. A renderer without ray gradients has no numbers "
     "for the camera.",
+    "Colour: the gradient of colours, of a random smooth paint of point and normal, at the renderer's points, towards "
+    "shape (code), camera and texture. In the figure are distances alone.",
 )
 TITLES = ("gradient for the code", "gradient for the camera", "silhouette")  # of the figure's columns
 # Panels of the figure: metric, label of the axis, and the value of an exact gradient; None where there is none.
@@ -72,7 +80,7 @@ def draw(data: pd.DataFrame) -> Figure:
             axis.set_visible(False)
             continue
         metric, label, right = panel
-        bands = BANDS[3:] if metric.startswith("image") else BANDS[:3]
+        bands = ("silhouette",) if metric.startswith("image") else ANGLES
         for place, name in enumerate(names):
             _points(axis, data[data["name"] == name].set_index("band"), metric, bands, (place + 0.5) / len(names) - 0.5)
         _dress(axis, label, right, bands)
