@@ -174,6 +174,12 @@ class Camera:
         plane = seen / torch.where(depth > 0, depth, 1.0)[..., None]
         return (plane @ self.intrinsics.T)[..., :2], depth
 
+    def shows(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Which points of the world lie in front of the camera and within its image, whatever hides them."""
+        pixels, depth = self.project(points)
+        size = torch.tensor([self.width, self.height], device=points.device)
+        return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
+
     def _bearings(self) -> Float[Tensor, "height width 3"]:
         """Camera coordinates of the pixel centres on the plane z = 1."""
         like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}

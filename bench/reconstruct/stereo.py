@@ -106,8 +106,10 @@ def _matched(shot: Shot, other: Shot) -> Cloud:
     rows, places = np.nonzero(disparity >= low)
     depth = 1 / (disparity[rows, places] / scale + 1 / middle)
     pixels = np.stack([places, rows, np.ones_like(rows)])
-    seen = np.linalg.inv(columns[0]) @ pixels * depth
-    return Cloud(seen.T @ axes + centres[0], shot.camera)
+    points = (np.linalg.inv(columns[0]) @ pixels * depth).T @ axes + centres[0]
+    places = torch.from_numpy(points).float()
+    shown = shot.camera.shows(places) & other.camera.shows(places)  # what is beyond a border was matched with black
+    return Cloud(points[shown.numpy()], shot.camera)
 
 
 def _axes(baseline: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -75,9 +75,7 @@ class Subject:
 def visible(scene: Truth, shot: Shot, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Which points of a surface a photograph sees: within it, and in front of everything else."""
     centre = shot.camera.center.double().numpy()
-    pixels, depth = shot.camera.project(torch.from_numpy(points).float())
-    size = torch.tensor([shot.camera.width, shot.camera.height])
-    inside = ((depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)).numpy()
+    inside = shot.camera.shows(torch.from_numpy(points).float()).numpy()
     hits = scene.cast(np.broadcast_to(centre, points.shape), points - centre)
     return inside & (hits.distance > np.linalg.norm(points - centre, axis=1) - ON_SURFACE)
 

@@ -354,3 +354,18 @@ def test_a_moved_object_is_seen_as_by_the_camera_that_stays():
     moved = rigid(twist) @ torch.cat([point, torch.ones(1, dtype=torch.float64)])
     for seen, expected in zip(old.with_object_moved(twist).project(point), old.project(moved[:3]), strict=True):
         torch.testing.assert_close(seen, expected)
+
+
+def test_a_camera_shows_what_lies_in_front_of_it_and_within_its_image():
+    camera = Camera(torch.tensor([[10.0, 0, 8], [0, 10.0, 4], [0, 0, 1]]), torch.eye(4), 8, 16)
+    corners = torch.tensor([[-0.79, -0.39, 1.0], [0.79, 0.39, 1.0]])
+    beyond = torch.tensor([[-0.81, 0.0, 1.0], [0.81, 0.0, 1.0], [0.0, -0.41, 1.0], [0.0, 0.41, 1.0], [0.0, 0.0, -1.0]])
+    assert camera.shows(corners).all() and camera.shows(2 * corners).all()
+    assert not camera.shows(beyond).any()
+
+
+def test_distances_and_depths_are_each_others_inverse():
+    camera = Camera(torch.tensor([[10.0, 0, 8], [0, 10.0, 4], [0, 0, 1]]), torch.eye(4), 8, 16)
+    depth = torch.rand(8, 16) + 1
+    torch.testing.assert_close(camera.depth(camera.distance(depth)), depth)
+    assert (camera.rays().at(camera.distance(depth))[..., 2] - depth).abs().max() < 1e-6

@@ -31,7 +31,7 @@ from bench.report.write.table import Column, text
 ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
 CLOSE = {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
 MOST_COLUMNS = 7
-HIGHER = ("psnr", "ssim", "mask_iou", "seen_fscore")  # of which more is better
+HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore")  # of which more is better
 
 
 def _values(value: float | None) -> str:
@@ -62,8 +62,8 @@ def _line(records: list[Record], names: Sequence[str]) -> dict[str, Any]:
 
 
 def _middle(records: list[Record], name: str) -> float | None:
-    """The median of a metric, with failed runs worst; None where no run has it."""
-    if all(measured(record, name) is None for record in records):
+    """The median of a metric, with failed runs worst; None where runs that ended ok do not have it."""
+    if any(measured(record, name) is None for record in records if record["status"] == "ok"):
         return None
     if name in HIGHER:
         found = [measured(record, name) if record["status"] == "ok" else 0.0 for record in records]
@@ -82,7 +82,7 @@ def history(experiment: Experiment, record: Record, name: str) -> list[tuple[flo
         if isinstance(line.get(name), int | float):
             found.append((*spent, float(line[name])))
         spent = float(line.get("seconds", spent[0])), float(line.get("value_evaluations", spent[1]))
-    last = measured(record, name)
+    last = measured(record, name) if record["status"] == "ok" else None
     return found if last is None else [*found, (*spent, float(last))]
 
 
@@ -120,13 +120,10 @@ def _draw_run(experiment: Experiment, record: Record, column: Any, name: str, sc
 
 
 def scene_of(record: Record) -> str:
-    """The name of a run's scene, for titles."""
-    return family(record) if setting_path(record) else f"{family(record)} {index(record)}"
-
-
-def setting_path(record: Record) -> bool:
-    """Whether the scene is of files of the user's."""
-    return bool(record["config"].get("dataset", {}).get("path"))
+    """The name of a run's scene, for titles: with its number, unless it is a file's or a folder's own object."""
+    dataset = record["config"].get("dataset", {})
+    own = dataset.get("path") and not dataset.get("strength") and not index(record)
+    return family(record) if own else f"{family(record)} {index(record)}"
 
 
 @style.styled
@@ -150,14 +147,15 @@ def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[
 
 
 def _cells(experiment: Experiment, rows: Sequence[Row], scene: str) -> tuple[list[Any], list[str]]:
-    cells, notes = [], []
+    cells, notes, shown = [], [], False
     for row in rows:
         record = next((r for r in experiment.records if scene_of(r) == scene and row_of(r) == row), None)
         found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), ARRAYS)
         if why:
             notes.append(f"No pictures of {row.name}, {scene}: {why}.")
-        elif not cells:
-            cells.append((f"{scene}, held out", {"colours": found["photograph"]}))
+        elif not shown:
+            cells.insert(0, (f"{scene}, held out", {"colours": found["photograph"]}))
+            shown = True
         cells.append((row.name, found))
     return cells, notes
 
