@@ -14,8 +14,11 @@ from renderers.checks import BadInput, check_choice
 class Photographed(Protocol):
     """A dataset of one object that is known from photographs alone."""
 
-    def capture(self, longest: int) -> Capture:
-        """The photographs, with at most `longest` pixels along their longer sides."""
+    def capture(self, longest: int, held_out: int) -> Capture:
+        """The photographs, with at most `longest` pixels along their longer sides.
+
+        Of so many as `held_out`, one has no part in finding the unit sphere.
+        """
         ...
 
 
@@ -43,9 +46,9 @@ class OwnPhotographs:
         """The folder's name."""
         return Path(self.path).resolve().name
 
-    def capture(self, longest: int) -> Capture:
+    def capture(self, longest: int, held_out: int) -> Capture:
         """See `Photographed`."""
-        return read_capture(Path(self.path), longest=longest, masks=self.masks, axes=self.axes)
+        return read_capture(Path(self.path), longest=longest, masks=self.masks, axes=self.axes, held_out=held_out)
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """Raises BadInput: photographs have no true shape."""

@@ -41,18 +41,19 @@ def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "heig
 
 def vertex_colours(field: Coloured, mesh: Mesh, device: torch.device) -> Float[np.ndarray, "v 3"]:
     """The colours of a mesh's vertices, each seen from straight above."""
-    points = torch.from_numpy(mesh.vertices).float()
-    slopes = autograd_gradients(field, points.to(device)).cpu()
-    return colours_at(field, points, -torch.nn.functional.normalize(slopes, dim=-1), device).numpy()
+    return colours_at(field, torch.from_numpy(mesh.vertices).float(), None, device).numpy()
 
 
 def colours_at(
-    field: Coloured, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], device: torch.device
+    field: Coloured, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"] | None, device: torch.device
 ) -> Float[Tensor, "n 3"]:
-    """The colours of points of the surface, on the CPU."""
+    """The colours of points of the surface, on the CPU; without directions each is seen from straight above."""
     found = [points.new_zeros(0, 3)]
-    for some, towards in zip(points.to(device).split(CHUNK), directions.to(device).split(CHUNK), strict=True):
+    for start in range(0, len(points), CHUNK):
+        some = points[start : start + CHUNK].to(device)
         slopes = autograd_gradients(field, some)
+        above = -torch.nn.functional.normalize(slopes, dim=-1)
+        towards = above if directions is None else directions[start : start + CHUNK].to(device)
         with torch.no_grad():
             found.append(field.colours(some, slopes, towards).cpu())
     return torch.cat(found)

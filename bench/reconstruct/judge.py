@@ -30,6 +30,7 @@ from datasets.mesh import Mesh
 from datasets.scene import View, see
 from datasets.shot import Shot
 from datasets.truth import Truth, sample_surface
+from renderers.camera import sphere_span
 from renderers.fields.coloured import Coloured
 
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
@@ -44,9 +45,9 @@ SURFACE = (
 )
 IMAGES = {
     "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph, both black outside of the shape"
-    " and the photograph outside of its mask, mean over photographs, in decibels. Without masks: over the pixels that"
-    " the shape covers.",
-    "ssim": "Structural similarity (Wang et al. 2004, scikit-image) of the same images, mean, up to 1.",
+    " and the photograph outside of its mask, mean over photographs, in decibels. Without masks: over the pixels whose"
+    " rays meet the unit sphere.",
+    "ssim": "Structural similarity (scikit-image, in windows of 7 x 7 pixels) of the same images, mean, up to 1.",
     "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground in at"
     " least one, mean over held-out photographs, from 0 to 1.",
     "mask_iou_least": "The same, the least over held-out photographs.",
@@ -124,10 +125,10 @@ def image_scores(
 
 
 def _against(view: View, image: Float[Tensor, "height width 3"], shot: Shot) -> dict[str, float]:
-    known = view.mask if shot.mask is None else shot.mask
-    found, true = image.numpy(), (shot.colours * known[..., None]).numpy()
-    count = 3 * int(known.sum()) if shot.mask is None else true.size
-    error = float(((found - true) ** 2).sum()) / max(count, 1)
+    judged = sphere_span(shot.camera.rays())[2] if shot.mask is None else torch.ones_like(shot.mask)
+    known = judged if shot.mask is None else shot.mask
+    found, true = (image * judged[..., None]).numpy(), (shot.colours * known[..., None]).numpy()
+    error = float(((found - true) ** 2).sum()) / max(3 * int(judged.sum()), 1)
     similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=_window(true.shape))
     overlap = nan if shot.mask is None else mask_iou(view.mask.numpy(), shot.mask.numpy())
     return {"psnr": -10 * log10(error) if error else inf, "ssim": float(similar), "mask_iou": overlap}

@@ -17,7 +17,7 @@ from renderers.rendering import Observed, Renderer
 from renderers.silhouette import SilhouetteLoss
 
 ANYWHERE = 512  # points of the cube at which a distance's gradient is measured
-BESIDE = 0.01  # scene units: side of the cube in which a point's neighbour is drawn, as in DVR's official code
+BESIDE = 2e-3  # scene units: side of the cube in which a point's neighbour is drawn; DVR's code: 1e-3 of a unit cube
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,16 @@ class Losses:
 
     Args:
         colour: of the l1 norm of colours, over hits on the foreground (DVR, Eq. 12).
-        colour_gradient: of the l1 norm of their differences between neighbours, on patches of 2 x 2 pixels (DVR, Sec.
-            3.4, which names it; the sum is that of its official code).
-        depth: of the mean error of given depths over rays that hit (DVR, Eq. 13).
+        colour_gradient: of the error of their differences to the right and below, of the upper left pixel in patches of
+            2 x 2, an l2 norm for each channel (DVR's official code; the paper has no equation for it).
+        depth: of the error of given depths over rays that hit (DVR, Eq. 13).
         depth_loss: "depth", or "points", the distance in space.
         silhouette: loss of the mask; DVR, Eqs. 14 and 15, are `silhouette=occupancy`.
         silhouette_weight: of that loss.
         smoothness: of the difference between unit normals at a hit and beside it (DVR, Eq. 16).
-        normals: of 1 less the cosine between normals and given ones, over hits (DIST, B.3).
-        eikonal: of the squared difference of a distance's slope from 1, at hits and in the whole cube (IDR, Sec. 3.4).
-            A level set has none.
+        normals: of 1 less the cosine between normals and given ones, the mean over hits (DIST, B.3).
+        eikonal: of the squared difference of a distance's slope from 1, at hits on the foreground and in the whole cube
+            (IDR, Sec. 3.4), two means. A level set has none.
     """
 
     colour: float
@@ -83,13 +83,13 @@ class Losses:
                 pixels.distance[known] * pixels.at_one[known],
             )
             error = depth_error(self.depth_loss, found, given, pixels.at_one[known])
-            terms["depth"] = self.depth * error.sum() / known.sum().clamp_min(1)
+            terms["depth"] = self.depth * error.sum() / rays
         if self.silhouette_weight and pixels.mask is not None:
             observed = Observed(pixels.mask, pixels.guide)
             loss = self.silhouette(renderer, metered, pixels.rays, rendering, observed)
             terms["silhouette"] = self.silhouette_weight * loss
         if self.smoothness:
-            beside = points.detach() + BESIDE * (torch.rand_like(points) - 0.5)
+            beside = points + BESIDE * (torch.rand_like(points) - 0.5)
             neighbours = torch.nn.functional.normalize(slopes_at(metered, beside), dim=-1)
             terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
         if self.normals and pixels.normals is not None:
@@ -115,7 +115,8 @@ def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"
 
 
 def _between_neighbours(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-    """The l1 norm of differences to the right and below, in patches of 2 x 2 whose pixels are all inside."""
+    """The norm of the upper left pixel's differences to the right and below, over patches of 2 x 2 that are inside."""
     patches, whole = difference.view(-1, 2, 2, 3), inside.view(-1, 4).all(-1)
-    across, down = patches[:, :, 1] - patches[:, :, 0], patches[:, 1] - patches[:, 0]
-    return ((across.abs() + down.abs()).sum((1, 2)) * whole).sum()
+    corner = patches[:, 0, 0]
+    slopes = torch.stack([patches[:, 0, 1] - corner, patches[:, 1, 0] - corner], dim=-1)
+    return (torch.linalg.vector_norm(slopes, dim=-1).sum(-1) * whole).sum()

@@ -85,8 +85,8 @@ class ReconstructionProblem:
         return Shown(View(shot.camera, blank, normals, mask), shot.colours, shot.mask is not None)
 
     def field(self) -> Coloured:
-        """The shape at the current parameters, which stays as it is."""
-        return deepcopy(self.model).requires_grad_(False).field
+        """The shape at the current parameters, which stays as it is; it counts operations as one that is learnt."""
+        return deepcopy(self.model).field
 
     def frame(self) -> tuple[Field, Camera]:
         """The current shape, seen by the first held-out camera."""

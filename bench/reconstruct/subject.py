@@ -39,14 +39,15 @@ class Depths:
     def __post_init__(self) -> None:
         check_at_least("task.depths.noise", self.noise, 0, "0 gives true depths")
 
-    def of(self, shot: Shot, seed: int) -> Shot:
-        """The photograph with the depths that are given of it, 0 elsewhere."""
+    def of(self, shot: Shot, seed: tuple[int, int]) -> Shot:
+        """The photograph with the depths that are given of it, 0 elsewhere; the seed is of the scene, then of it."""
         if self.points == NONE:
             return replace(shot, depth=None)
         if shot.depth is None or shot.mask is None:
             raise BadInput("these photographs have no depths: set task.depths.points=none")
-        chosen = observed_pixels(shot.mask, self.points, seed)
-        noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(seed))
+        first, second = np.random.default_rng(seed).integers(2**62, size=2).tolist()
+        chosen = observed_pixels(shot.mask, self.points, first)
+        noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(second))
         return replace(shot, depth=torch.where(chosen, shot.depth + noise, 0.0))
 
 
@@ -91,24 +92,26 @@ def find_subject(
         inputs: of the run.
         longest: most pixels along the longer side of a photograph.
         every: of so many photographs one is held out.
-        masks: whether those that are given have their masks.
+        masks: whether those that are given have their masks. The unit sphere may have been found by masks anyway, those
+            of photographs that are held out not among them.
 
     Raises:
         BadInput: where photographs are missing, too few, or do not fit.
     """
     if inputs.photographed is not None:
-        capture = inputs.photographed.capture(longest)
-        shots, truth = capture.shots, None
+        capture = inputs.photographed.capture(longest, every)
+        shots, truth, seed = capture.shots, None, inputs.seed
         found = "; ".join([capture.summary, *capture.notes])
     else:
         scene = inputs.scene
         camera = scene.view.camera.resized(longest, longest)
-        shots, truth = tuple(images.take(Truth(scene.mesh), camera, seed=scene.seed(inputs.seed))), scene.mesh
+        seed, truth = scene.seed(inputs.seed), scene.mesh
+        shots = tuple(images.take(Truth(truth), camera, seed=seed))
         found = f"{len(shots)} rendered photographs of {longest} x {longest} pixels"
     held_out, given = shots[::every], tuple(shot for place, shot in enumerate(shots) if place % every)
     if len(given) < FEWEST:
         raise BadInput(f"{len(shots)} photographs with every {every}th held out leave {len(given)}: give more")
-    given = tuple(depths.of(shot, inputs.seed + place) for place, shot in enumerate(given))
+    given = tuple(depths.of(shot, (seed, place)) for place, shot in enumerate(given))
     given = given if masks else tuple(replace(shot, mask=None) for shot in given)
     return Subject(given, held_out, truth, f"{found}; {len(held_out)} of them are held out")
 

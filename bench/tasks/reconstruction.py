@@ -24,6 +24,11 @@ from bench.solve.solve import solve
 from datasets.photographs import Photography
 from renderers.checks import check_at_least, check_choice
 
+UNCOUNTED = {
+    "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
+    "foreground in each iteration, nor second derivatives"
+}
+
 
 @dataclass(frozen=True)
 class Reconstruction:
@@ -61,15 +66,18 @@ class Reconstruction:
         check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
         check_choice("task.guide", self.guide, GUIDES)
         check_at_least("task.rays", self.rays, 4, "1024 work")
+        if self.losses.colour_gradient and self.rays % 4:
+            raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def execute(self, run: RunContext) -> None:
         """Learns the field, and judges it before and after."""
-        run.record.definitions = dict(COLOURED_DEFINITIONS)
+        definitions = COLOURED_DEFINITIONS | UNCOUNTED
+        run.record.definitions = dict(definitions)
         subject = find_subject(
             self.images, self.depths, run.inputs, longest=self.longest, every=self.held_out, masks=self.masks
         )
         run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
-        solve(lambda: self.problem(subject, run), self.optimiser, run, COLOURED_DEFINITIONS)
+        solve(lambda: self.problem(subject, run), self.optimiser, run, definitions)
 
     def problem(self, subject: Subject, run: RunContext) -> ReconstructionProblem:
         """The problem of photographs."""

@@ -8,7 +8,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
 from bench.reconstruct.pictures import draw_surface
 from bench.reconstruct.stereo import Matching, stereo_clouds
 from bench.reconstruct.subject import Depths, Subject, find_subject
-from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS, note_result
 from datasets.captures.hull import hull_mesh
@@ -40,7 +40,7 @@ class _Photographs:
         )
         record.notes = [*record.notes, subject.found, "no renderer took part"]
         clock = time.perf_counter()
-        mesh = surface(subject)
+        mesh = cut_off(surface(subject))
         mesh = None if mesh is None else with_colours(mesh, subject.given)
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0}

@@ -46,7 +46,9 @@ class Capture:
         )
 
 
-def read_capture(folder: Path, *, longest: int, masks: bool = True, axes: str = "stated") -> Capture:
+def read_capture(
+    folder: Path, *, longest: int, masks: bool = True, axes: str = "stated", held_out: int | None = None
+) -> Capture:
     """Reads the photographs of a folder.
 
     Args:
@@ -54,6 +56,7 @@ def read_capture(folder: Path, *, longest: int, masks: bool = True, axes: str = 
         longest: most pixels of a photograph's longer side; larger ones are made smaller.
         masks: whether masks are used where there are any.
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
+        held_out: of so many photographs one, from the first on, has no part in finding the sphere; None: all have.
 
     Raises:
         BadInput: where something is missing, or cameras and masks do not fit.
@@ -72,7 +75,8 @@ def read_capture(folder: Path, *, longest: int, masks: bool = True, axes: str = 
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
     if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
         raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
-    sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(shots)
+    given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
+    sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(given)
     source = "files" if frames[0].mask is not None else "the alpha channel"
     return Capture(
         layout.format,

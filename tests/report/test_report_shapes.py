@@ -9,7 +9,7 @@ from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.pages import dvr_figures, dvr_table2, photos
 from bench.report.write.paper import write_paper
-from bench.report.write.shapes import history, scene_of
+from bench.report.write.shapes import MOST_COLUMNS, history, scene_of
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
 NEWTON, IDR, HULL, STEREO = "Newton, RGB", "IDR, RGB", "Visual hull", "Stereo, Poisson"
@@ -282,7 +282,7 @@ def test_many_rows_take_further_lines(tmp_path):
         (folder / "record.json").write_text(json.dumps(record))
     result = dvr_figures.make(chosen(tmp_path, dvr_figures))
     assert titles(result.figure) == ["sofa 0, held out", *(f"row {number}" for number in range(9))]
-    assert len(result.figure.axes) == 4 * 7
+    assert len(result.figure.axes) == 4 * MOST_COLUMNS
 
 
 def test_shapes_of_one_family_are_scenes_of_their_own(tmp_path):

@@ -29,8 +29,7 @@ from bench.report.write import chart, pictures
 from bench.report.write.table import Column, text
 
 ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
-CLOSE = {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
-MOST_COLUMNS = 7
+MOST_COLUMNS = 8
 HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore")  # of which more is better
 
 
@@ -135,13 +134,13 @@ def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[
         blocks += [cells[start : start + MOST_COLUMNS] for start in range(0, len(cells), MOST_COLUMNS)]
         notes += missing
     columns = max(map(len, blocks), default=1)
-    figure, axes = chart.sheet(2.1 * style.WIDTH / columns * len(blocks), 2 * max(len(blocks), 1), columns)
-    figure.get_layout_engine().set(**CLOSE)
+    figure, axes = chart.sheet(2.4 * style.WIDTH / columns * len(blocks), 2 * max(len(blocks), 1), columns)
+    figure.get_layout_engine().set(**pictures.CLOSE)
     for axis in axes.flat:
         axis.axis("off")
     for place, cells in enumerate(blocks):
         for (title, images), above, below in zip(cells, axes[2 * place], axes[2 * place + 1], strict=False):
-            above.set_title("\n".join(textwrap.wrap(title, 16)), fontsize=6)
+            above.set_title("\n".join(textwrap.wrap(title, 15)), fontsize=5.5)
             _pair(above, below, images)
     return figure, notes
 
@@ -157,15 +156,24 @@ def _cells(experiment: Experiment, rows: Sequence[Row], scene: str) -> tuple[lis
             cells.insert(0, (f"{scene}, held out", {"colours": found["photograph"]}))
             shown = True
         cells.append((row.name, found))
-    return cells, notes
+    masks = [images["hit"] for _, images in cells if "hit" in images]
+    window = style.window(masks) if masks else (0.0, 0.0, 1.0)
+    return [(title, {**images, "window": window} if images else {}) for title, images in cells], notes
 
 
-def _pair(above: Any, below: Any, images: dict[str, np.ndarray]) -> None:
+def _pair(above: Any, below: Any, images: dict[str, Any]) -> None:
+    """Draws colours above and normals below, the same part of each: that with the shapes of all rows."""
     if not images:
-        chart.say(above, "no picture", color="#777777")
+        chart.say(above, "no picture", color="#777777", fontsize=5.5)
         return
-    hit = images.get("hit")
-    colours = images["colours"].astype(float)
-    above.imshow(colours if hit is None else np.where(hit[..., None], colours, 1.0).clip(0, 1), interpolation="auto")
+    hit, colours = images.get("hit"), images["colours"].astype(float)
+    _draw_part(above, colours if hit is None else np.where(hit[..., None], colours, 1.0).clip(0, 1), images["window"])
     if hit is not None:
-        below.imshow(pictures.coloured(images["normals"].astype(float), hit), interpolation="auto")
+        _draw_part(below, pictures.coloured(images["normals"].astype(float), hit), images["window"])
+
+
+def _draw_part(axis: Any, picture: np.ndarray, window: tuple[float, float, float]) -> None:
+    height, width = (length / max(picture.shape[:2]) for length in picture.shape[:2])
+    top, left, side = window
+    axis.imshow(picture, extent=(0, width, height, 0), interpolation="auto")
+    axis.set(xlim=(left, left + side), ylim=(top + side, top))
