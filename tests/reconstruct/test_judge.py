@@ -16,6 +16,7 @@ from datasets.mesh import Mesh
 from datasets.photographs import around
 from datasets.scene import View
 from datasets.shot import Shot
+from renderers.camera import sphere_span
 from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, run_of
 
@@ -46,7 +47,9 @@ def inputs(tmp_path):
 
 
 def without_masks(subject: Subject) -> Subject:
-    return replace(subject, held_out=tuple(replace(shot, mask=None) for shot in subject.held_out))
+    """The same in front of black, which is known no more."""
+    black = [replace(shot, colours=shot.colours * shot.mask[..., None], mask=None) for shot in subject.held_out]
+    return replace(subject, held_out=tuple(black))
 
 
 def test_the_truth_scores_high(subject, inputs):
@@ -79,9 +82,10 @@ def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
     assert metrics["own_ssim"] < 0.999 and metrics["own_mask_iou"] == 1.0
 
 
-def test_without_masks_psnr_is_over_covered_pixels_and_there_is_no_overlap(subject, inputs):
+def test_without_masks_psnr_is_over_what_lies_in_the_unit_sphere_and_there_is_no_overlap(subject, inputs):
     metrics = judge(painted(red=0.2), without_masks(subject), inputs).metrics
-    assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)
+    shares = [shot.mask.sum() / sphere_span(shot.camera.rays())[2].sum() for shot in subject.held_out]
+    assert metrics["own_psnr"] == pytest.approx(np.mean([-10 * log10(0.2**2 * s / 3) for s in shares]), abs=0.01)
     assert not {*MASK_IOU, *(OWN + name for name in MASK_IOU)} & set(metrics)
     assert set(metrics) == set(COLOURED_DEFINITIONS) - {*MASK_IOU, *(OWN + name for name in MASK_IOU)}
     exact = judge(painted(), without_masks(subject), inputs).metrics
@@ -150,7 +154,17 @@ def test_images_are_compared_black_outside_of_their_masks():
     assert scores["mask_iou"] == pytest.approx(1 / 3)
     blind = image_scores([view], [larger[2]], [replace(shot, mask=None)])
     assert set(blind) == {"psnr", "ssim"}
-    assert blind["psnr"] == pytest.approx(-10 * log10(both), abs=1e-4)  # of the pixels that the shape covers
+    meets = sphere_span(camera.rays())[2]
+    wrong = ((larger[2] - 0.8) ** 2)[meets].mean().item()  # what the shape does not cover is black, and wrong as well
+    assert meets.any() and not meets.all() and blind["psnr"] == pytest.approx(-10 * log10(wrong), abs=1e-4)
+
+
+def test_without_masks_no_surface_is_not_a_perfect_one():
+    camera = camera_of(16)
+    blank = View(camera, torch.zeros(16, 16), torch.zeros(16, 16, 3), torch.zeros(16, 16).bool())
+    shot = Shot("0", camera, torch.full((16, 16, 3), 0.8), None)
+    scores = image_scores([blank], [torch.zeros(16, 16, 3)], [shot])
+    assert scores["psnr"] == pytest.approx(-20 * log10(0.8)) and scores["ssim"] < 0.5
 
 
 def test_the_same_image_has_the_best_scores():

@@ -86,25 +86,25 @@ def test_photographs_of_ones_own_have_no_truth_and_no_depths(inputs, tmp_path):
 @pytest.mark.parametrize(("points", "count"), [("dense", None), ("25%", None), ("30", 30)])
 def test_depths_are_given_in_the_amount_that_is_asked_for(points, count):
     shot = shot_of(ball(), CAMERA)
-    given = Depths(points, 0.0).of(shot, 3).depth
+    given = Depths(points, 0.0).of(shot, (0, 3)).depth
     assert shot.mask is not None and given is not None and shot.depth is not None
     foreground = int(shot.mask.sum())
     expected = count or round(foreground * (0.25 if "%" in points else 1))
     known = given > 0
     assert int(known.sum()) == expected and not (known & ~shot.mask).any()
     assert torch.equal(given[known], shot.depth[known])
-    again, other = (Depths(points, 0.0).of(shot, seed).depth for seed in (3, 4))
+    again, other = (Depths(points, 0.0).of(shot, (0, seed)).depth for seed in (3, 4))
     assert torch.equal(given, again) and torch.equal(given, other) == (points == "dense")
 
 
 def test_depths_have_noise_of_the_standard_deviation():
     shot = shot_of(ball(), camera_of(64))
     assert shot.mask is not None and shot.depth is not None
-    given = Depths("dense", 0.05).of(shot, 0).depth
+    given = Depths("dense", 0.05).of(shot, (0, 0)).depth
     assert given is not None and (given[~shot.mask] == 0).all()
     off = (given - shot.depth)[shot.mask]
     assert off.std().item() == pytest.approx(0.05, rel=0.1) and abs(off.mean().item()) < 0.01
-    assert NO_DEPTHS.of(shot, 0).depth is None
+    assert NO_DEPTHS.of(shot, (0, 0)).depth is None
     with pytest.raises(ValueError, match=r"task\.depths\.noise must be at least 0"):
         Depths("dense", -0.1)
 
@@ -113,8 +113,8 @@ def test_depths_of_photographs_without_any_are_refused():
     shot = shot_of(ball(), CAMERA)
     for without in (replace(shot, depth=None), replace(shot, mask=None)):
         with pytest.raises(BadInput, match=r"no depths: set task\.depths\.points=none"):
-            Depths("dense", 0.0).of(without, 0)
-        assert NO_DEPTHS.of(without, 0).depth is None
+            Depths("dense", 0.0).of(without, (0, 0))
+        assert NO_DEPTHS.of(without, (0, 0)).depth is None
 
 
 def test_depths_differ_from_photograph_to_photograph(inputs):

@@ -26,8 +26,8 @@ NOTES = (
     "surfaces are cut off at the unit sphere.",
     "All rows but DVR's own share one field (4 layers of 128, a distance), mask loss and weights. The depths of “RGB "
     "and depth” are a tenth of all, those of Poisson all of them; both have noise of 0.01.",
-    "DVR's own rows have their paper's rate of 1e-4 and no more iterations than the others, where the paper has hundreds "
-    "of thousands: they are far from their end.",
+    "DVR's own rows have their paper's rate of 1e-4 and no more iterations than others, not the paper's hundreds of "
+    "thousands: they are far from their end.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU at 1200 x 1600, in mm, which cannot be compared "
     "directly with the measured rows.",
 )
