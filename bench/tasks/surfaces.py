@@ -1,12 +1,12 @@
 """The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
 from bench.reconstruct.pictures import draw_surface
-from bench.reconstruct.stereo import Matching, stereo_clouds
+from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import Depths, Subject, find_subject
 from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
@@ -52,6 +52,22 @@ class _Photographs:
 
 
 @dataclass(frozen=True)
+class Fusing:
+    """How points become a surface; see `bench.reconstruct.surfaces.poisson`."""
+
+    octree: int
+    trim: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.fusing.octree", self.octree, 2, "8 has 256 cells per axis")
+        check_at_least("task.fusing.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
+
+    def surface(self, clouds: Sequence[Cloud]) -> Mesh | None:
+        """The surface of all points."""
+        return poisson(*fused(clouds), depth=self.octree, trim=self.trim)
+
+
+@dataclass(frozen=True)
 class Hull(_Photographs):
     """The visual hull of the masks (Laurentini 1994).
 
@@ -80,16 +96,10 @@ class Poisson(_Photographs):
     """Given depths, fused by screened Poisson reconstruction.
 
     Args:
-        octree, trim: see `bench.reconstruct.surfaces.poisson`.
+        fusing: of their points.
     """
 
-    octree: int
-    trim: float
-
-    def __post_init__(self) -> None:
-        check_at_least("task.octree", self.octree, 2, "8 has 256 cells per axis")
-        check_at_least("task.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
-        super().__post_init__()
+    fusing: Fusing
 
     def execute(self, run: RunContext) -> None:
         """Fuses the points of the given depths."""
@@ -98,7 +108,7 @@ class Poisson(_Photographs):
     def _surface(self, subject: Subject) -> Mesh | None:
         if all(shot.depth is None for shot in subject.given):
             raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task=stereo")
-        return poisson(*fused(given_clouds(subject.given)), depth=self.octree, trim=self.trim)
+        return self.fusing.surface(given_clouds(subject.given))
 
 
 @dataclass(frozen=True)
@@ -107,21 +117,12 @@ class Stereo(_Photographs):
 
     Args:
         matching: of neighbouring photographs.
-        octree, trim: see `bench.reconstruct.surfaces.poisson`.
+        fusing: of the points.
     """
 
     matching: Matching
-    octree: int
-    trim: float
-
-    def __post_init__(self) -> None:
-        check_at_least("task.octree", self.octree, 2, "8 has 256 cells per axis")
-        check_at_least("task.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
-        super().__post_init__()
+    fusing: Fusing
 
     def execute(self, run: RunContext) -> None:
         """Matches the photographs, and fuses what is found."""
-        self.make(run, self._surface)
-
-    def _surface(self, subject: Subject) -> Mesh | None:
-        return poisson(*fused(stereo_clouds(subject.given, self.matching)), depth=self.octree, trim=self.trim)
+        self.make(run, lambda subject: self.fusing.surface(stereo_clouds(subject.given, self.matching)))

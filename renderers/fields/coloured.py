@@ -20,6 +20,7 @@ SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second de
 AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
 DIRECTION_OCTAVES = 2  # of the encoding of view directions
 LOGIT_WIDTH = 0.1  # scene units over which a logit of occupancy changes by 1 at its start
+Vectors = Float[Tensor, "*batch 3"]
 COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size of those of distances
 
 
@@ -27,12 +28,7 @@ COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size
 class Coloured(Field, Protocol):
     """A field whose surface has colours."""
 
-    def colours(
-        self,
-        points: Float[Tensor, "*batch 3"],
-        normals: Float[Tensor, "*batch 3"],
-        directions: Float[Tensor, "*batch 3"],
-    ) -> Float[Tensor, "*batch 3"]:
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """Red, green and blue from 0 to 1.
 
         Args:
@@ -94,12 +90,7 @@ class ColouredDistance(nn.Module):
         """The distance at the current weights."""
         return DistanceOf(self)
 
-    def colours(
-        self,
-        points: Float[Tensor, "*batch 3"],
-        normals: Float[Tensor, "*batch 3"],
-        directions: Float[Tensor, "*batch 3"],
-    ) -> Float[Tensor, "*batch 3"]:
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`; directions are unused unless `directional`."""
         seen = [encoded(directions, DIRECTION_OCTAVES)] if self.directional else []
         features = torch.cat([self.features(self._hidden(points)), points, normals, *seen], dim=-1)
@@ -137,12 +128,7 @@ class DistanceOf:
         values = [self.network.last(self.network._hidden(chunk)) for chunk in chunks]
         return torch.cat(values).view(points.shape[:-1])
 
-    def colours(
-        self,
-        points: Float[Tensor, "*batch 3"],
-        normals: Float[Tensor, "*batch 3"],
-        directions: Float[Tensor, "*batch 3"],
-    ) -> Float[Tensor, "*batch 3"]:
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
         return self.network.colours(points, normals, directions)
 
@@ -202,12 +188,7 @@ class OccupancyOf:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return -self._bound.logits(points)
 
-    def colours(
-        self,
-        points: Float[Tensor, "*batch 3"],
-        normals: Float[Tensor, "*batch 3"],
-        directions: Float[Tensor, "*batch 3"],
-    ) -> Float[Tensor, "*batch 3"]:
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
         return self._bound.colours(points)
 
@@ -254,12 +235,7 @@ class GridOf:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return Grid(self.grid.distances, self.grid.reach)(points)
 
-    def colours(
-        self,
-        points: Float[Tensor, "*batch 3"],
-        normals: Float[Tensor, "*batch 3"],
-        directions: Float[Tensor, "*batch 3"],
-    ) -> Float[Tensor, "*batch 3"]:
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
         places = (points.flip(-1) / self.grid.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
         sampled = torch.nn.functional.grid_sample(

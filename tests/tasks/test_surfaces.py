@@ -11,7 +11,7 @@ from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
 from bench.reconstruct.surfaces import with_colours
 from bench.solve.solve import COSTS
-from bench.tasks.surfaces import Hull, Poisson, Stereo
+from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
@@ -26,10 +26,10 @@ SHARED = {
     "depths": Depths("none", 0.0),
 }
 HULL = Hull(**SHARED, samples=32)
-POISSON = Poisson(**SHARED | {"depths": Depths("dense", 0.0)}, octree=5, trim=0.0)
+POISSON = Poisson(**SHARED | {"depths": Depths("dense", 0.0)}, fusing=Fusing(5, 0.0))
 NEAR = replace(PLAINLY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
 STEREO = Stereo(
-    **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), octree=5, trim=0.0
+    **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), fusing=Fusing(5, 0.0)
 )
 TASKS = {"hull": HULL, "poisson": POISSON, "stereo": STEREO}
 ARRAYS = {"colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}  # at the size of pictures
@@ -128,7 +128,7 @@ def test_what_a_surface_needs_is_told(scene, tmp_path, task, message):  # noqa: 
 
 def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
     run = run_in(tmp_path, scene)
-    altered(POISSON, {"trim": 99.0}).execute(run)
+    altered(POISSON, {"fusing.trim": 99.0}).execute(run)
     record = run.record
     assert (record.status, record.reason) == ("empty", "no surface was found")
     assert set(record.metrics) == SCORES
@@ -142,8 +142,8 @@ def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
         ("hull", {"samples": 4}, "task.samples must be at least 8"),
         ("hull", {"longest": 4}, "task.longest must be at least 8"),
         ("stereo", {"held_out": 1}, "task.held_out must be at least 2"),
-        *((task, {"octree": 1}, "task.octree must be at least 2") for task in ("poisson", "stereo")),
-        *((task, {"trim": -1.0}, "task.trim must be at least 0") for task in ("poisson", "stereo")),
+        *((task, {"fusing.octree": 1}, "task.fusing.octree must be at least 2") for task in ("poisson", "stereo")),
+        *((task, {"fusing.trim": -1.0}, "task.fusing.trim must be at least 0") for task in ("poisson", "stereo")),
     ],
 )
 def test_settings_that_cannot_be_are_told(task, changed, message):
