@@ -45,7 +45,8 @@ class Shown:
 
     def cells(self, truth: "Shown") -> dict[str, Float[np.ndarray, "height width 3"]]:
         """Pictures of it by the names of their rows: its colours and the error of its mask where the truth has them."""
-        cells = {"normals": normals_image(self.view)}
+        image = normals_image(self.view)
+        cells = {"normals": image if bool(self.view.normals.any()) else np.ones_like(image)}
         if truth.colours is not None and self.colours is not None:
             on_white = torch.where(self.view.mask[..., None], self.colours, 1.0)
             cells = {"colours": (self.colours if self is truth else on_white).clamp(0, 1).numpy()} | cells

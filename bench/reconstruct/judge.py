@@ -6,7 +6,7 @@ from math import inf, log10, nan
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -125,13 +125,20 @@ def image_scores(
 
 
 def _against(view: View, image: Float[Tensor, "height width 3"], shot: Shot) -> dict[str, float]:
-    judged = sphere_span(shot.camera.rays())[2] if shot.mask is None else torch.ones_like(shot.mask)
-    known = judged if shot.mask is None else shot.mask
+    judged, known = judged_pixels(shot)
     found, true = (image * judged[..., None]).numpy(), (shot.colours * known[..., None]).numpy()
     error = float(((found - true) ** 2).sum()) / max(3 * int(judged.sum()), 1)
     similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=_window(true.shape))
     overlap = nan if shot.mask is None else mask_iou(view.mask.numpy(), shot.mask.numpy())
     return {"psnr": -10 * log10(error) if error else inf, "ssim": float(similar), "mask_iou": overlap}
+
+
+def judged_pixels(shot: Shot) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """The pixels that are judged, and those of them whose colour is the photograph's; the others are to be black."""
+    if shot.mask is not None:
+        return torch.ones_like(shot.mask), shot.mask
+    meets = sphere_span(shot.camera.rays())[2]
+    return meets, meets
 
 
 def _window(shape: tuple[int, ...]) -> int:

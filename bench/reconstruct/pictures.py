@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from bench.evaluate.colours import coloured_image
 from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
+from bench.reconstruct.judge import judged_pixels
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import mesh_image
 from bench.setup.inputs import RunInputs
@@ -24,6 +26,7 @@ from renderers.camera import Camera
 from renderers.fields.coloured import Coloured
 
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
+ERRORS = colormaps["magma_r"].with_extremes(bad="0.85")  # grey where nothing is judged
 Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
 WORST = 0.3  # mean difference of colours that is shown darkest
 
@@ -68,29 +71,38 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
     shots = spread(subject.held_out, MOST_HELD_OUT)
     tall = shots[0].camera.height / shots[0].camera.width
-    figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 0.9), layout="constrained")
+    figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 1.2), layout="constrained")
     axes = figure.subplots(len(shots), 4, squeeze=False)
     for row, shot in zip(axes, shots, strict=True):
         view, image = seen(_larger(shot.camera, inputs))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
         row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
-        shown = row[2].imshow(_error(seen, shot), cmap="magma_r", vmin=0, vmax=WORST, interpolation="nearest")
+        shown = row[2].imshow(_error(seen, shot), cmap=ERRORS, vmin=0, vmax=WORST, interpolation="nearest")
         row[3].imshow(normals_image(view))
         row[0].set_ylabel(Path(shot.name).stem if Path(shot.name).suffix else f"photograph {shot.name}")
         for axis in row:
             bare(axis)
     for axis, name in zip(axes[0], ("held-out photograph", "rendering", "difference", "normals"), strict=True):
         axis.set_title(name)
-    figure.colorbar(shown, ax=axes[:, 2], location="bottom", shrink=0.9, pad=0.02, label="of colours from 0 to 1, mean")
+    figure.colorbar(
+        shown,
+        ax=axes[:, 2],
+        location="bottom",
+        shrink=0.9,
+        pad=0.02,
+        label="mean absolute, of colours from 0 to 1",
+        extend="max",
+    )
     figure.suptitle(title)
     return figure
 
 
 def _error(seen: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
-    """The mean difference of colours at the photograph's own size; both are black outside of their masks."""
-    view, image = seen(shot.camera)
-    known = view.mask if shot.mask is None else shot.mask
-    return (image - shot.colours * known[..., None]).abs().mean(-1).numpy()
+    """The mean difference of colours at the photograph's own size, as `judge.IMAGES` has it; NaN elsewhere."""
+    image = seen(shot.camera)[1]
+    judged, known = judged_pixels(shot)
+    error = (image - shot.colours * known[..., None]).abs().mean(-1)
+    return torch.where(judged, error, torch.nan).numpy()
 
 
 def _input(subject: Subject) -> Figure:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from bench.evaluate.colours import colours_at
 from bench.evaluate.evaluate import Evaluation, surface_of
 from bench.pictures.filmstrip import Shown
 from bench.reconstruct.judge import judge, mesh_scores, surface_scores
@@ -20,12 +21,13 @@ from bench.reconstruct.subject import Subject
 from bench.setup.inputs import RunInputs
 from bench.solve.latent_code import Terms
 from datasets.scene import View
+from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Counts, Field, Meter
 from renderers.fields.coloured import Coloured
 from renderers.rendering import Renderer, at_iteration
 
-COMPARED = 4096  # pixels of which the loss before and after is made
+COMPARED = 4096  # pixels of which the objective before and after is made
 
 
 @dataclass
@@ -117,8 +119,15 @@ class ReconstructionProblem:
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
 
     def objective(self) -> float:
-        """The loss over the same pixels before and after, not counted."""
-        patches, rows = self.losses.colour_gradient > 0, min(COMPARED, 4 * len(self.stack.corners))
-        pixels, shape = self.stack.drawn(rows, patches=patches, seed=self.seed), self.model.field
-        renderer = at_iteration(self.renderer, self.iterations)
-        return float(self.losses(renderer, shape, Meter(shape), pixels)["total"].detach())
+        """The mean difference of colours over the same given pixels, black outside of the shape and of masks.
+
+        The loss itself compares what is hit: it falls where a surface is lost.
+        """
+        pixels, shape = self.stack.drawn(COMPARED, patches=False, seed=self.seed), self.field()
+        with torch.no_grad():
+            rendering = rendered(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
+        true = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
+        found = torch.zeros_like(true)
+        at, towards = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
+        found[rendering.hit] = colours_at(shape, at, towards, at.device).to(true)
+        return float((found - true).abs().mean())

@@ -18,6 +18,7 @@ from datasets.truth import Truth
 from renderers.checks import BadInput, check_at_least
 
 FEWEST = 3  # given photographs
+NO_HULL = "the visual hull needs a mask of each photograph: leave out dataset.masks=false and task.masks=false"
 NONE, GIVEN, HULL = "none", "given", "hull"  # where distances are known; see `Depths`
 GUIDES = (NONE, GIVEN, HULL)
 HULL_SAMPLES = 96  # per axis
@@ -44,7 +45,9 @@ class Depths:
         if self.points == NONE:
             return replace(shot, depth=None)
         if shot.depth is None or shot.mask is None:
-            raise BadInput("these photographs have no depths: set task.depths.points=none")
+            raise BadInput(
+                "these photographs have no depths: take task=stereo, or set task.depths.points=none of another"
+            )
         first, second = np.random.default_rng(seed).integers(2**62, size=2).tolist()
         chosen = observed_pixels(shot.mask, self.points, first)
         noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(second))
@@ -113,7 +116,9 @@ def find_subject(
         raise BadInput(f"{len(shots)} photographs with every {every}th held out leave {len(given)}: give more")
     given = tuple(depths.of(shot, (seed, place)) for place, shot in enumerate(given))
     given = given if masks else tuple(replace(shot, mask=None) for shot in given)
-    return Subject(given, held_out, truth, f"{found}; {len(held_out)} of them are held out")
+    return Subject(
+        given, held_out, truth, f"{found}; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
+    )
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
@@ -133,7 +138,7 @@ def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
     """
     hull = hull_mesh(shots, HULL_SAMPLES) if all(shot.mask is not None for shot in shots) else None
     if hull is None:
-        raise BadInput("the visual hull needs masks that have a point in common: set task.guide=none")
+        raise BadInput(f"{NO_HULL}, or set task.guide=none")
     scene = Truth(hull, closed=False)
     views = [see(scene, shot.camera) for shot in shots]
     behind = [torch.where(view.mask, view.camera.distance(view.depth), torch.nan) for view in views]

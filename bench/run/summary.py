@@ -99,6 +99,8 @@ def _measured(record: Record) -> Table:
     table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene}"))
     table.add_column("")
     table.add_column("measured", justify="right")
+    known = {name: (label, factor) for name, label, factor, _ in ROWS}
     for name, value in record.metrics.items():
-        table.add_row(name, number(value))
+        label, factor = known.get(name, (name, 1.0))
+        table.add_row(label, number(value, factor))
     return table

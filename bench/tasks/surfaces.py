@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
 from bench.reconstruct.pictures import draw_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
-from bench.reconstruct.subject import Depths, Subject, find_subject
+from bench.reconstruct.subject import NO_HULL, Depths, Subject, find_subject
 from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS, note_result
@@ -87,7 +87,7 @@ class Hull(_Photographs):
 
     def _surface(self, subject: Subject) -> Mesh | None:
         if any(shot.mask is None for shot in subject.given):
-            raise BadInput("the visual hull needs masks: set task.masks=true, or another task")
+            raise BadInput(f"{NO_HULL}, or set task=stereo")
         return hull_mesh(subject.given, self.samples)
 
 

@@ -79,7 +79,7 @@ def test_photographs_of_ones_own_have_no_truth_and_no_depths(inputs, tmp_path):
     subject = found(inputs, every=5, longest=24)
     assert subject.truth is None and (len(subject.given), len(subject.held_out)) == (8, 2)
     assert subject.given[0].colours.shape == (20, 24, 3) and subject.given[0].mask is not None
-    with pytest.raises(BadInput, match=r"have no depths: set task\.depths\.points=none"):
+    with pytest.raises(BadInput, match=r"have no depths: take task=stereo, or set task\.depths\.points=none"):
         found(inputs, Depths("dense", 0.0))
 
 
@@ -112,7 +112,7 @@ def test_depths_have_noise_of_the_standard_deviation():
 def test_depths_of_photographs_without_any_are_refused():
     shot = shot_of(ball(), CAMERA)
     for without in (replace(shot, depth=None), replace(shot, mask=None)):
-        with pytest.raises(BadInput, match=r"no depths: set task\.depths\.points=none"):
+        with pytest.raises(BadInput, match=r"no depths: take task=stereo, or set task\.depths\.points=none"):
             Depths("dense", 0.0).of(without, (0, 0))
         assert NO_DEPTHS.of(without, (0, 0)).depth is None
 
@@ -207,5 +207,5 @@ def test_without_masks_or_with_an_empty_hull_the_remedy_is_told(shots):
     blind = [*shots[:3], replace(shots[3], mask=None)]
     empty = [replace(shot, mask=torch.zeros(32, 32, dtype=torch.bool)) for shot in shots[:4]]
     for wrong in (blind, empty):
-        with pytest.raises(BadInput, match=r"the visual hull needs masks .*: set task\.guide=none"):
+        with pytest.raises(BadInput, match=r"the visual hull needs a mask of each .*, or set task\.guide=none"):
             hull_distances(wrong)

@@ -31,6 +31,8 @@ class Toy:
     tracked: tuple[str, ...] = ()
     observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
 
+    shown = None
+
     def __post_init__(self):
         self.radius = torch.tensor(1.0, requires_grad=True)
         self.parameters = [self.radius]

@@ -112,7 +112,7 @@ def test_the_hull_is_as_fine_as_its_samples(scene, tmp_path):  # noqa: F811
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (altered(HULL, {"masks": False}), "the visual hull needs masks: set task.masks=true"),
+        (altered(HULL, {"masks": False}), "the visual hull needs a mask of each"),
         (
             altered(POISSON, {"depths": Depths("none", 0.0)}),
             "screened Poisson needs depths: set task.depths.points=dense, or task=stereo",

@@ -116,6 +116,8 @@ def _draw_run(experiment: Experiment, record: Record, column: Any, name: str, sc
         look = style.look(row.preset)
         for axis in column:
             axis.axhline(scale * last, color=look.colour, ls=look.line, lw=0.9, label=row.name)
+        if spent := loop_seconds(record):
+            chart.points(column[0], row.preset, [spent], [scale * last])
 
 
 def scene_of(record: Record) -> str:
