@@ -90,10 +90,12 @@ class Stack:
 
     def drawn(self, count: int, *, patches: bool, seed: int) -> Pixels:
         """That many random pixels, or in patches of 2 x 2: four after one another, by rows."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator("cpu").manual_seed(seed)
         places = self.corners if patches else self.useful
         chosen = places[
-            torch.randint(len(places), (count // 4 if patches else count,), generator=generator).to(places.device)
+            torch.randint(len(places), (count // 4 if patches else count,), generator=generator, device="cpu").to(
+                places.device
+            )
         ]
         if patches:
             right = torch.tensor([0, 1, 0, 1], device=chosen.device)

@@ -1,5 +1,7 @@
 """The loop of a task makes no tensor without a device: with another default device, it stays on that of the run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,14 +9,16 @@ import trimesh
 from hydra import compose, initialize_config_dir
 
 from bench.config import CONF, build, load, register
+from bench.reconstruct.subject import Depths, find_subject
+from bench.setup.fields import FieldChoice
 from bench.solve.optimise import History, optimise
-from bench.solve.problem import OptimiserSettings
+from bench.solve.problem import Objective, OptimiserSettings
 from bench.tasks.pose import Pose, PoseProblem
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from renderers.fields.analytic import sphere
-from tests.tiny import CPU, ball_prior, camera_of
+from tests.tiny import CPU, ball_prior, camera_of, run_of
 
 CASES = {
     "completion": ("task.points=50",),
@@ -45,8 +49,27 @@ def test_the_loop_stays_on_the_device_of_its_run(scene, name, renderer):
         problem = PoseProblem(task, tested, sphere(0.5), scene.view, task.cameras(scene.view.camera, 0), CPU)
     else:
         problem = task.problem(scene, ball_prior(radius=0.45), tested, seed=0, device=CPU)
+    check(problem)
+
+
+@pytest.mark.parametrize("renderer", ["dist", "dvr", "newton"])
+def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, renderer):
+    register()
+    weights = [f"task.losses.{name}=1" for name in ("colour_gradient", "depth", "smoothness", "normals")]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", ["task=reconstruction", "scale=smoke", "task.longest=24", "task.rays=64", *weights])
+    task, tested = build(config.task, "task"), load("renderer", renderer)
+    run = run_of(tmp_path, tested, ball_prior(), camera_of(24), make_scene=lambda: scene)
+    run = replace(run, inputs=replace(run.inputs, field=FieldChoice("network_2x16", None)))
+    depths = Depths("20%", 0.01)
+    subject = find_subject(task.images, depths, run.inputs, longest=24, every=task.held_out, masks=True)
+    check(task.problem(subject, run))
+
+
+def check(problem: Objective) -> None:
+    """Optimises a problem where tensors that name no device have no data."""
     history = History()
-    torch.set_default_device("meta")  # holds no data: what is made on it by mistake cannot meet what the run has made
+    torch.set_default_device("meta")  # what is made on it by mistake cannot meet what the run has made
     try:
         optimise(problem, ADAM, CPU, history=history, on_step=lambda line: None)
     finally:
