@@ -101,8 +101,8 @@ def sphere_of(shots: Sequence[Shot]) -> Sphere:
         if len(inside) == 0:
             raise BadInput(
                 "the visual hull of the masks is empty: no point is inside of all masks, so that cameras do not fit "
-                "the masks. Turn the cameras round (axes=flipped, or stated where they are flipped), check the order "
-                "of the images and that masks are white on the object"
+                "the masks. Try flipped axes (stated ones, where they are flipped), check the order of the images and "
+                "that masks are white on the object"
             )
         spacing = 2 * half / (SAMPLES - 1)
         low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing
