@@ -14,6 +14,7 @@ from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.reference import trace
 
 NEURONS = 16  # of the paint
+JUMP = 1e-9  # of a colour within a step: smooth ones have a second difference of about 1e-12
 STEP = 1e-6  # of a central difference, in units of the parameter: a network has few kinks within so short a step
 ROOT_STEPS = 6  # of the secant method, from the undisturbed root
 RESIDUAL = 1e-12  # |field| above which the secant method has not converged
@@ -124,7 +125,9 @@ def colour_differences(
     shifts = STEP * torch.cat([directions.T, -directions.T])
     moved, _ = _roots(decoder.at(code + shifts), rays, distance)
     seen = _painted(decoder.at(code + shifts), rays, moved, paint)
-    by_code = (seen[: len(shifts) // 2] - seen[len(shifts) // 2 :]) / (2 * STEP)
+    here = _painted(decoder.at(code[None]), rays, distance[None], paint)
+    ahead, behind = seen[: len(shifts) // 2], seen[len(shifts) // 2 :]
+    by_code, smooth = (ahead - behind) / (2 * STEP), _smooth(ahead, here, behind)
     by_camera = []
     for twist in STEP * torch.eye(6, dtype=torch.float64):
         ends = []
@@ -133,6 +136,7 @@ def colour_differences(
             found, _ = _roots(decoder.at(code[None]), turned, distance)
             ends.append(_painted(decoder.at(code[None]), turned, found, paint)[0])
         by_camera.append((ends[0] - ends[1]) / (2 * STEP))
+        smooth &= _smooth(ends[0][None], here, ends[1][None])
     by_weight = []
     for weight in STEP * torch.eye(Paint.size, dtype=torch.float64):
         ends = [
@@ -141,7 +145,7 @@ def colour_differences(
         ]
         by_weight.append((ends[0] - ends[1]) / (2 * STEP))
     columns = (by_code.permute(1, 2, 0), *(torch.stack(by, dim=-1) for by in (by_camera, by_weight)))
-    return ColourDifferences(*columns, truth.valid)
+    return ColourDifferences(*columns, truth.valid & smooth)
 
 
 def image_differences(
@@ -217,6 +221,13 @@ def _painted(
         (normals,) = torch.autograd.grad(field(points).sum(), points)
     with torch.no_grad():
         return paint(points, normals)
+
+
+def _smooth(
+    ahead: Float[Tensor, "codes m 3"], here: Float[Tensor, "1 m 3"], behind: Float[Tensor, "codes m 3"]
+) -> Bool[Tensor, " m"]:
+    """Which pixels' normals do not jump within the step, as those of a network of ReLUs do at its kinks."""
+    return ((ahead + behind - 2 * here).abs() < JUMP).all(-1).all(0)
 
 
 def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
