@@ -62,7 +62,7 @@ DEFINITIONS: dict[str, str] = {
 }
 
 # The score of a run without a surface: the worst.
-_WORST_SURFACE = {
+WORST_SURFACE = {
     "chamfer_l2": np.inf,
     "chamfer_l1": np.inf,
     "chamfer_gt_to_pred": np.inf,
@@ -119,7 +119,7 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
     if len(truth.points) == 0:
         raise ValueError("truth must have points, found 0; sample the true surface before comparing with it.")
     if predicted is None or len(predicted.points) == 0:
-        return dict(_WORST_SURFACE)
+        return dict(WORST_SURFACE)
     to_truth, cosine_to_truth = _nearest(predicted, truth)
     to_predicted, cosine_to_predicted = _nearest(truth, predicted)
     return {

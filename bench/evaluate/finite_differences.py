@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderers.camera import Camera, Rays, sphere_span
-from renderers.field import Field
+from renderers.field import Field, autograd_gradients
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.reference import trace
 
@@ -124,8 +124,9 @@ def colour_differences(
     truth = differences(decoder, code, directions, camera=camera, pixels=pixels, distance=distance)
     shifts = STEP * torch.cat([directions.T, -directions.T])
     moved, _ = _roots(decoder.at(code + shifts), rays, distance)
-    seen = _painted(decoder.at(code + shifts), rays, moved, paint)
-    here = _painted(decoder.at(code[None]), rays, distance[None], paint)
+    seen = paint(*_hits(decoder.at(code + shifts), rays, moved))
+    hits = _hits(decoder.at(code[None]), rays, distance[None])
+    here = paint(*hits)
     ahead, behind = seen[: len(shifts) // 2], seen[len(shifts) // 2 :]
     by_code, smooth = (ahead - behind) / (2 * STEP), _smooth(ahead, here, behind)
     by_camera = []
@@ -134,15 +135,12 @@ def colour_differences(
         for sign in (1, -1):
             turned = camera.moved(sign * twist).rays().flat()[pixels]
             found, _ = _roots(decoder.at(code[None]), turned, distance)
-            ends.append(_painted(decoder.at(code[None]), turned, found, paint)[0])
+            ends.append(paint(*_hits(decoder.at(code[None]), turned, found))[0])
         by_camera.append((ends[0] - ends[1]) / (2 * STEP))
         smooth &= _smooth(ends[0][None], here, ends[1][None])
     by_weight = []
     for weight in STEP * torch.eye(Paint.size, dtype=torch.float64):
-        ends = [
-            _painted(decoder.at(code[None]), rays, distance[None], Paint(paint.weights + sign * weight))[0]
-            for sign in (1, -1)
-        ]
+        ends = [Paint(paint.weights + sign * weight)(*hits)[0] for sign in (1, -1)]
         by_weight.append((ends[0] - ends[1]) / (2 * STEP))
     columns = (by_code.permute(1, 2, 0), *(torch.stack(by, dim=-1) for by in (by_camera, by_weight)))
     return ColourDifferences(*columns, truth.valid & smooth)
@@ -212,15 +210,12 @@ def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, " m"]) -> tuple
     return second, (second_value.abs() < RESIDUAL) & ((second - start).abs() < CLEAR)
 
 
-def _painted(
-    field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"], paint: Paint
-) -> Float[Tensor, "codes m 3"]:
-    """The colours of the points at distances along m rays, by the normals of a batch of fields."""
-    points = (rays.origins + distance[..., None] * rays.directions).detach().requires_grad_(True)
-    with torch.enable_grad():
-        (normals,) = torch.autograd.grad(field(points).sum(), points)
-    with torch.no_grad():
-        return paint(points, normals)
+def _hits(
+    field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"]
+) -> tuple[Float[Tensor, "codes m 3"], Float[Tensor, "codes m 3"]]:
+    """The points at distances along m rays, and the gradients there of a batch of fields."""
+    points = rays.origins + distance[..., None] * rays.directions
+    return points.detach(), autograd_gradients(field, points)
 
 
 def _smooth(

@@ -14,6 +14,7 @@ from bench.evaluate.colours import coloured_image, vertex_colours
 from bench.evaluate.evaluate import (
     DEFINITIONS,
     OWN,
+    WORST_SURFACE,
     Evaluation,
     Surface,
     mask_iou,
@@ -23,7 +24,7 @@ from bench.evaluate.evaluate import (
     unseen,
 )
 from bench.reconstruct.subject import Subject
-from bench.reconstruct.surfaces import mesh_image
+from bench.reconstruct.surfaces import painter
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -34,15 +35,7 @@ from renderers.camera import sphere_span
 from renderers.fields.coloured import Coloured
 
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
-SURFACE = (
-    "chamfer_l2",
-    "chamfer_l1",
-    "chamfer_gt_to_pred",
-    "accuracy",
-    "completeness",
-    "fscore",
-    "normal_consistency",
-)
+SURFACE = tuple(WORST_SURFACE)  # their names
 IMAGES = {
     "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph, both black outside of the shape"
     " and the photograph outside of its mask, mean over photographs, in decibels. Without masks: over the pixels whose"
@@ -82,7 +75,7 @@ def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evalua
     metrics = surface_scores(mesh, subject, inputs)
     cameras = [shot.camera for shot in subject.held_out]
     blank = [(unseen(camera), torch.zeros(camera.height, camera.width, 3)) for camera in cameras]
-    seen = blank if mesh is None else [mesh_image(mesh, camera) for camera in cameras]
+    seen = blank if mesh is None else [*map(painter(mesh), cameras)]
     metrics |= image_scores([view for view, _ in seen], [image for _, image in seen], subject.held_out)
     failure = (RunStatus.EMPTY, "no surface was found") if mesh is None else None
     return Evaluation(metrics, mesh, failure)

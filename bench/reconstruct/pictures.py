@@ -17,7 +17,7 @@ from bench.pictures.run_figures import draw_curve, normals_image, picture_normal
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.judge import judged_pixels
 from bench.reconstruct.subject import Subject
-from bench.reconstruct.surfaces import mesh_image
+from bench.reconstruct.surfaces import painter
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import View
@@ -46,7 +46,7 @@ def draw_reconstruction(
 
 def draw_surface(folder: Path, inputs: RunInputs, mesh: Mesh, subject: Subject, title: str) -> None:
     """Writes summary.png, input.png and images.npz of a mesh with colours."""
-    _save(folder, lambda camera: mesh_image(mesh, camera), inputs, subject, title)
+    _save(folder, painter(mesh), inputs, subject, title)
 
 
 def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:

@@ -1,6 +1,6 @@
 """Surfaces of photographs without a renderer: depths fused by screened Poisson, and colours from photographs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -101,7 +101,7 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
     return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), GREY))
 
 
-def mesh_image(mesh: Mesh, camera: Camera) -> tuple[View, Float[torch.Tensor, "height width 3"]]:
-    """A mesh's view, and its colours as `bench.evaluate.colours.painted` has them."""
+def painter(mesh: Mesh) -> Callable[[Camera], tuple[View, Float[torch.Tensor, "height width 3"]]]:
+    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.colours.painted` has them."""
     scene = Truth(mesh, closed=False)
-    return see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float()
+    return lambda camera: (see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float())

@@ -15,6 +15,7 @@ from bench.evaluate.finite_differences import (
     image_differences,
 )
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
+from bench.reconstruct.losses import slopes_at
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.problem import check_field_gradient, check_kind
@@ -238,7 +239,7 @@ class Subject:
         rows = rendering.hit.nonzero().squeeze(-1)
         points = rendering.points[rows]
         if len(rows):
-            normals = torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+            normals = slopes_at(field, points)
             colours = Paint(weights)(points, normals)
             for place, row in enumerate(rows.tolist()):
                 for channel in range(3):

@@ -9,7 +9,7 @@ import torch
 from bench.evaluate.colours import GREY, painted
 from bench.reconstruct import surfaces
 from bench.reconstruct.stereo import Cloud
-from bench.reconstruct.surfaces import fused, given_clouds, mesh_image, poisson, with_colours
+from bench.reconstruct.surfaces import fused, given_clouds, painter, poisson, with_colours
 from datasets.mesh import Mesh
 from datasets.truth import Truth
 from tests.reconstruct.test_judge import CENTRE
@@ -167,7 +167,7 @@ def test_a_triangle_is_painted_with_the_colours_between_its_corners():
     weights = weights_of(mesh, camera)
     inside, outside = weights.min(axis=-1) > 1e-4, weights.min(axis=-1) < -1e-4
     assert inside.sum() > 60 and outside.sum() > 200
-    view, image = mesh_image(mesh, camera)
+    view, image = painter(mesh)(camera)
     assert image.shape == (29, 33, 3) and image.dtype == torch.float32
     assert view.mask.numpy()[inside].all() and not view.mask.numpy()[outside].any()
     np.testing.assert_allclose(image.numpy()[inside], (weights @ PAINT)[inside], atol=1e-4)
