@@ -101,9 +101,9 @@ def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
 
 def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
     """Runs a configuration; its record says that it is under way, and at the end how it ended."""
-    record.write(folder)
     started, stopped, tracker = time.perf_counter(), "", None
     try:
+        record.write(folder)  # in here, since a signal may come just after it
         limits = RunLimits(config.time_limit, config.memory_limit)
         tracker = build(config.tracker, "tracker", list(config.packages))
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))

@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 from bench.config import CONF, register
 from bench.records.folder import identify
 from bench.records.read import read_records
+from bench.records.record import Record
 from bench.report.write.html import write_index
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, wait_for
 from tests.run.test_process import CASES
@@ -275,6 +276,22 @@ def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrup
     assert code == 130
     assert "3 planned: 2 not_run, 1 killed" in out
     assert err.strip() == "error: killed: stopped by Ctrl-C; the same command starts it anew"
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_sweep_that_is_stopped_just_after_a_record_is_written_says_so(tmp_path, monkeypatch):
+    write, written = Record.write, []
+
+    def interrupted(record: Record, folder: Path) -> None:
+        write(record, folder)
+        written.append(folder)
+        if len(written) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Record, "write", interrupted)
+    code, out, _ = command("-m", *FAILING, "+renderer.how=not", "seed=0,1,2", f"results_dir={tmp_path}")
+    assert code == 130
+    assert "3 planned: 2 not_run, 1 killed" in out
 
 
 def test_a_cell_that_cannot_be_composed_stops_the_sweep_before_it_starts(isolated, tmp_path):
