@@ -18,6 +18,7 @@ OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired soli
 CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
 SHEET = 0.3  # % of the diagonal: a wrap with less mean thickness is that of a sheet, two offsets thick
 OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
+OCTREE = 9  # depth of the octree of a Poisson reconstruction: cells of a 512th of its box
 
 
 def repair(mesh: Mesh) -> Mesh:
@@ -33,7 +34,8 @@ def repair(mesh: Mesh) -> Mesh:
     if closed is None:
         return _warned(mesh, _wrap_flat(mesh))
     if not closed.watertight:
-        return _warned(mesh, _wrap(closed, "its parts do not close into a solid"))
+        reason = "its parts do not close into a solid"
+        return _warned(mesh, _smoothed(mesh, reason) or _wrap(closed, reason))
     solid = _merge(_turn_outward(closed))
     if solid is None:
         return _warned(mesh, _wrap(closed, "its overlapping parts could not be merged into a solid"))
@@ -149,6 +151,24 @@ def _covers(solid: Mesh, mesh: Mesh) -> bool:
     points, _ = sample_surface(mesh, 5000, seed=0)
     outside = Truth(solid).signed_distance(points) > OUTSIDE_BY * mesh.diagonal
     return bool(outside.mean() <= OUTSIDE_SHARE)
+
+
+def _smoothed(mesh: Mesh, reason: str) -> Mesh | None:
+    """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
+
+    None where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the other, as where faces are
+    not wound consistently or a hole is wide.
+    """
+    meshes = _mesh_set(_apply(mesh, ("meshing_re_orient_faces_coherently", {})))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)
+    found = _current(meshes, mesh)
+    if not (found.watertight and found.volume > 0):
+        return None
+    for near, far in ((mesh, found), (found, mesh)):
+        points, _ = sample_surface(near, 5000, seed=0)
+        if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
+            return None
+    return _with_note(found, f"replaced by its Poisson reconstruction, since {reason}")
 
 
 def _wrap(mesh: Mesh, reason: str) -> Mesh:

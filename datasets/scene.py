@@ -1,7 +1,7 @@
 """A scene: one shape, one camera, and the camera's view of it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, runtime_checkable
 from zlib import crc32
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
+from datasets.range_scans import Scanned
 from datasets.truth import Truth
 from datasets.views import ViewSampler
 from renderers.camera import Camera
@@ -39,12 +40,48 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """A true shape and one view of it; `formula` gives the shape as a field, where it has a formula."""
+    """A true shape and one view of it.
+
+    Args:
+        name: of the dataset and the shape.
+        mesh: the true shape.
+        view: its true images.
+        formula: gives the shape as a field, where it has a formula.
+        measured: camera z that a scanner measured at the view's pixels, 0 where it measured none; None without one.
+    """
 
     name: str
     mesh: Mesh
     view: View
     formula: Callable[[], Field] | None = None
+    measured: Float[Tensor, "height width"] | None = None
+
+    def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
+        """The view whose depths may be given to a task, and the pixels that have one.
+
+        Args:
+            exact: True for the mesh's depths also where a scanner measured others, at the pixels that have both.
+        """
+        if self.measured is None:
+            return self.view, self.view.mask
+        known = self.measured > 0
+        if exact:
+            return self.view, known & self.view.mask
+        return replace(self.view, depth=self.measured, mask=self.view.mask | known), known
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was repaired in the mesh, and how good the measured depths are."""
+        if self.measured is None:
+            return self.mesh.repairs
+        both = self.view.mask & (self.measured > 0)
+        off = (self.measured - self.view.depth)[both].abs()
+        beside = int((self.measured > 0).sum()) - len(off)
+        note = f"measured: {len(off)} of the shape's {int(self.view.mask.sum())} pixels, {beside} beside it"
+        if len(off):
+            half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()
+            note += f"; half of their depths are within {half:.2g} scene units of the mesh, 95 % within {most:.2g}"
+        return (*self.mesh.repairs, note)
 
     def seed(self, seed: int) -> int:
         """A run's seed combined with the scene's name, so that draws for different scenes are independent."""
@@ -63,13 +100,16 @@ class Formulas(Protocol):
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
     """The scene of shape number `index` of a split, with the camera of that number."""
     mesh = dataset.mesh(split, index)
-    view = see(Truth(mesh), views.draw(seed_of(split, index)))
+    scanned = dataset if isinstance(dataset, Scanned) else None
+    camera = views.towards(scanned.towards_scanner(index)) if scanned else views.draw(seed_of(split, index))
+    view = see(Truth(mesh), camera)
     if not bool(view.mask.any()):
         repaired = f" (repaired: {'; '.join(mesh.repairs)})" if mesh.repairs else ""
         what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
         raise BadInput(f"{what}: widen view.field_of_view or distance")
     formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
-    return Scene(scene_name(dataset, split, index), mesh, view, formula)
+    measured = scanned.depths(index, camera) if scanned else None
+    return Scene(scene_name(dataset, split, index), mesh, view, formula, measured)
 
 
 def scene_name(dataset: Dataset, split: Split, index: int) -> str:

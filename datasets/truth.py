@@ -75,6 +75,11 @@ class Truth:
         flat = self._tensor(np.ascontiguousarray(points.reshape(-1, 3)))
         return self._scene.compute_signed_distance(flat, nsamples=5).numpy().reshape(points.shape[:-1])
 
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Gives the distance to the nearest point of the surface, which may be open."""
+        flat = self._tensor(np.ascontiguousarray(points, dtype=np.float32))
+        return self._scene.compute_distance(flat).numpy()
+
     def distance_grid(self, samples: int, reach: float) -> Float[np.ndarray, "n n n"]:
         """Signed distances at evenly spaced points of the cube from -reach to reach, indexed by x, y and z."""
         axis = np.linspace(-reach, reach, samples, dtype=np.float32)

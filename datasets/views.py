@@ -1,7 +1,7 @@
 """Positions of cameras."""
 
 from dataclasses import dataclass
-from math import inf, radians, tan
+from math import asin, atan2, degrees, inf, radians, tan
 
 import numpy as np
 import torch
@@ -10,6 +10,8 @@ from torch import Tensor
 
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_positive
+
+STEEPEST = 89.0  # degrees
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,11 @@ class ViewSampler:
         """Camera number `seed`; its random draws are independent of the shape of the same number."""
         generator = np.random.default_rng([seed, 1])
         return self.camera(generator.uniform(*self.azimuth), generator.uniform(*self.elevation))
+
+    def towards(self, direction: Float[Tensor, "3"]) -> Camera:
+        """The camera in a direction from the origin; straight above or below it stands a degree beside."""
+        x, y, z = torch.nn.functional.normalize(direction, dim=0).tolist()
+        return self.camera(degrees(atan2(x, z)), min(max(degrees(asin(y)), -STEEPEST), STEEPEST))
 
     def camera(self, azimuth: float, elevation: float) -> Camera:
         """The camera at these angles, in degrees."""

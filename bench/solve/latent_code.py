@@ -121,7 +121,7 @@ class CodeProblem:
 
     def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.problem.Problem`."""
-        given = Given(inputs.scene.view, self.observed.cpu().numpy(), self.photographs)
+        given = Given(inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
         draw_run(folder, inputs, (first, self.field()), given, curve, title)
 
     def loss(self, iteration: int) -> Terms:

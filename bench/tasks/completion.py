@@ -18,11 +18,12 @@ from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.problem import OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
 from datasets.observe import observed_pixels, parse_amount
-from datasets.scene import Scene, View
+from datasets.scene import Scene
 from renderers.checks import check_at_least, check_choice
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
+MEASURED, EXACT = "measured", "exact"
 HELD_OUT, TILES = 0.2, 4  # share of the observations that is held out; tiles of the view along each side
 
 
@@ -32,6 +33,7 @@ class Completion:
 
     Args:
         points: amount of depth that is given; see `datasets.observe.observed_pixels`. Dense depth implies the mask.
+        depths: "measured", those of a scanner where the dataset has one; "exact", those of the mesh at the same pixels.
         mask: whether the silhouette is given.
         depth_loss: over pixels that are observed and hit, the mean of "depth", the error of the camera's depth (DIST,
             B.3), or of "points", the distance in space between the points (DVR's official code).
@@ -43,6 +45,7 @@ class Completion:
     """
 
     points: str
+    depths: str
     mask: bool
     depth_loss: str
     depth_weight: float
@@ -55,6 +58,7 @@ class Completion:
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
+        check_choice("task.depths", self.depths, (MEASURED, EXACT))
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
@@ -69,25 +73,26 @@ class Completion:
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape."""
         check_field_gradient(renderer)
-        given, observed = self._given(scene.view, renderer, seed=seed, device=device)
+        given, observed = self._given(scene, renderer, seed=seed, device=device)
         return CodeProblem(prior, self.code, given.compare, observed, observed.numel(), device)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[Observations, Given]:
         """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
-        view, observed = self._given(scene.view, renderer, seed=seed, device=device)
+        view, observed = self._given(scene, renderer, seed=seed, device=device)
         camera, (rows, columns) = scene.view.camera, observed.shape
         tile = (torch.arange(rows) * TILES // rows)[:, None] * TILES + torch.arange(columns) * TILES // columns
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         split = Holdout(HELD_OUT, (), half_pixel, seed)
         held = hold_out(together([view]), tile.flatten(), split, rays=observed.numel())
-        return held, Given(scene.view, observed.numpy(), mask=view.mask is not None)
+        return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
     def _given(
-        self, view: View, renderer: Renderer, *, seed: int, device: torch.device
+        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[GivenView, Bool[Tensor, "height width"]]:
-        """The given part of a view, and the pixels whose depth is given."""
-        observed = observed_pixels(view.mask, self.points, seed)
+        """The given part of a scene's view, and the pixels whose depth is given."""
+        view, known = scene.given(exact=self.depths == EXACT)
+        observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
         return GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device), observed

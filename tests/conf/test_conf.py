@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import pytest
 import trimesh
@@ -18,6 +17,7 @@ from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
+from tests.made_scans import write_scans
 
 IDR_ARGUMENTS = {
     "steps": 7,
@@ -40,7 +40,6 @@ COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
 CHOSEN = {"renderer", "dataset", "stress", "method", "silhouette"}  # groups that experiments sweep over
-ASKED = {"photos": [f"dataset.path={CONF}"]}  # by experiments: any folder
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 # What a choice needs on the command line.
 NEEDS = {
@@ -48,6 +47,14 @@ NEEDS = {
     "stability": ("stress=wires",),
     **{name: ("draw=0",) for _, name in NESTED if name.startswith("space/")},
 }
+
+
+@pytest.fixture(scope="session")
+def paths(tmp_path_factory) -> dict[str, str]:
+    """What the datasets of files need as `dataset.path`."""
+    mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
+    trimesh.creation.box().export(mesh)
+    return {"mesh": str(mesh), "photos": str(mesh.parent), "scans": str(write_scans(scans))}
 
 
 @cache
@@ -81,13 +88,6 @@ SWEEPS = [
 ]
 
 
-@pytest.fixture
-def mesh_path(tmp_path) -> str:
-    path = tmp_path / "ball.ply"
-    trimesh.creation.icosphere(subdivisions=2).export(path)
-    return str(path)
-
-
 def build_part(config: DictConfig, part: str):
     return build(config[part], part, list(config.packages), TARGETS.get(part, ""))
 
@@ -119,9 +119,8 @@ def test_the_default_configuration_builds(compose_config):
 
 # The cells of the stability experiment are of all stresses but `none`.
 @pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in GROUPS if ("stability", f"{g}={n}") not in SWEEPS])
-def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name):
-    local = {"mesh": mesh_path, "photos": str(Path(mesh_path).parent)} if group == "dataset" else {}
-    extra = [f"dataset.path={local[name]}"] if name in local else NEEDS.get(name, [])
+def test_every_choice_composes_and_builds(compose_config, paths, group, name):
+    extra = [f"dataset.path={paths[name]}"] if group == "dataset" and name in paths else NEEDS.get(name, [])
     new = "+" if group == "method" else ""  # none is chosen by default
     config = compose_config(f"{new}{group}={name}", *extra)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -133,8 +132,9 @@ def test_every_choice_composes_and_builds(compose_config, mesh_path, group, name
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
-    for extra in (ASKED.get(name, []), ["scale=paper", "dataset=mesh", f"dataset.path={mesh_path}"]):
+def test_every_experiment_composes_and_builds(compose_config, paths, name):
+    asked = [f"dataset.path={paths[name]}"] if name in paths else []
+    for extra in (asked, ["scale=paper", "dataset=mesh", f"dataset.path={paths['mesh']}"]):
         config = compose_config(f"+experiment={name}", *extra)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         for part in PARTS:
@@ -143,13 +143,14 @@ def test_every_experiment_composes_and_builds(compose_config, mesh_path, name):
 
 
 @pytest.mark.parametrize(("name", "swept"), SWEEPS)
-def test_every_cell_of_an_experiment_composes_and_builds(compose_config, name, swept):
+def test_every_cell_of_an_experiment_composes_and_builds(compose_config, paths, name, swept):
     rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
     method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
     draw = [f"draw={rows['draw']}"] if "draw" in rows else []
     key, _, value = swept.removeprefix("+").partition("=")
     chosen = [swept] if key in CHOSEN else []
-    config = compose_config(*method, *draw, *chosen, f"+experiment={name}", *ASKED.get(name, []))
+    asked = [f"dataset.path={paths[name]}"] if name in paths else []
+    config = compose_config(*method, *draw, *chosen, f"+experiment={name}", *asked)
     if key not in CHOSEN:  # a value of a key that is there, which is cheaper to set than to compose
         OmegaConf.update(config, key, yaml.safe_load(value), force_add=False)
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)

@@ -202,6 +202,25 @@ def test_a_sheet_is_wrapped_closely_with_a_note(height, reason):
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 0.005
 
 
+def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
+    """A ball with two faces joined by a tube that crosses over, so that the surface has one side only."""
+    one, other = ball.faces[first], ball.faces[second]
+    sides = [(one[i], one[i - 2], other[i - 2], other[i]) for i in range(3)]
+    tube = [corner for a, b, c, d in sides for corner in ([a, b, c], [a, c, d])]
+    return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
+
+
+def test_a_scan_with_a_tangle_keeps_its_surface():
+    ball = trimesh.creation.icosphere(5)
+    near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
+    mesh = repair(handled(ball, 0, near))
+    assert mesh.watertight
+    assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
+    points, _ = sample_surface(mesh, 2000, seed=0)
+    assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.01
+    assert mesh.volume == pytest.approx(ball.volume, rel=1e-3)
+
+
 def walls() -> Mesh:
     """Six sides of a box that do not touch."""
     sides = box().triangles + 0.02 * box().face_normals[:, None]

@@ -73,3 +73,9 @@ def test_samples_follow_the_seed(box):
     assert sample_surface(box, 0, seed=1)[0].shape == (0, 3)
     with pytest.raises(ValueError, match="count: must be 0 or more, found -1"):
         sample_surface(box, -1, seed=0)
+
+
+def test_the_distance_to_an_open_mesh_has_no_sign():
+    square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    found = Truth(square, closed=False).distance(np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [2.0, 0.5, 0.0]]))
+    assert found == pytest.approx([0.3, 0.3, 1.0], abs=1e-6)

@@ -115,3 +115,16 @@ def test_the_view_of_a_shape_is_not_drawn_as_the_shape_is():
         shares.append((atan2(x, z) / (2 * pi)) % 1)
     shapes = [np.random.default_rng(seed).random() for seed in range(40)]
     assert abs(np.corrcoef(shares, shapes)[0, 1]) < 0.5
+
+
+@pytest.mark.parametrize("direction", [(0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0)])
+def test_the_camera_towards_a_direction_stands_in_it(direction):
+    camera = VIEWS.towards(torch.tensor(direction))
+    expected = 2.5 * np.array(direction) / np.linalg.norm(direction)
+    assert camera.center.numpy() == pytest.approx(expected, abs=1e-5)
+    assert project(camera, (0.0, 0.0, 0.0)) == pytest.approx([16.5, 16.5], abs=1e-4)
+
+
+def test_the_camera_straight_above_stands_a_degree_beside():
+    above = VIEWS.towards(torch.tensor([0.0, 1.0, 0.0])).center.numpy()
+    assert above == pytest.approx([0.0, 2.5 * cos(pi / 180), 2.5 * sin(pi / 180)], abs=1e-5)

@@ -26,6 +26,7 @@ from tests.tiny import altered
 CPU = torch.device("cpu")
 SETTINGS = Completion(
     points="dense",
+    depths="measured",
     mask=True,
     depth_loss="depth",
     depth_weight=10.0,
