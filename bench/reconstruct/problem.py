@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.evaluate.colours import colours_at
@@ -16,7 +16,7 @@ from bench.reconstruct.judge import judge, mesh_scores, surface_scores
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.models import Learnt
 from bench.reconstruct.pictures import draw_reconstruction
-from bench.reconstruct.pixels import Stack
+from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
 from bench.setup.inputs import RunInputs
 from bench.solve.latent_code import Terms
@@ -119,15 +119,19 @@ class ReconstructionProblem:
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
 
     def objective(self) -> float:
-        """The mean difference of colours over the same given pixels, black outside of the shape and of masks.
+        """The mean difference of colours over the same given pixels.
 
         The loss itself compares what is hit: it falls where a surface is lost.
         """
-        pixels, shape = self.stack.drawn(COMPARED, patches=False, seed=self.seed), self.field()
+        return float(self.colour_errors(self.stack.drawn(COMPARED, patches=False, seed=self.seed)).mean())
+
+    def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
+        """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""
+        shape = self.field()
         with torch.no_grad():
             rendering = rendered(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
         true = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
         found = torch.zeros_like(true)
         at, towards = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
         found[rendering.hit] = colours_at(shape, at, towards, at.device).to(true)
-        return float((found - true).abs().mean())
+        return (found - true).abs().mean(dim=-1)

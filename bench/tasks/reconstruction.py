@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
+
+from bench.reconstruct.choice import DEFINITIONS, AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.models import Appearance
@@ -18,8 +21,9 @@ from bench.reconstruct.subject import (
     given_distances,
     hull_distances,
 )
+from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
-from bench.solve.problem import OptimiserSettings, check_field_gradient
+from bench.solve.problem import OptimiserSettings, check_field_gradient, check_kind
 from bench.solve.solve import solve
 from datasets.photographs import Photography
 from renderers.checks import check_at_least, check_choice
@@ -44,6 +48,7 @@ class Reconstruction:
             Sec. 3.4): "none", "given" depths, or where rays meet the visual "hull", and given depths before these.
         rays: pixels that are drawn in each iteration.
         appearance: of the field, beside its size.
+        auto: the fields that `field=auto` tries, and how.
         losses: of the renderings.
         optimiser: iterations and learning rates.
     """
@@ -56,6 +61,7 @@ class Reconstruction:
     guide: str
     rays: int
     appearance: Appearance
+    auto: AutoField
     losses: Losses
     optimiser: OptimiserSettings
 
@@ -71,19 +77,32 @@ class Reconstruction:
 
     def execute(self, run: RunContext) -> None:
         """Learns the field, and judges it before and after."""
-        definitions = COLOURED_DEFINITIONS | UNCOUNTED
+        name, inputs = run.inputs.field.name, run.inputs
+        check_field_gradient(inputs.renderer)
+        if name != AUTO:  # told before photographs are read
+            with torch.random.fork_rng():
+                check_kind(inputs.renderer, self.appearance.make(name).field)
+        definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = find_subject(
-            self.images, self.depths, run.inputs, longest=self.longest, every=self.held_out, masks=self.masks
+            self.images, self.depths, inputs, longest=self.longest, every=self.held_out, masks=self.masks
         )
         run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
-        solve(lambda: self.problem(subject, run), self.optimiser, run, definitions)
+        if name != AUTO:
+            solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
+            return
+        with torch.random.fork_rng():  # so that the run is that of the field which it ends on
+            choice = self.auto.choose(lambda n, part: self.problem(n, part, run), subject, self.optimiser, run)
+        run.record.notes.append(choice.note)
+        solve(lambda: self.problem(choice.kept.name, subject, run), self.optimiser, run, definitions)
+        seconds = run.record.seconds
+        run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
+        seconds["trials"] = choice.seconds
 
-    def problem(self, subject: Subject, run: RunContext) -> ReconstructionProblem:
-        """The problem of photographs."""
+    def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
+        """The problem of photographs with the field of a name."""
         inputs = run.inputs
-        check_field_gradient(inputs.renderer)
-        model = self.appearance.make(inputs.field.name).to(inputs.device)
+        model = self.appearance.make(name).to(inputs.device)
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
         stack = Stack.of(subject.given, guide and guide(subject.given), inputs.device)
         iterations = self.optimiser.iterations

@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from bench.config import load
+from bench.reconstruct.choice import AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.models import Appearance
@@ -39,6 +40,7 @@ SETTINGS = Reconstruction(
     guide="none",
     rays=192,
     appearance=Appearance(octaves=2, directional=False, radius=0.5),
+    auto=AutoField(candidates=("network_2x16", "network_1x8"), trial=0.2, patience=1),
     losses=Losses(
         colour=1.0, colour_gradient=0.0, depth=1.0, depth_loss="depth", silhouette=Own(), silhouette_weight=0.3,
         smoothness=0.0, normals=0.0, eikonal=0.3,
@@ -151,7 +153,7 @@ def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
     run = run_in(tmp_path, scene, renderer="dvr", field="occupancy_16")
     for guide, known in (("none", None), ("hull", True), ("given", True)):
         settings = replace(SETTINGS, guide=guide, depths=Depths("dense", 0.0))
-        problem = settings.problem(_subject(settings, run), run)
+        problem = settings.problem(run.inputs.field.name, _subject(settings, run), run)
         found = problem.stack.pixels.guide
         assert (found is None) == (known is None)
         assert found is None or 0.05 < found.isfinite().float().mean() < 0.6
@@ -170,7 +172,7 @@ def test_the_same_seed_gives_the_same_result(scene, tmp_path):
     for seed in (0, 0, 1):
         run = run_in(tmp_path, scene, seed=seed)
         settings = replace(SETTINGS, optimiser=OptimiserSettings(4, 0.02, "constant"))
-        problem = settings.problem(_subject(settings, run), run)
+        problem = settings.problem(run.inputs.field.name, _subject(settings, run), run)
         torch.manual_seed(0)
         totals.append([problem.loss(iteration)["total"].item() for iteration in range(2)])
     assert totals[0] == totals[1] and totals[0] != totals[2] and totals[0][0] != totals[0][1]
@@ -188,11 +190,33 @@ def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
         executed(run)
 
 
-@pytest.mark.parametrize("field", ["union_3", "prior", "auto", "sphere"])
+@pytest.mark.parametrize("field", ["union_3", "prior", "sphere"])
 def test_a_field_without_colours_is_told(scene, tmp_path, field):
-    words = f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
+    words = (
+        f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH, grid_N or auto"
+    )
     with pytest.raises(BadInput, match=words):
         executed(run_in(tmp_path, scene, field=field))
+
+
+def folder(parent: Path, name: str) -> Path:
+    (parent / name).mkdir()
+    return parent / name
+
+
+def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
+    run = without_pictures(run_in(folder(tmp_path, "auto"), scene, field="auto"))
+    record = executed(run)
+    assert record.status == "ok", record.reason
+    name = record.metrics["field"]
+    assert name in ("network_1x8", "network_2x16") and record.metrics["fields_tried"] == 2
+    assert any(note.startswith(f"field=auto: {name}, ") for note in record.notes)
+    assert record.seconds["trials"] > 0 and record.metrics["field_overhead"] > 1
+    known = {part for key in record.definitions for part in key.split(", ")}
+    assert set(record.metrics) <= known
+    named = executed(without_pictures(run_in(folder(tmp_path, "named"), scene, field=name)))
+    assert named.metrics["psnr"] == record.metrics["psnr"]
+    assert named.evaluations == record.evaluations
 
 
 def test_depths_of_photographs_on_disk_are_refused(tmp_path):
