@@ -14,10 +14,12 @@ from bench.evaluate.evaluate import mask_iou
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from datasets.captures.capture import AXES, Capture, read_capture
 from datasets.captures.hull import hull_mesh, hull_views
+from renderers.camera import sphere_span
 
 MOST = 8  # photographs in the picture
 SAMPLES = 96  # of the hull, per axis
 GOOD, DOUBTFUL = 0.9, 0.8  # overlap of hull and masks: above the first cameras are right, below the second hardly
+OUTLINE = "#e5007d"
 NAMED = 5  # photographs that fit worst
 
 
@@ -55,17 +57,20 @@ class Fit:
 
 @rc_context(SCREEN)
 def draw(capture: Capture, fit: Fit | None) -> Figure:
-    """Photographs, evenly spaced and the one that fits worst, with the hull's silhouette over the masks below."""
+    """Photographs, evenly spaced and the one that fits worst, with the unit sphere; the hull over the masks below."""
     chosen = np.linspace(0, len(capture.shots) - 1, min(MOST, len(capture.shots))).round().astype(int)
     if fit is not None and (worst := int(np.argmin(fit.overlaps))) not in chosen:
         chosen[np.abs(chosen - worst).argmin()] = worst
     shots = [capture.shots[place] for place in chosen]
     figure = Figure(figsize=(1.6 * len(shots), 2.0 if fit is None else 3.6), layout="constrained")
     axes = figure.subplots(1 if fit is None else 2, len(shots), squeeze=False)
-    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs")
+    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs; the line is the unit sphere")
     for axis, shot in zip(axes[0], shots, strict=True):
         bare(axis).imshow(shot.colours.numpy())
         axis.set_title(Path(shot.name).stem)
+        within = sphere_span(shot.camera.rays())[2].numpy()
+        if within.any() and not within.all():
+            axis.contour(within, [0.5], colors=OUTLINE, linewidths=0.8)
     if fit is not None:
         for axis, place in zip(axes[1], chosen, strict=True):
             picture = silhouette_image(fit.silhouettes[place], np.asarray(capture.shots[place].mask))
