@@ -85,6 +85,7 @@ class Config:
     dataset: Any = MISSING
     stress: Any = MISSING
     silhouette: Any = MISSING
+    supervision: Any = MISSING
     prior: Any = MISSING
     scale: Any = MISSING
     tracker: Any = MISSING
@@ -132,9 +133,11 @@ def check_names(config: DictConfig) -> None:
         *task,
         *task.get("fit", {}),
         *task.get("losses", {}),
+        *(task.get("supervision") or {}).get("losses", {}),
     }:
         raise ValueError(
-            "silhouette is read by task=completion, pose, capacity, stability and reconstruction alone: leave it out"
+            "silhouette is read by task=completion, pose, capacity, stability, reconstruction and single_view alone: "
+            "leave it out"
         )
 
 

@@ -1,5 +1,6 @@
 """Colour images of a textured mesh from cameras all around it, with noise, blur and exposure of a real camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,9 +68,12 @@ class Photography:
         Raises:
             ValueError: where a camera sees nothing of it, or all colours of its surface are alike.
         """
+        return self.take_from(truth, (around if self.places == "sphere" else circle)(first, self.views), seed=seed)
+
+    def take_from(self, truth: Truth, cameras: Sequence[Camera], *, seed: int) -> list[Shot]:
+        """The photographs of a mesh from given cameras; see `take`."""
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
-        cameras = around(first, self.views) if self.places == "sphere" else circle(first, self.views)
         taken = [self._take_one(str(index), truth, texture, camera, generator) for index, camera in enumerate(cameras)]
         for shot in taken:
             if shot.mask is None or not bool(shot.mask.any()):

@@ -45,6 +45,7 @@ class RunInputs:
     device: torch.device
     cache: Path  # folder of priors and references
     field: FieldChoice  # what an unknown shape is made of
+    dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
     photographed: Photographed | None = None  # the dataset, where it has photographs and no true shape
@@ -137,6 +138,7 @@ def set_up(config: DictConfig, progress: Report) -> RunInputs:
         device=device,
         cache=cache,
         field=FieldChoice(config.field, build(config.models, "models", target="bench.setup.fields.ModelSettings")),
+        dataset=dataset,
         notes=tuple(notes),
         photographed=dataset if isinstance(dataset, Photographed) else None,
         trained=trained,

@@ -152,31 +152,38 @@ class ColouredOccupancy(nn.Module):
         super().__init__()
         check_positive("radius", radius, "0.5 lies within most objects")
         self.network = OccupancyNetwork(width=width, code_length=0)
-        with torch.no_grad():
-            half = torch.randn(width - width // 2, 3)
-            self.network.first.weight.copy_(torch.cat([half, -half])[:width])
-            self.network.first.bias.zero_()
-            for block in self.network.blocks:
-                block.outer.weight.zero_()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
-                block.outer.bias.zero_()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
-            head = self.network.occupancy_head
-            head.weight.fill_(-1.0)
-            head.bias.zero_()
-            around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
-            head.weight.mul_(radius / LOGIT_WIDTH / self.field(around).mean())
-            head.bias.fill_(radius / LOGIT_WIDTH)
+        begin_as_sphere(self.network, radius)
 
     @property
     def field(self) -> "OccupancyOf":
         """The level set at the current weights."""
-        return OccupancyOf(self.network)
+        return OccupancyOf(self.network.at(self.network.first.weight.new_empty(0)))
+
+
+@torch.no_grad()
+def begin_as_sphere(network: OccupancyNetwork, radius: float) -> None:
+    """Sets the weights so that the shape is a sphere whatever the code; see `ColouredOccupancy`."""
+    width = network.width
+    half = torch.randn(width - width // 2, 3)
+    network.first.weight.copy_(torch.cat([half, -half])[:width])
+    network.first.bias.zero_()
+    for added in (*network.shifts, *(block.outer for block in network.blocks)):
+        for weights in added.parameters():  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+            weights.zero_()
+    head = network.occupancy_head
+    head.weight.fill_(-1.0)
+    head.bias.zero_()
+    around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
+    shape = OccupancyOf(network.at(head.weight.new_zeros(network.code_length)))
+    head.weight.mul_(radius / LOGIT_WIDTH / shape(around).mean())
+    head.bias.fill_(radius / LOGIT_WIDTH)
 
 
 @dataclass(frozen=True)
 class OccupancyOf:
-    """The level set p = 1/2 of an occupancy network of one shape (DVR, Sec. 3.1)."""
+    """The level set p = 1/2 of an occupancy network at one code (DVR, Sec. 3.1)."""
 
-    network: OccupancyNetwork
+    bound: BoundOccupancy
 
     kind: ClassVar[Kind] = Kind.LEVEL
     lipschitz: ClassVar[None] = None
@@ -184,18 +191,24 @@ class OccupancyOf:
     @property
     def flops(self) -> Flops:
         """See `BoundOccupancy`."""
-        return self._bound.flops
+        return self.bound.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return occupancy_field(self._bound.logits, THRESHOLD)(points)
+        return occupancy_field(self.bound.logits, THRESHOLD)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
-        return self._bound.colours(points)
+        return self.bound.colours(points)
 
-    @property
-    def _bound(self) -> BoundOccupancy:
-        return self.network.at(self.network.first.weight.new_empty(0))
+
+@dataclass(frozen=True)
+class ScaledOccupancyOf(OccupancyOf):
+    """The same network read as a distance, for renderers of distances: an eikonal term makes it one."""
+
+    kind: ClassVar[Kind] = Kind.DISTANCE
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return -LOGIT_WIDTH * self.bound.logits(points)
 
 
 class ColouredGrid(nn.Module):

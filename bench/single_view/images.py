@@ -1,0 +1,153 @@
+"""Images of many shapes from random views, with masks and depths: made once for a dataset, then read from a file."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from bench.progress import Report
+from bench.reconstruct.pixels import Pixels
+from bench.records.files import digest, file_lock
+from datasets.dataset import Dataset, Split, seed_of
+from datasets.photographs import Photography
+from datasets.truth import Truth, sample_surface
+from datasets.views import ViewSampler
+from renderers.camera import Camera, sphere_span
+
+VERSION = 1  # raise it when the images or points change, so that no file of the old ones is used
+POINTS = 8192  # of known occupancy per shape: half in the cube, half near the surface
+NEAR = 0.05  # scene units: standard deviation of the latter from the surface
+CUBE = 1.0  # half the side of the cube
+
+
+@dataclass(frozen=True)
+class ImagesOf:
+    """Images of one shape.
+
+    Args:
+        cameras: of each image.
+        colours: 0 to 255.
+        masks: true on the shape.
+        depths: camera z, in scene units; 0 on the background.
+        points: in space.
+        inside: whether each lies in the shape.
+    """
+
+    cameras: tuple[Camera, ...]
+    colours: UInt8[Tensor, "views height width 3"]
+    masks: Bool[Tensor, "views height width"]
+    depths: Float[Tensor, "views height width"]
+    points: Float[Tensor, "points 3"]
+    inside: Bool[Tensor, " points"]
+
+    def image(self, view: int) -> Float[Tensor, "3 height width"]:
+        """An image as encoders take it, from 0 to 1."""
+        return as_input(self.colours[view].float() / 255)
+
+    def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
+        """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth."""
+        camera = self.cameras[view]
+        rays = camera.rays().flat()
+        meets = sphere_span(rays)[2].nonzero().squeeze(-1)
+        chosen = meets[torch.randint(len(meets), (count,), generator=generator)]
+        at_one = camera.depth(torch.ones(camera.height, camera.width)).flatten()[chosen]
+        mask, depth = self.masks[view].flatten()[chosen], self.depths[view].flatten()[chosen]
+        return Pixels(
+            rays[chosen].to(device),
+            (self.colours[view].reshape(-1, 3)[chosen].float() / 255).to(device),
+            at_one.to(device),
+            mask.to(device),
+            torch.where(mask, depth / at_one, torch.nan).to(device),
+            None,
+            None,
+        )
+
+
+def as_input(colours: Float[Tensor, "height width 3"]) -> Float[Tensor, "3 height width"]:
+    """An image in the order of axes that encoders take."""
+    return colours.permute(2, 0, 1).contiguous()
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """How images are made.
+
+    Args:
+        photography: texture, light, noise.
+        sampler: of the cameras.
+    """
+
+    photography: Photography
+    sampler: ViewSampler
+
+    def images(self, dataset: Dataset, split: Split, count: int, cache: Path, progress: Report) -> list[ImagesOf]:
+        """The images of the first `count` shapes of a split, from `cache` where they were made before."""
+        settings = {"dataset": dataset.identity(), "split": split, "count": count, "version": VERSION}
+        key = digest({**settings, "photography": asdict(self.photography), "sampler": asdict(self.sampler)})
+        path = cache / f"images-{dataset.name}-{split}-{key}.safetensors"
+        with file_lock(cache, path.stem):
+            tensors = _read(path)
+            if tensors is None:
+                made = []
+                for index in range(count):
+                    progress("rendering images", index, count)
+                    made.append(self.of_shape(dataset, split, index))
+                progress("rendering images", count, count)
+                tensors = _packed(made)
+                save_file(tensors, path)
+        return _unpacked(tensors)
+
+    def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:
+        """The images of one shape, from cameras and with a texture of its own."""
+        truth, mesh, seed = (made := dataset.mesh(split, index)) and Truth(made), made, seed_of(split, index)
+        cameras = [self.sampler.draw(seed * self.photography.views + view) for view in range(self.photography.views)]
+        shots = self.photography.take_from(truth, cameras, seed=seed)
+        points = _points(mesh, seed)
+        return ImagesOf(
+            tuple(cameras),
+            torch.stack([(255 * shot.colours).round().to(torch.uint8) for shot in shots]),
+            torch.stack([shot.mask for shot in shots if shot.mask is not None]),
+            torch.stack([shot.depth for shot in shots if shot.depth is not None]),
+            torch.from_numpy(points).float(),
+            torch.from_numpy(truth.signed_distance(points) < 0),
+        )
+
+    def resized(self, pixels: int) -> "Imaging":
+        """The same with images of another size."""
+        return replace(self, sampler=replace(self.sampler, resolution=pixels))
+
+
+def _points(mesh, seed: int) -> Float[np.ndarray, "points 3"]:
+    draw = np.random.default_rng([seed, 3])
+    near = sample_surface(mesh, POINTS // 2, seed)[0] + NEAR * draw.standard_normal((POINTS // 2, 3))
+    return np.concatenate([draw.uniform(-CUBE, CUBE, (POINTS - len(near), 3)), near])
+
+
+def _read(path: Path) -> dict[str, Tensor] | None:
+    try:
+        return load_file(path) if path.exists() else None
+    except (SafetensorError, OSError):
+        return None  # cut short when the disk was full: made again
+
+
+def _packed(made: Sequence[ImagesOf]) -> dict[str, Tensor]:
+    names = ("colours", "masks", "depths", "points", "inside")
+    tensors = {name: torch.stack([getattr(one, name) for one in made]) for name in names}
+    tensors["motions"] = torch.stack([torch.stack([c.world_to_camera for c in one.cameras]) for one in made])
+    return tensors | {"intrinsics": made[0].cameras[0].intrinsics}
+
+
+def _unpacked(tensors: dict[str, Tensor]) -> list[ImagesOf]:
+    parts = [tensors[name] for name in ("motions", "colours", "masks", "depths", "points", "inside")]
+    found = []
+    for motions, colours, *others in zip(*parts, strict=True):
+        height, width = colours.shape[1:3]
+        cameras = tuple(Camera(tensors["intrinsics"], motion, height, width) for motion in motions)
+        found.append(ImagesOf(cameras, colours, *others))
+    return found

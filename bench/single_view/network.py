@@ -1,0 +1,94 @@
+"""From an image to a code, and from a code to a shape with colours (DVR, Secs. 3.1, 3.5)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.fields.coloured import OccupancyOf, ScaledOccupancyOf, begin_as_sphere
+from renderers.fields.occupancy import OccupancyNetwork
+
+OCCUPANCY, DISTANCE = "occupancy", "distance"
+READINGS = {OCCUPANCY: OccupancyOf, DISTANCE: ScaledOccupancyOf}
+GROUPS = 8  # of channels that are normalised together
+
+
+@dataclass(frozen=True)
+class SingleViewNetwork:
+    """The sizes of a `SingleView`.
+
+    Args:
+        channels: of each stage of the encoder, a multiple of 8.
+        blocks: residual blocks in each stage.
+        code_length: numbers in a code.
+        width: of the decoder.
+        reads: its values as "occupancy", for DVR, or as "distance", for every renderer.
+        radius: of the sphere that all shapes begin as, in scene units.
+    """
+
+    channels: tuple[int, ...]
+    blocks: int
+    code_length: int
+    width: int
+    reads: str
+    radius: float
+
+    def __post_init__(self) -> None:
+        check_at_least("the length of task.network.channels", len(self.channels), 1, "[16, 32, 64, 128]")
+        if any(count < GROUPS or count % GROUPS for count in self.channels):
+            raise ValueError(f"task.network.channels must be multiples of {GROUPS}, not {list(self.channels)}")
+        for name in ("blocks", "code_length", "width"):
+            check_at_least(f"task.network.{name}", getattr(self, name), 1, "conf/scale has values that work")
+        check_choice("task.network.reads", self.reads, tuple(READINGS))
+        check_positive("task.network.radius", self.radius, "0.5 lies within most objects")
+
+
+class SingleView(nn.Module):
+    """An encoder of images and a decoder of codes.
+
+    Source: DVR (Niemeyer et al. 2020), Sec. 3.5: a ResNet-18 whose last layer gives a code of 256, and the network of
+        `OccupancyNetwork`.
+    Deviates: the ResNet is not trained before; groups of channels are normalised, not batches, since a step has few
+        images; at desk it has one block in each of four narrow stages; the shape begins as a sphere.
+    """
+
+    def __init__(self, settings: SingleViewNetwork) -> None:
+        super().__init__()
+        self.settings = settings
+        stages: list[nn.Module] = [nn.Conv2d(3, settings.channels[0], 7, stride=2, padding=3, bias=False)]
+        previous = settings.channels[0]
+        for place, channels in enumerate(settings.channels):
+            for block in range(settings.blocks):
+                stride = 2 if place and not block else 1
+                stages.append(_Residual(previous, channels, stride))
+                previous = channels
+        self.stages = nn.Sequential(*stages, nn.ReLU())
+        self.code = nn.Linear(previous, settings.code_length)
+        self.decoder = OccupancyNetwork(width=settings.width, code_length=settings.code_length)
+        begin_as_sphere(self.decoder, settings.radius)
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch code_length"]:
+        """The codes of images with colours from 0 to 1."""
+        return self.code(self.stages(2 * images - 1).mean(dim=(-2, -1)))
+
+    def at(self, code: Float[Tensor, " code_length"]) -> OccupancyOf:
+        """The shape of a code, with colours."""
+        return READINGS[self.settings.reads](self.decoder.at(code))
+
+
+class _Residual(nn.Module):
+    """Two convolutions with a skip connection around them, normalised before (He et al. 2016)."""
+
+    def __init__(self, before: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self.first_norm, self.second_norm = nn.GroupNorm(GROUPS, before), nn.GroupNorm(GROUPS, channels)
+        self.first = nn.Conv2d(before, channels, 3, stride=stride, padding=1, bias=False)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        same = before == channels and stride == 1
+        self.skip = nn.Identity() if same else nn.Conv2d(before, channels, 1, stride=stride, bias=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        active = torch.relu(self.first_norm(features))
+        return self.skip(features) + self.second(torch.relu(self.second_norm(self.first(active))))

@@ -1,0 +1,152 @@
+"""Networks on disk: found by what determines their training, or trained, with a record of it."""
+
+import json
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from bench.machine.environment import describe
+from bench.progress import Report
+from bench.records.files import digest, file_lock, to_json, write_text
+from bench.shape_prior.store import SHIPPED
+from bench.single_view.images import ImagesOf, Imaging
+from bench.single_view.network import SingleView, SingleViewNetwork
+from bench.single_view.training import Course, Failed, Supervision, TrainingSettings, train
+from datasets.dataset import Dataset, Split
+from renderers.checks import BadInput
+from renderers.rendering import Renderer
+
+VERSION = 1  # raise it when training changes, so that no network of the old training is used
+VALIDATION = 8  # shapes on which a new network is evaluated, from their first images
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What determines a network.
+
+    Args:
+        dataset: of its shapes.
+        imaging: of their images.
+        network: its sizes.
+        supervision: what it may know.
+        training: of it.
+        renderer: through which it is trained.
+        settings: all of these as plain data.
+    """
+
+    dataset: Dataset
+    imaging: Imaging
+    network: SingleViewNetwork
+    supervision: Supervision
+    training: TrainingSettings
+    renderer: Renderer
+    settings: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """A hash of what determines the weights."""
+        return digest({"version": VERSION, "dataset": self.dataset.identity(), "settings": self.settings})
+
+    @property
+    def stem(self) -> str:
+        """The name of the network's files, without suffix."""
+        return f"single_view-{self.dataset.name}-{self.key}"
+
+    def find(self, cache: Path) -> Path | None:
+        """The network's file: shipped, or in `cache`; None where it was not trained yet."""
+        found = [folder / f"{self.stem}.safetensors" for folder in (SHIPPED, cache)]
+        return next((path for path in found if path.exists()), None)
+
+    def load(self, path: Path) -> tuple[SingleView, dict[str, Any]]:
+        """The network of a file, and the record of its training.
+
+        Raises:
+            BadInput: where one of its files is missing or cannot be read.
+        """
+        try:
+            model = SingleView(self.network)
+            model.load_state_dict(load_file(path))
+            record = json.loads(path.with_suffix(".json").read_text())
+        except (SafetensorError, OSError, RuntimeError, ValueError) as error:
+            what = " ".join(str(error).split())[:160]
+            raise BadInput(f"the network {path} cannot be read ({what}): delete it, and train it again") from error
+        return model.eval().requires_grad_(False), record
+
+    def make(self, cache: Path, device: torch.device, progress: Report) -> Path:
+        """Trains the network, or goes on with a training that was stopped; gives its file.
+
+        Raises:
+            Failed: where the loss is not a number; the record says so, and the last good state stays.
+        """
+        cache.mkdir(parents=True, exist_ok=True)
+        with file_lock(cache, self.stem):
+            if (found := self.find(cache)) is not None:
+                return found
+            path = cache / f"{self.stem}.safetensors"
+            started = time.perf_counter()
+            images = self.imaging.images(self.dataset, Split.TRAIN, self.training.shapes, cache, progress)
+            made = time.perf_counter() - started
+            state = path.with_suffix(".state")
+            try:
+                model, course = train(
+                    images, self.network, self.supervision, self.renderer, self.training, state, device, progress
+                )
+            except Failed as error:
+                self._write(path, {"status": "nan", "reason": str(error)}, device)
+                raise
+            with torch.no_grad():
+                mean = torch.stack([model(_inputs(one, device)).mean(dim=0) for one in images]).mean(dim=0)
+            unseen = self.imaging.images(self.dataset, Split.VALIDATION, VALIDATION, cache, progress)
+            found = _found(model, course, unseen, mean, device)
+            seconds = {"images": made, "training": course.seconds}
+            self._write(path, {"status": "ok", "reason": "", "seconds": seconds, **found}, device)
+            scratch = path.with_suffix(".writing")
+            save_file({name: tensor.cpu() for name, tensor in model.state_dict().items()}, scratch)
+            scratch.replace(path)
+        return path
+
+    def _write(self, path: Path, more: dict[str, Any], device: torch.device) -> None:
+        record = {
+            "key": self.key,
+            "dataset": self.dataset.identity(),
+            "settings": self.settings,
+            "made": datetime.now(UTC).isoformat(timespec="seconds"),
+            "environment": describe(device),
+        }
+        write_text(path.with_suffix(".json"), to_json(record | more))
+
+
+@torch.no_grad()
+def overlap(model: SingleView, code: torch.Tensor, images: ImagesOf, device: torch.device) -> float:
+    """Intersection over union of a code's shape and the true one, by the known points in the cube (DVR, Sec. 4.1)."""
+    uniform = slice(0, len(images.points) // 2)
+    found = model.at(code)(images.points[uniform].to(device)).cpu() < 0
+    true = images.inside[uniform]
+    return float((found & true).sum() / (found | true).sum().clamp_min(1))
+
+
+def _inputs(images: ImagesOf, device: torch.device) -> torch.Tensor:
+    return torch.stack([images.image(view) for view in range(len(images.cameras))]).to(device)
+
+
+def _found(
+    model: SingleView, course: Course, unseen: list[ImagesOf], mean: torch.Tensor, device: torch.device
+) -> dict[str, Any]:
+    overlaps = {
+        "network": [overlap(model, model(one.image(0)[None].to(device))[0], one, device) for one in unseen],
+        "mean_code": [overlap(model, mean, one, device) for one in unseen],
+    }
+    return {
+        "evaluations": {"value": course.counts.value, "gradient": course.counts.gradient},
+        "parameters": sum(weights.numel() for weights in model.parameters()),
+        "loss": {"first": course.losses[0], "last": float(np.mean(course.losses[-50:]))},
+        "mean_code": mean.cpu().tolist(),
+        "validation": {f"iou_{name}": float(np.mean(found)) for name, found in overlaps.items()},
+    }

@@ -1,0 +1,236 @@
+"""Trains a `SingleView` over many shapes: from images (2D), from depths (2.5D), or from the true occupancy (3D)."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import cos, isfinite, pi
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from bench.progress import Report
+from bench.reconstruct.losses import Losses
+from bench.single_view.images import ImagesOf
+from bench.single_view.network import SingleView, SingleViewNetwork
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Counts, Meter, occupancy_logits
+from renderers.fields.coloured import LOGIT_WIDTH
+from renderers.rendering import Renderer, at_iteration
+
+LARGEST_GRADIENT = 1.0  # norm to which a step's gradient is shortened
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """What a training may know of its shapes.
+
+    Args:
+        losses: of renderings: of colours and masks (2D), of depths (2.5D); see `bench.reconstruct.losses.Losses`.
+        occupancy: weight of the cross entropy at points of known occupancy (3D; Occupancy Networks, Eq. 3).
+        points: of known occupancy, of each shape in a step.
+    """
+
+    losses: Losses
+    occupancy: float
+    points: int
+
+    def __post_init__(self) -> None:
+        check_at_least("supervision.occupancy", self.occupancy, 0, "0 switches the term off")
+        check_at_least("supervision.points", self.points, 1, "1024 work")
+
+    @property
+    def renders(self) -> bool:
+        """Whether any term is of a rendering."""
+        losses = self.losses
+        return any((losses.colour, losses.colour_gradient, losses.depth, losses.silhouette_weight))
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a network is trained.
+
+    Args:
+        shapes: number of training shapes.
+        steps: optimiser steps, each on `shapes_per_step` shapes, an input image and another one of each.
+        shapes_per_step: their number.
+        rays: of each shape's other image.
+        learning_rate: of Adam at the start; it falls to zero along a cosine.
+        keep_every: steps after which the state is kept on disk, for a training that is stopped.
+        seed: of weights, batches and rays.
+    """
+
+    shapes: int
+    steps: int
+    shapes_per_step: int
+    rays: int
+    learning_rate: float
+    keep_every: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        for name in ("shapes", "steps", "shapes_per_step", "rays", "keep_every"):
+            check_at_least(f"task.training.{name}", getattr(self, name), 1, "conf/scale has values that work")
+        check_positive("task.training.learning_rate", self.learning_rate, "1e-3 works")
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step, counted from 0."""
+        return self.learning_rate * 0.5 * (1 + cos(pi * step / self.steps))
+
+
+@dataclass
+class Course:
+    """The course of a training: losses of its steps, and what they cost."""
+
+    losses: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    counts: Counts = field(default_factory=Counts)
+    reason: str = ""  # why it ended early
+
+
+class Failed(ValueError):
+    """The loss or a weight became NaN; `kept` is the number of steps of the last state on disk."""
+
+    def __init__(self, step: int, kept: int, path: Path) -> None:
+        super().__init__(
+            f"the training failed: not a number at step {step}; the state after {kept} steps is in {path}: "
+            "lower task.training.learning_rate"
+        )
+        self.step, self.kept = step, kept
+
+
+def train(
+    images: Sequence[ImagesOf],
+    network: SingleViewNetwork,
+    supervision: Supervision,
+    renderer: Renderer,
+    settings: TrainingSettings,
+    state: Path,
+    device: torch.device,
+    progress: Report,
+) -> tuple[SingleView, Course]:
+    """Trains a network; a training that was stopped goes on from `state`, and ends with the same weights.
+
+    Args:
+        images: of the training shapes.
+        network: its sizes.
+        supervision: what it may know.
+        renderer: through which shapes are compared with images.
+        settings: of the training.
+        state: file of the state of a training under way; removed at the end.
+        device: of the training.
+        progress: of its steps.
+
+    Raises:
+        Failed: where the loss or a weight is not a number; `state` stays.
+    """
+    torch.manual_seed(settings.seed)
+    model = SingleView(network).to(device)
+    optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
+    begun = _restored(state, model, optimiser, course)
+    for step in range(begun, settings.steps):
+        started = time.perf_counter()
+        for group in optimiser.param_groups:
+            group["lr"] = settings.rate(step)
+        loss = _step(model, images, supervision, at_iteration(renderer, step), settings, step, course.counts, device)
+        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
+        if not isfinite(loss) or not bool(norm.isfinite()):
+            raise Failed(step, step - step % settings.keep_every, state)
+        optimiser.step()
+        course.losses.append(loss)
+        course.seconds += time.perf_counter() - started
+        progress("training", step + 1, settings.steps, loss)
+        if (step + 1) % settings.keep_every == 0 and step + 1 < settings.steps:
+            _keep(state, model, optimiser, course)
+    state.unlink(missing_ok=True)
+    return model.eval().requires_grad_(False), course
+
+
+def _step(
+    model: SingleView,
+    images: Sequence[ImagesOf],
+    supervision: Supervision,
+    renderer: Renderer,
+    settings: TrainingSettings,
+    step: int,
+    counts: Counts,
+    device: torch.device,
+) -> float:
+    """The mean loss over a step's shapes, whose gradients are left in the weights; one shape's graph at a time."""
+    draw = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
+    torch.manual_seed(draw.initial_seed())  # of what the losses draw
+    chosen = torch.randperm(len(images), generator=draw)[: settings.shapes_per_step].tolist()
+    views = len(images[0].cameras)
+    inputs = torch.randint(views, (len(chosen),), generator=draw).tolist()
+    shown = torch.stack([images[shape].image(view) for shape, view in zip(chosen, inputs, strict=True)])
+    for parameter in model.parameters():
+        parameter.grad = None
+    codes = model(shown.to(device))
+    cut = codes.detach().requires_grad_()
+    total = 0.0
+    for place, shape in enumerate(chosen):
+        terms = _terms(model, cut[place], images[shape], supervision, renderer, settings.rays, draw, counts, device)
+        loss = torch.stack(terms).sum() / len(chosen)
+        loss.backward()
+        total += loss.item()
+    codes.backward(cut.grad)
+    return total
+
+
+def _terms(
+    model: SingleView,
+    code: Tensor,
+    images: ImagesOf,
+    supervision: Supervision,
+    renderer: Renderer,
+    rays: int,
+    draw: torch.Generator,
+    counts: Counts,
+    device: torch.device,
+) -> list[Tensor]:
+    shape, terms = model.at(code), []
+    if supervision.renders:
+        view = int(torch.randint(len(images.cameras), (1,), generator=draw))
+        pixels = images.pixels(view, rays, draw, device)
+        terms.append(supervision.losses(renderer, shape, Meter(shape, counts), pixels)["total"])
+    if supervision.occupancy:
+        known = torch.randint(len(images.points), (supervision.points,), generator=draw)
+        logits = occupancy_logits(shape, shape(images.points[known].to(device)), width=LOGIT_WIDTH)
+        inside = images.inside[known].to(logits)
+        terms.append(supervision.occupancy * binary_cross_entropy_with_logits(logits, inside))
+    return terms
+
+
+def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> None:
+    tensors = {f"weights.{name}": tensor for name, tensor in model.state_dict().items()}
+    for place, moments in optimiser.state_dict()["state"].items():
+        tensors |= {f"adam.{place}.{name}": tensor for name, tensor in moments.items()}
+    tensors["losses"] = torch.tensor(course.losses, dtype=torch.float64)
+    spent = (course.seconds, course.counts.value, course.counts.gradient, course.counts.coarse)
+    tensors["spent"] = torch.tensor(spent, dtype=torch.float64)
+    scratch = path.with_suffix(".writing")
+    save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, scratch)
+    scratch.replace(path)
+
+
+def _restored(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> int:
+    """Fills model, optimiser and course from a kept state, if there is one; gives the number of its steps."""
+    if not path.exists():
+        return 0
+    tensors = load_file(path)
+    weights, adam = (
+        {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
+        for start in ("weights.", "adam.")
+    )
+    model.load_state_dict(weights)
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in adam.items():
+        place, _, part = name.partition(".")
+        moments.setdefault(int(place), {})[part] = tensor
+    optimiser.load_state_dict({**optimiser.state_dict(), "state": moments})
+    course.losses = tensors["losses"].tolist()
+    course.seconds, *counted = tensors["spent"].tolist()
+    course.counts.value, course.counts.gradient, course.counts.coarse = map(int, counted)
+    return len(course.losses)
