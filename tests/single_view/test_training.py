@@ -1,0 +1,269 @@
+"""Training of a network over shapes: it learns, goes on where it was stopped, and ends with a record where it fails."""
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.reconstruct.losses import Losses
+from bench.single_view import training
+from bench.single_view.images import NEAR, POINTS, Imaging
+from bench.single_view.network import SingleView, SingleViewNetwork
+from bench.single_view.store import Recipe, overlap
+from bench.single_view.training import Failed, Supervision, TrainingSettings, train
+from datasets.dataset import Split
+from datasets.mesh import Mesh
+from datasets.views import ViewSampler
+from renderers.checks import BadInput
+from renderers.field import Kind
+from renderers.silhouette import CrossEntropy
+from tests.datasets.test_photographs import PLAINLY
+from tests.tiny import silent
+
+CPU = torch.device("cpu")
+SAMPLER = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(10.0, 40.0), resolution=16)
+IMAGING = Imaging(replace(PLAINLY, views=3, texture_size=1.0), SAMPLER)
+NETWORK = SingleViewNetwork(channels=(8, 8), blocks=1, code_length=6, width=16, reads="distance", radius=0.5)
+LOSSES = Losses(
+    colour=1.0, colour_gradient=0.0, depth=0.0, depth_loss="depth", silhouette=CrossEntropy(sharpness=30.0, weight=1.0),
+    silhouette_weight=0.3, smoothness=0.0, normals=0.0, eikonal=0.1,
+)  # fmt: skip
+RGB = Supervision(LOSSES, occupancy=0.0, points=64)
+VOLUME = Supervision(replace(LOSSES, colour=0.0, silhouette_weight=0.0), occupancy=1.0, points=256)
+SETTINGS = TrainingSettings(
+    shapes=3, steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Balls:
+    """Balls of three sizes."""
+
+    name: str = "balls"
+
+    def mesh(self, split, index):
+        made = trimesh.creation.icosphere(subdivisions=3, radius=(0.35, 0.55, 0.8)[index % 3])
+        return Mesh(np.array(made.vertices), np.array(made.faces))
+
+    def identity(self):
+        return {"name": self.name}
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    return IMAGING.images(Balls(), Split.TRAIN, 3, tmp_path_factory.mktemp("images"), silent)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return load("renderer", "newton", warm=False)
+
+
+def trained(images, renderer, state, supervision=RGB, progress=silent, network=NETWORK, **changed):
+    return train(images, network, supervision, renderer, replace(SETTINGS, **changed), state, CPU, progress)
+
+
+def weights(model: SingleView) -> torch.Tensor:
+    return torch.cat([one.flatten() for one in model.parameters()])
+
+
+def test_images_are_of_the_shape_from_other_cameras_and_points_know_where_they_are(images):
+    assert len(images) == 3
+    radii = [0.35, 0.55, 0.8]
+    for one, radius in zip(images, radii, strict=True):
+        assert one.colours.shape == (3, 16, 16, 3) and one.masks.shape == one.depths.shape == (3, 16, 16)
+        centres = torch.stack([camera.center for camera in one.cameras])
+        assert torch.pdist(centres).min() > 0.05
+        assert bool((one.masks == (one.depths > 0)).all())
+        nearest = torch.stack([depth[mask].min() for depth, mask in zip(one.depths, one.masks, strict=True)])
+        assert nearest.numpy() == pytest.approx(2.5 - radius, abs=0.05)
+        length = one.points.norm(dim=1)
+        clear = (length - radius).abs() > 0.02  # of the faces of the ball, which lie a little inside of it
+        assert torch.equal(one.inside[clear], (length < radius)[clear])
+        near = (length[POINTS // 2 :] - radius).abs()
+        assert float(near.median()) == pytest.approx(0.6745 * NEAR, rel=0.15)
+        assert float(one.points[: POINTS // 2].abs().max()) <= 1
+    cameras = torch.stack([torch.stack([camera.center for camera in one.cameras]) for one in images])
+    assert not torch.allclose(cameras[0], cameras[1])
+
+
+def test_images_are_made_once(tmp_path, images, monkeypatch):
+    first = IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
+    monkeypatch.setattr(Imaging, "of_shape", lambda *_: pytest.fail("made again"))
+    again = IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
+    for one, other, whole in zip(first, again, images, strict=False):
+        assert torch.equal(one.colours, other.colours) and torch.equal(one.colours, whole.colours)
+        assert torch.equal(one.cameras[2].world_to_camera, other.cameras[2].world_to_camera)
+    (file,) = tmp_path.glob("images-*.safetensors")
+    file.write_bytes(b"cut short")
+    with pytest.raises(pytest.fail.Exception, match="made again"):
+        IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
+
+
+def test_pixels_are_those_of_the_image(images):
+    pixels = images[1].pixels(2, 50, torch.Generator().manual_seed(0), CPU)
+    camera = images[1].cameras[2]
+    at, _ = camera.project(pixels.rays.at(torch.full((50,), 2.0)))
+    column, row = at.floor().long().T
+    assert torch.equal(pixels.colours, images[1].colours[2][row, column].float() / 255)
+    assert torch.equal(pixels.mask, images[1].masks[2][row, column])
+    known = pixels.distance.isfinite()
+    assert torch.equal(known, pixels.mask)
+    found = pixels.rays.at(pixels.distance.nan_to_num())[known].norm(dim=1)
+    assert found.numpy() == pytest.approx(0.55, abs=0.01)
+
+
+@pytest.mark.parametrize(("reads", "kind"), [("distance", Kind.DISTANCE), ("occupancy", Kind.LEVEL)])
+def test_every_code_begins_as_the_same_sphere(reads, kind):
+    torch.manual_seed(0)
+    model = SingleView(replace(NETWORK, reads=reads, width=64))
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    for code in torch.randn(2, 6):
+        shape = model.at(code)
+        assert shape.kind is kind
+        assert bool((shape(0.3 * directions) < 0).all()) and bool((shape(0.75 * directions) > 0).all())
+    assert model(torch.rand(2, 3, 16, 16)).shape == (2, 6)
+
+
+def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
+    model, course = trained(images, renderer, tmp_path / "s", VOLUME, steps=150, shapes_per_step=3, keep_every=1000)
+    assert np.mean(course.losses[-10:]) < 0.5 * course.losses[0]
+    codes = [model(one.image(0)[None])[0] for one in images]
+    own = [overlap(model, code, one, CPU) for code, one in zip(codes, images, strict=True)]
+    other = [overlap(model, codes[2 - place], one, CPU) for place, one in enumerate(images) if place != 1]
+    assert min(own) > 0.6 and min(own[0], own[2]) > max(other) + 0.2
+
+
+@pytest.mark.parametrize(("name", "reads"), [("newton", "distance"), ("dvr", "occupancy")])
+def test_renderings_teach_the_encoder_as_well(images, name, reads, tmp_path):
+    network = replace(NETWORK, reads=reads)
+    model, course = trained(images, load("renderer", name), tmp_path / "s", network=network)
+    assert len(course.losses) == 6 and np.isfinite(course.losses).all()
+    assert course.counts.value > 0 and course.counts.gradient > 0 and course.seconds > 0
+    torch.manual_seed(0)
+    before = SingleView(network)
+    for part in ("stages.0.weight", "code.weight", "decoder.first.weight", "decoder.texture_head.weight"):
+        assert not torch.equal(model.state_dict()[part], before.state_dict()[part]), part
+
+
+class Stopped(Exception):
+    """As a signal would stop it."""
+
+
+@pytest.mark.parametrize("after", [1, 4, 5])
+def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_path, after):
+    whole, course = trained(images, renderer, tmp_path / "whole.state")
+
+    def stop(phase: str, done: int, total: int, loss: float | None = None) -> None:
+        if done == after:
+            raise Stopped
+
+    state = tmp_path / "stopped.state"
+    with pytest.raises(Stopped):
+        trained(images, renderer, state, progress=stop)
+    assert state.exists() == (after > 2)
+    begun = []
+    again, more = trained(
+        images, renderer, state, progress=lambda phase, done, total, loss=None: begun.append(done)
+    )  # fmt: skip
+    assert begun[0] == {1: 1, 4: 3, 5: 5}[after]  # states are kept after the progress of every second step is told
+    assert torch.equal(weights(again), weights(whole))
+    assert more.losses == course.losses
+    assert more.counts == course.counts
+    assert not state.exists()
+
+
+def test_a_step_that_is_no_number_keeps_the_last_state(images, renderer, tmp_path, monkeypatch):
+    step = training._step
+
+    def spoilt(model, *rest):
+        loss = step(model, *rest)
+        return float("nan") if rest[4] == 5 else loss
+
+    monkeypatch.setattr(training, "_step", spoilt)
+    with pytest.raises(Failed, match=r"number at step 5; the state after 4 steps is in .*: lower task\.training"):
+        trained(images, renderer, tmp_path / "s.state")
+    assert (tmp_path / "s.state").exists()
+
+
+def recipe(renderer, **changed) -> Recipe:
+    settings = replace(SETTINGS, steps=3, **changed)
+    return Recipe(
+        Balls(), IMAGING, NETWORK, RGB, settings, renderer, {"training": {"shapes": 3, "steps": settings.steps}}
+    )
+
+
+def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path, monkeypatch):
+    made = recipe(renderer)
+    assert made.find(tmp_path) is None
+    path = made.make(tmp_path, CPU, silent)
+    assert made.find(tmp_path) == path and path.name.startswith("single_view-balls-")
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["status"] == "ok" and record["key"] == made.key and record["settings"] == made.settings
+    assert set(record["validation"]) == {"iou_network", "iou_mean_code"} and 0 < record["validation"]["iou_network"] < 1
+    assert record["seconds"]["training"] > 0 and len(record["mean_code"]) == 6
+    model, _ = made.load(path)
+    image = torch.rand(1, 3, 16, 16)
+    assert torch.equal(model(image), made.load(path)[0](image))
+    monkeypatch.setattr("bench.single_view.store.train", lambda *_: pytest.fail("trained again"))
+    assert made.make(tmp_path, CPU, silent) == path
+
+
+def test_one_that_fails_has_a_record(renderer, tmp_path, monkeypatch):
+    def failing(*arguments):
+        raise Failed(7, 4, tmp_path / "x.state")
+
+    monkeypatch.setattr("bench.single_view.store.train", failing)
+    made = recipe(renderer)
+    with pytest.raises(Failed):
+        made.make(tmp_path, CPU, silent)
+    (path,) = tmp_path.glob("single_view-*.json")
+    record = json.loads(path.read_text())
+    assert record["status"] == "nan" and "not a number at step 7" in record["reason"]
+    assert made.find(tmp_path) is None
+
+
+@pytest.mark.parametrize("spoil", ["cut", "other", "no record"])
+def test_a_damaged_network_is_told(renderer, tmp_path, spoil):
+    made = recipe(renderer)
+    path = made.make(tmp_path, CPU, silent)
+    if spoil == "cut":
+        path.write_bytes(path.read_bytes()[:100])
+    elif spoil == "other":
+        made = replace(made, network=replace(NETWORK, width=8))
+    else:
+        path.with_suffix(".json").unlink()
+    with pytest.raises(BadInput, match=r"cannot be read \(.*\): delete it, and train it again"):
+        made.load(path)
+
+
+def test_the_overlap_is_that_of_volumes(images):
+    torch.manual_seed(0)
+    model = SingleView(replace(NETWORK, width=128))
+    volume = 8 * float((model.at(torch.zeros(6))(images[2].points[: POINTS // 2]) < 0).float().mean())
+    radius = (volume * 3 / (4 * np.pi)) ** (1 / 3)
+    for one, true in zip(images, (0.35, 0.55, 0.8), strict=True):
+        expected = (min(radius, true) / max(radius, true)) ** 3
+        assert overlap(model, torch.zeros(6), one, CPU) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changed", "says"),
+    [
+        (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
+        (NETWORK, {"channels": ()}, "the length of task.network.channels"),
+        (NETWORK, {"reads": "density"}, "task.network.reads must be one of occupancy, distance"),
+        (NETWORK, {"width": 0}, "task.network.width"),
+        (SETTINGS, {"steps": 0}, "task.training.steps"),
+        (SETTINGS, {"learning_rate": 0.0}, "task.training.learning_rate"),
+        (RGB, {"occupancy": -1.0}, "supervision.occupancy"),
+        (RGB, {"points": 0}, "supervision.points"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(kind, changed, says):
+    with pytest.raises(ValueError, match=says):
+        replace(kind, **changed)
