@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
@@ -24,6 +26,7 @@ from renderers.checks import BadInput
 from renderers.rendering import Renderer
 
 VERSION = 1  # raise it when training changes, so that no network of the old training is used
+Values = Callable[[Float[torch.Tensor, "n 3"]], Float[torch.Tensor, " n"]]  # negative inside
 VALIDATION = 8  # shapes on which a new network is evaluated, from their first images
 
 
@@ -124,10 +127,10 @@ class Recipe:
 
 
 @torch.no_grad()
-def overlap(model: SingleView, code: torch.Tensor, images: ImagesOf, device: torch.device) -> float:
-    """Intersection over union of a code's shape and the true one, by the known points in the cube (DVR, Sec. 4.1)."""
+def overlap(shape: Values, images: ImagesOf, device: torch.device) -> float:
+    """Intersection over union of a shape and the true one, by the known points in the cube (DVR, Sec. 4.1)."""
     uniform = slice(0, len(images.points) // 2)
-    found = model.at(code)(images.points[uniform].to(device)).cpu() < 0
+    found = shape(images.points[uniform].to(device)).cpu() < 0
     true = images.inside[uniform]
     return float((found & true).sum() / (found | true).sum().clamp_min(1))
 
@@ -140,8 +143,8 @@ def _found(
     model: SingleView, course: Course, unseen: list[ImagesOf], mean: torch.Tensor, device: torch.device
 ) -> dict[str, Any]:
     overlaps = {
-        "network": [overlap(model, model(one.image(0)[None].to(device))[0], one, device) for one in unseen],
-        "mean_code": [overlap(model, mean, one, device) for one in unseen],
+        "network": [overlap(model.at(model(one.image(0)[None].to(device))[0]), one, device) for one in unseen],
+        "mean_code": [overlap(model.at(mean), one, device) for one in unseen],
     }
     return {
         "evaluations": {"value": course.counts.value, "gradient": course.counts.gradient},

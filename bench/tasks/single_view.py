@@ -6,11 +6,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
-from bench.reconstruct.pictures import draw_reconstruction
+from bench.evaluate.evaluate import surface_of
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
+from bench.reconstruct.pictures import draw_reconstruction, draw_surface
 from bench.reconstruct.subject import Subject
+from bench.reconstruct.surfaces import with_colours
 from bench.setup.inputs import RunContext, RunInputs
+from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleViewNetwork
 from bench.single_view.store import Recipe, overlap
@@ -20,14 +25,15 @@ from bench.solve.solve import COSTS, note_result
 from datasets.dataset import Split
 from datasets.photographs import Photography
 from datasets.shot import Shot
-from renderers.checks import BadInput, check_at_least
+from datasets.truth import Truth
+from renderers.checks import BadInput, check_at_least, check_choice
 
-MEAN, NETWORK = "mean_code", "network"
+NETWORK, MEAN, NEAREST, BEST = "network", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
     "before: of the mean code of all training images",
-    "seconds.inference": "from the image to the mesh",
 }
+REMEDY = "give the same command to `python -m bench.train` first"
 DECIDING = ("images", "image_pixels", "network", "supervision", "training")  # settings that determine the network
 
 
@@ -36,6 +42,8 @@ class OneImage:
     """A shape from one image of it; the other images of the shape judge it.
 
     Args:
+        method: "network"; or without one, the "mean" of the training shapes, that with the "nearest" image, or the one
+            that is "best" by the truth.
         images: that are rendered of each shape, from random cameras of `view`.
         image_pixels: height and width of these.
         given: number of the image that is given.
@@ -44,6 +52,7 @@ class OneImage:
         training: of the network, by `python -m bench.train`.
     """
 
+    method: str
     images: Photography
     image_pixels: int
     given: int
@@ -52,6 +61,7 @@ class OneImage:
     training: TrainingSettings
 
     def __post_init__(self) -> None:
+        check_choice("task.method", self.method, (NETWORK, MEAN, NEAREST, BEST))
         check_at_least("task.image_pixels", self.image_pixels, 16, "64 shows the shape")
         if not 0 <= self.given < self.images.views:
             raise ValueError(f"task.given must be one of the {self.images.views} images, not {self.given}: 0")
@@ -70,51 +80,96 @@ class OneImage:
         return Recipe(inputs.dataset, imaging, self.network, self.supervision, self.training, inputs.renderer, settings)
 
     def execute(self, run: RunContext) -> None:
-        """Infers the shape and judges it; before, that of the mean code."""
+        """Infers the shape and judges it."""
         inputs, record = run.inputs, run.record
         record.definitions = DEFINITIONS | COSTS
         recipe = self.recipe(inputs, record.config)
+        images = recipe.imaging.of_shape(recipe.dataset, Split(record.config["split"]), record.config["index"])
+        subject = subject_of(images, self.given, inputs)
+        record.evaluations = {"value": 0, "gradient": 0}
+        (self._infer if self.method == NETWORK else self._look_up)(run, recipe, images, subject)
+
+    def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+        """The shape that the network gives; before, that of the mean code."""
+        inputs, record = run.inputs, run.record
         path = recipe.find(inputs.cache)
         if path is None:
-            raise BadInput(f"no network was trained for these settings: {remedy(record.config)}")
+            raise BadInput(f"no network was trained for these settings: {REMEDY}")
         model, trained = recipe.load(path)
         model = model.to(inputs.device)
         mean = torch.tensor(trained["mean_code"], device=inputs.device)
         check_kind(inputs.renderer, model.at(mean))
-        images = recipe.imaging.of_shape(recipe.dataset, Split(record.config["split"]), record.config["index"])
-        subject = subject_of(images, self.given, inputs)
-        clock = time.perf_counter()
-        with torch.no_grad():
-            code = model(images.image(self.given)[None].to(inputs.device))[0]
-        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
-        record.evaluations = {"value": 0, "gradient": 0}
         record.notes = [*record.notes, told(trained), "the renderer took part in the training, and judges as own_"]
         with run.off_clock():
             before = judge(model.at(mean), subject, inputs)
-            record.metrics_start = before.metrics | {"iou": overlap(model, mean, images, inputs.device)}
-            clock = time.perf_counter()
-            after = judge(model.at(code), subject, inputs)
-            after.metrics["iou"] = overlap(model, code, images, inputs.device)
+            record.metrics_start = before.metrics | {"iou": overlap(model.at(mean), images, inputs.device)}
+        clock = time.perf_counter()
+        with torch.no_grad():
+            shape = model.at(model(images.image(self.given)[None].to(inputs.device))[0])
+            surface_of(shape, inputs)
+        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        with run.off_clock():
+            after = judge(shape, subject, inputs)
+            after.metrics["iou"] = overlap(shape, images, inputs.device)
             note_result(run, after)
             if inputs.evaluation.picture is not None:
-                title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
-                draw_reconstruction(run.folder, inputs, model.at(code), subject, [], title)
+                draw_reconstruction(run.folder, inputs, shape, subject, [], _title(run))
+
+    def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+        """A shape that needs no network, with the colours of its images."""
+        inputs, record, count = run.inputs, run.record, self.training.shapes
+        record.notes = [*record.notes, "no network and no renderer took part"]
+        if self.method == MEAN:
+            mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.given
+        else:
+            others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
+            clock = time.perf_counter()
+            if self.method == NEAREST:
+                place = most_alike(images.image(self.given), others)
+            else:
+                place = best_shape(inputs.scene.mesh, recipe.dataset, count)
+            record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+            mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), shots_of(others[place])
+            record.notes.append(f"training shape {place}")
+        with run.off_clock():
+            mesh = None if mesh is None else with_colours(mesh, seen)
+            after = judge_mesh(mesh, subject, inputs)
+            after.metrics["iou"] = 0.0 if mesh is None else overlap(Inside(Truth(mesh)), images, torch.device("cpu"))
+            note_result(run, after)
+            if inputs.evaluation.picture is not None and mesh is not None:
+                draw_surface(run.folder, inputs, mesh, subject, _title(run))
+
+
+@dataclass(frozen=True)
+class Inside:
+    """The signed distance of a closed mesh, as a function of points."""
+
+    truth: Truth
+
+    def __call__(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Negative inside."""
+        return torch.from_numpy(self.truth.signed_distance(points.numpy()))
+
+
+def _title(run: RunContext) -> str:
+    record = run.record
+    return f"{record.task}, {record.name}, {record.scene}: {record.status}"
+
+
+def shots_of(images: ImagesOf) -> tuple[Shot, ...]:
+    """The images as photographs."""
+    parts = zip(images.cameras, images.colours, images.masks, images.depths, strict=True)
+    return tuple(
+        Shot(str(place), camera, colours.float() / 255, mask, depth)
+        for place, (camera, colours, mask, depth) in enumerate(parts)
+    )
 
 
 def subject_of(images: ImagesOf, given: int, inputs: RunInputs) -> Subject:
     """The given image, and all others as those that judge."""
-    parts = zip(images.cameras, images.colours, images.masks, images.depths, strict=True)
-    shots = [
-        Shot(str(place), camera, colours.float() / 255, mask, depth)
-        for place, (camera, colours, mask, depth) in enumerate(parts)
-    ]
+    shots = shots_of(images)
     others = tuple(shot for place, shot in enumerate(shots) if place != given)
     return Subject((shots[given],), others or (shots[given],), inputs.scene.mesh, "")
-
-
-def remedy(config: dict[str, Any]) -> str:
-    """The command that trains the network of a configuration."""
-    return "run the same command with `python -m bench.train` instead of `python -m bench`"
 
 
 def told(trained: dict[str, Any]) -> str:

@@ -133,8 +133,8 @@ def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
     model, course = trained(images, renderer, tmp_path / "s", VOLUME, steps=150, shapes_per_step=3, keep_every=1000)
     assert np.mean(course.losses[-10:]) < 0.5 * course.losses[0]
     codes = [model(one.image(0)[None])[0] for one in images]
-    own = [overlap(model, code, one, CPU) for code, one in zip(codes, images, strict=True)]
-    other = [overlap(model, codes[2 - place], one, CPU) for place, one in enumerate(images) if place != 1]
+    own = [overlap(model.at(code), one, CPU) for code, one in zip(codes, images, strict=True)]
+    other = [overlap(model.at(codes[2 - place]), one, CPU) for place, one in enumerate(images) if place != 1]
     assert min(own) > 0.6 and min(own[0], own[2]) > max(other) + 0.2
 
 
@@ -248,7 +248,7 @@ def test_the_overlap_is_that_of_volumes(images):
     radius = (volume * 3 / (4 * np.pi)) ** (1 / 3)
     for one, true in zip(images, (0.35, 0.55, 0.8), strict=True):
         expected = (min(radius, true) / max(radius, true)) ** 3
-        assert overlap(model, torch.zeros(6), one, CPU) == pytest.approx(expected, abs=0.1)
+        assert overlap(model.at(torch.zeros(6)), one, CPU) == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.parametrize(
