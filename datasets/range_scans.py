@@ -1,6 +1,6 @@
 """Range scans of one object as a dataset: depths that a scanner measured, beside the surface made from all of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -8,17 +8,17 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from datasets.dataset import Split
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import load_mesh
-from renderers.camera import Camera
+from datasets.truncated import check_whole
 from renderers.checks import BadInput, check_share
 
-NEAR = 0.25  # pixels, along rows and columns: a point farther from a pixel's centre does not measure its depth
-HIDDEN = 0.05  # scene units behind the nearest point of a pixel: a point farther behind belongs to a hidden surface
+LONGEST = 4.0  # median edges: points farther apart are not joined, as across a gap or behind an outline
 SCANNER = np.array([0.0, 0.0, 1.0])  # from the object to the scanner, in a scan's own axes (Stanford's repository)
 LINE = "bmesh FILE tx ty tz qx qy qz qw"
 
@@ -31,8 +31,8 @@ class Scanned(Protocol):
         """The direction from the object to the scanner of scan number `index`."""
         ...
 
-    def depths(self, index: int, camera: Camera) -> Float[Tensor, "height width"]:
-        """The depths of scan number `index` in a camera's image, 0 where there is none."""
+    def seen(self, index: int) -> Mesh:
+        """The surface that scan number `index` measured, which is open."""
         ...
 
 
@@ -49,18 +49,26 @@ class Scan:
         """From the scan's axes to the world's."""
         return Rotation.from_quat(self.quaternion).inv()
 
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """Its points in world coordinates.
+    def surface(self) -> Mesh:
+        """The scan as an open surface in world coordinates: neighbours in the scanner's view are joined.
 
         Raises:
-            BadInput: where the file has none.
+            BadInput: where the file is cut short, or has no points.
         """
         import open3d
 
+        try:
+            check_whole(self.file)
+        except ValueError as error:
+            raise BadInput(f"scan '{self.file}': {error}") from None
         points = np.asarray(open3d.io.read_point_cloud(str(self.file)).points)
-        if not len(points) or not np.isfinite(points).all():
+        if len(points) < 3 or not np.isfinite(points).all():
             raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
-        return self.rotation.apply(points) + self.translation
+        faces = Delaunay(points[:, :2]).simplices
+        corners = points[faces]
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        faces = faces[edges.max(axis=1) <= LONGEST * np.median(edges)]
+        return Mesh(self.rotation.apply(points) + self.translation, faces)
 
 
 @dataclass(frozen=True)
@@ -71,16 +79,18 @@ class RangeScans:
 
     Args:
         path: the folder: one `.conf` file whose lines `bmesh FILE tx ty tz qx qy qz qw` name the scans, these, and the
-            mesh, which is the largest other `.ply` file.
+            mesh.
+        truth: the mesh's file in it; None takes the largest `.ply` file that is no scan.
         radius: of the sphere about the origin that holds the mesh.
     """
 
     path: str
+    truth: str | None
     radius: float
 
     def __post_init__(self) -> None:
         check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
-        if not Path(self.path).is_dir():
+        if not self.path or not Path(self.path).is_dir():
             raise ValueError(f"dataset.path={self.path} is no folder: give the folder that has the .conf file")
         _ = self.scans, self.reference
 
@@ -95,7 +105,8 @@ class RangeScans:
         found = sorted(Path(self.path).glob("*.conf"))
         if len(found) != 1:
             raise ValueError(f"dataset.path={self.path} must have one .conf file, the poses of scans, not {len(found)}")
-        lines = [(number, line.split()) for number, line in enumerate(found[0].read_text().splitlines(), 1)]
+        text = found[0].read_text(encoding="utf-8-sig", errors="replace")
+        lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
         scans = [_scan(found[0], number, words) for number, words in lines if words and words[0] == "bmesh"]
         if not scans:
             raise ValueError(f"'{found[0]}' names no scan: it needs lines '{LINE}'")
@@ -104,6 +115,11 @@ class RangeScans:
     @cached_property
     def reference(self) -> Path:
         """The file of the mesh that stands for the true shape."""
+        if self.truth is not None:
+            file = Path(self.path) / self.truth
+            if not file.is_file():
+                raise ValueError(f"dataset.truth={self.truth} is not in {self.path}: name the mesh's file")
+            return file
         scans = {scan.file.name for scan in self.scans}
         others = [file for file in Path(self.path).glob("*.ply") if file.name not in scans]
         if not others:
@@ -112,7 +128,8 @@ class RangeScans:
 
     @cached_property
     def _read(self) -> Mesh:
-        return load_mesh(self.reference)
+        mesh = load_mesh(self.reference)
+        return replace(mesh, repairs=(f"the true shape is '{self.reference.name}'", *mesh.repairs))
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """The object, whatever the index; its `repairs` say what was repaired in the file.
@@ -121,7 +138,9 @@ class RangeScans:
             BadInput: where there is no scan of that number, or a prior should be trained.
         """
         if split is Split.TRAIN:
-            raise BadInput("scans show one object, of which no prior can be trained: set field=auto split=test")
+            raise BadInput(
+                "scans show one object, of which there is no prior: take task=completion field=auto split=test"
+            )
         self._scan(index)
         return normalise(self._read, self.radius)
 
@@ -129,15 +148,15 @@ class RangeScans:
         """See `Scanned`."""
         return torch.from_numpy(self._scan(index).rotation.apply(SCANNER)).float()
 
-    def depths(self, index: int, camera: Camera) -> Float[Tensor, "height width"]:
-        """See `Scanned`; a pixel has the depth of the point next to its centre."""
+    def seen(self, index: int) -> Mesh:
+        """See `Scanned`."""
         centre, factor = fit_in_sphere(self._read, self.radius)
-        points = torch.from_numpy((self._scan(index).points() - centre) * factor).float()
-        return nearest_to_pixels(points, camera)
+        surface = self._scan(index).surface()
+        return replace(surface, vertices=(surface.vertices - centre) * factor)
 
     def identity(self) -> dict[str, Any]:
         """The folder; runs are told apart by the contents of its files."""
-        return {"name": "scans", "path": self.path, "radius": self.radius}
+        return {"name": "scans", "path": self.path, "truth": self.truth, "radius": self.radius}
 
     def _scan(self, index: int) -> Scan:
         if index >= len(self.scans):
@@ -161,22 +180,3 @@ def _scan(conf: Path, number: int, words: list[str]) -> Scan:
     if not file.is_file():
         raise ValueError(f"'{conf}' names '{name}', which is not beside it: copy it there, or take line {number} out")
     return Scan(file, numbers[:3], numbers[3:])
-
-
-def nearest_to_pixels(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "height width"]:
-    """The camera's depth of the point next to each pixel's centre, 0 where none is within `NEAR`.
-
-    Points farther behind the nearest one of their pixel than `HIDDEN` are left out.
-    """
-    pixels, depths = (found.numpy() for found in camera.project(points[camera.shows(points)]))
-    column, row = np.minimum(pixels.T.astype(int), [[camera.width - 1], [camera.height - 1]])
-    place = row * camera.width + column
-    front = np.full(camera.height * camera.width, np.inf, dtype=np.float32)
-    np.minimum.at(front, place, depths)
-    offset = np.abs(pixels % 1 - 0.5).max(axis=1)
-    (kept,) = np.nonzero((depths <= front[place] + HIDDEN) & (offset <= NEAR))
-    kept = kept[np.lexsort((offset[kept], place[kept]))]
-    seen, first = np.unique(place[kept], return_index=True)
-    image = np.zeros(camera.height * camera.width, dtype=np.float32)
-    image[seen] = depths[kept[first]]
-    return torch.from_numpy(image).view(camera.height, camera.width)

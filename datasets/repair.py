@@ -159,7 +159,8 @@ def _smoothed(mesh: Mesh, reason: str) -> Mesh | None:
     None where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the other, as where faces are
     not wound consistently or a hole is wide.
     """
-    meshes = _mesh_set(_apply(mesh, ("meshing_re_orient_faces_coherently", {})))
+    wound = _apply(mesh, ("meshing_re_orient_faces_coherently", {}))
+    meshes = _mesh_set(wound if wound.volume > 0 else replace(wound, faces=wound.faces[:, ::-1]))
     meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)
     found = _current(meshes, mesh)
     if not (found.watertight and found.volume > 0):

@@ -60,28 +60,26 @@ class Scene:
         """The view whose depths may be given to a task, and the pixels that have one.
 
         Args:
-            exact: True for the mesh's depths also where a scanner measured others, at the pixels that have both.
+            exact: True for the mesh's depths also where a scanner measured others, at the same pixels.
         """
         if self.measured is None:
             return self.view, self.view.mask
-        known = self.measured > 0
-        if exact:
-            return self.view, known & self.view.mask
-        return replace(self.view, depth=self.measured, mask=self.view.mask | known), known
+        known = self.view.mask & (self.measured > 0)
+        return self.view if exact else replace(self.view, depth=self.measured), known
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What was repaired in the mesh, and how good the measured depths are."""
+    def on_depths(self) -> list[str]:
+        """How many depths a scanner measured, and how good they are, in words; empty without one."""
         if self.measured is None:
-            return self.mesh.repairs
+            return []
         both = self.view.mask & (self.measured > 0)
         off = (self.measured - self.view.depth)[both].abs()
         beside = int((self.measured > 0).sum()) - len(off)
-        note = f"measured: {len(off)} of the shape's {int(self.view.mask.sum())} pixels, {beside} beside it"
+        note = f"measured: {len(off)} of the shape's {int(self.view.mask.sum())} pixels"
         if len(off):
             half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()
             note += f"; half of their depths are within {half:.2g} scene units of the mesh, 95 % within {most:.2g}"
-        return (*self.mesh.repairs, note)
+        return [f"{note}; {beside} beside its outline are left out"]
 
     def seed(self, seed: int) -> int:
         """A run's seed combined with the scene's name, so that draws for different scenes are independent."""
@@ -108,7 +106,7 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
         what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
         raise BadInput(f"{what}: widen view.field_of_view or distance")
     formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
-    measured = scanned.depths(index, camera) if scanned else None
+    measured = see(Truth(scanned.seen(index), closed=False), camera).depth if scanned else None
     return Scene(scene_name(dataset, split, index), mesh, view, formula, measured)
 
 

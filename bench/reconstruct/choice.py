@@ -49,7 +49,7 @@ class AutoField:
     """How `field=auto` tries candidates, each from the start, for a share of a whole run.
 
     Args:
-        candidates: their names, in any order; see `bench.reconstruct.models.Appearance.make`.
+        candidates: their names, each once, in any order; see `bench.reconstruct.models.Appearance.make`.
         trial: share of the iterations.
         patience: successive larger candidates that may be tried without improvement.
     """
@@ -60,17 +60,23 @@ class AutoField:
 
     def __post_init__(self) -> None:
         check_at_least("the length of task.auto.candidates", len(self.candidates), 1, "network_2x64, network_4x128")
+        if len(set(self.candidates)) < len(self.candidates):
+            raise ValueError(f"task.auto.candidates must name each once, not {', '.join(self.candidates)}")
         check_share("task.auto.trial", self.trial, "0.1 shows which one follows the photographs better")
         check_at_least("task.auto.patience", self.patience, 1, "2 looks past one that is no better")
 
-    def choose(self, make: Make, subject: Subject, settings: OptimiserSettings, run: RunContext) -> "Choice":
+    def choose(
+        self, make: Make, sizes: dict[str, int], subject: Subject, settings: OptimiserSettings, run: RunContext
+    ) -> "Choice":
         """Tries candidates from the smallest on, and keeps one that lowers the error by more than its noise.
 
         Errors are of photographs that are given, but not to the trials. The noise is the standard error of the
-        difference over the same tiles of these.
+        difference over the same tiles of these. It is that of the photographs alone: another start, as of another
+        seed, may end a trial with another error.
 
         Args:
             make: the problem of a candidate and photographs.
+            sizes: the free numbers of each candidate.
             subject: all photographs; those that are held out are not used.
             settings: of the whole run.
             run: whose progress is reported.
@@ -78,13 +84,13 @@ class AutoField:
         aside, rest = subject.given[::ASIDE], [shot for place, shot in enumerate(subject.given) if place % ASIDE]
         part = replace(subject, given=tuple(rest))
         brief = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
-        problems = sorted(((name, make(name, part)) for name in self.candidates), key=lambda pair: _free(pair[1]))
         tried: list[Trial] = []
         best, worse = 0, 0
-        for name, problem in problems:
+        for name in sorted(self.candidates, key=lambda name: sizes[name]):
             if worse == self.patience:
                 break
-            tried.append(_tried(name, problem, aside, brief, run))
+            torch.manual_seed(run.inputs.seed)  # each begins as it would alone
+            tried.append(_tried(name, sizes[name], make(name, part), aside, brief, run))
             better = len(tried) > 1 and tried[-1].better_than(tried[best])
             best, worse = (len(tried) - 1, 0) if better else (best, worse + (len(tried) > 1))
         return Choice(tuple(tried), best, len(aside))
@@ -131,10 +137,12 @@ class Choice:
         """The result, in words."""
         errors = ", ".join(f"{trial.name} {trial.errors.mean():.3g}" for trial in self.trials)
         values = sum(trial.values for trial in self.trials)
-        return (
-            f"field=auto: {self.kept.name}, {self.kept.free:,} numbers; error of colours on {self.aside} photographs "
-            f"set aside, after the trials: {errors}; the trials took {self.seconds:.1f} s and {values:,} values"
-        )
+        found = f"field=auto: {self.kept.name}, {self.kept.free:,} numbers"
+        if not np.isfinite(self.kept.errors).all():
+            found += ", though no trial ended well: lower task.optimiser.learning_rate"
+        aside = f"{self.aside} photograph{'s' if self.aside > 1 else ''} set aside"
+        spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
+        return f"{found}; error of colours on {aside}, after the trials: {errors}; {spent}"
 
     def metrics(self, loop: float) -> dict[str, Any]:
         """The metrics of `DEFINITIONS`, for a run whose loop took so many seconds."""
@@ -144,7 +152,9 @@ class Choice:
         return {"field": self.kept.name, **size, "field_error": error, **overhead}
 
 
-def _tried(name: str, problem: Learning, aside: Sequence[Shot], brief: OptimiserSettings, run: RunContext) -> Trial:
+def _tried(
+    name: str, free: int, problem: Learning, aside: Sequence[Shot], brief: OptimiserSettings, run: RunContext
+) -> Trial:
     """A candidate's trial; one whose loss fails has infinite errors."""
     history = History()
 
@@ -152,17 +162,13 @@ def _tried(name: str, problem: Learning, aside: Sequence[Shot], brief: Optimiser
         run.progress(f"trying {name}", line["iteration"] + 1, brief.iterations, line["total"])
 
     optimise(problem, brief, run.inputs.device, history=history, on_step=on_step)
-    costs = _free(problem), history.seconds["forward"] + history.seconds["backward"], history.counts.value
+    costs = free, history.seconds["forward"] + history.seconds["backward"], history.counts.value
     groups = torch.cat([_tiles(shot) + place * TILES**2 for place, shot in enumerate(aside)])
     if history.status is not RunStatus.OK:
         return Trial(name, np.full(len(aside) * TILES**2, np.inf), *costs)
     errors = problem.colour_errors(Stack.of(aside, None, run.inputs.device).pixels).cpu()
     sums = torch.bincount(groups, errors.double()) / torch.bincount(groups)
     return Trial(name, sums.numpy(), *costs)
-
-
-def _free(problem: Learning) -> int:
-    return sum(parameter.numel() for parameter in problem.parameters)
 
 
 def _tiles(shot: Shot) -> Int[Tensor, " pixels"]:

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+from bench.setup.auto import AUTO
 from bench.setup.fields import PRIOR, parsed
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 
-FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH, grid_N or auto"
+FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
 REACH = 1.05  # half the side of a grid's cube: the unit sphere and a margin
 
 
@@ -38,7 +39,7 @@ class Appearance:
         Raises:
             BadInput: for a name that has no colours.
         """
-        if name == PRIOR:
+        if name in (PRIOR, AUTO):
             raise BadInput(f"field={name} has no colours: {FORMS}")
         kind, sizes = parsed(name)
         if kind == "network":

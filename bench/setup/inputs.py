@@ -63,9 +63,9 @@ class RunInputs:
 
     @property
     def last_notes(self) -> list[str]:
-        """Notes at the end of a run: on the scene, if it was made, and the final number of samples."""
-        found = self.scene.notes if "scene" in vars(self) else ()
-        return [*found, *final_notes(self.renderer)]
+        """Notes at the end of a run: repairs of the scene's mesh, if it was made, and the final number of samples."""
+        repairs = self.scene.mesh.repairs if "scene" in vars(self) else ()
+        return [*repairs, *final_notes(self.renderer)]
 
     @cached_property
     def prior(self) -> Prior:

@@ -65,6 +65,7 @@ class Completion:
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
+        run.record.notes = [*run.record.notes, *run.inputs.scene.on_depths]
         solve = solve_task if run.inputs.field.of_prior else solve_by_growth
         solve(self, run)
 

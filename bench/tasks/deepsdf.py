@@ -54,8 +54,8 @@ class DeepSDF:
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape."""
-        view, known = scene.given()
-        observed = observed_pixels(known, self.points, seed)
+        view = scene.view
+        observed = observed_pixels(view.mask, self.points, seed)
         rays = view.camera.rays()[observed]
         distance = view.depth[observed] / view.camera.depth(torch.ones(view.depth.shape))[observed]
         shift = self.offset * view.normals[observed]

@@ -79,9 +79,11 @@ class Reconstruction:
         """Learns the field, and judges it before and after."""
         name, inputs = run.inputs.field.name, run.inputs
         check_field_gradient(inputs.renderer)
-        if name != AUTO:  # told before photographs are read
-            with torch.random.fork_rng():
-                check_kind(inputs.renderer, self.appearance.make(name).field)
+        with torch.random.fork_rng():
+            candidates = self.auto.candidates if name == AUTO else (name,)
+            models = {candidate: self.appearance.make(candidate) for candidate in candidates}
+        for model in models.values():  # told before photographs are read
+            check_kind(inputs.renderer, model.field)
         definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = find_subject(
@@ -92,7 +94,8 @@ class Reconstruction:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
             return
         with torch.random.fork_rng():  # so that the run is that of the field which it ends on
-            choice = self.auto.choose(lambda n, part: self.problem(n, part, run), subject, self.optimiser, run)
+            sizes = {name: sum(one.numel() for one in model.parameters()) for name, model in models.items()}
+            choice = self.auto.choose(lambda n, part: self.problem(n, part, run), sizes, subject, self.optimiser, run)
         run.record.notes.append(choice.note)
         solve(lambda: self.problem(choice.kept.name, subject, run), self.optimiser, run, definitions)
         seconds = run.record.seconds

@@ -210,10 +210,12 @@ def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
     return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
 
 
-def test_a_scan_with_a_tangle_keeps_its_surface():
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_scan_with_a_tangle_keeps_its_surface(inverted):
     ball = trimesh.creation.icosphere(5)
     near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
-    mesh = repair(handled(ball, 0, near))
+    tangled = handled(ball, 0, near)
+    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]) if inverted else tangled)
     assert mesh.watertight
     assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
     points, _ = sample_surface(mesh, 2000, seed=0)

@@ -56,7 +56,8 @@ def ended_on(known: dict[str, Known], folder, *, patience: int = 2, given: int =
 
     run = run_of(folder, IDR, ball_prior(), camera_of(16))
     auto = AutoField(tuple(known), 0.25, patience)
-    return auto.choose(make, subject, SETTINGS, run), seen
+    sizes = {name: problem.free for name, problem in known.items()}
+    return auto.choose(make, sizes, subject, SETTINGS, run), seen
 
 
 def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
@@ -64,6 +65,7 @@ def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
     choice, seen = ended_on(known, tmp_path)
     assert [trial.name for trial in choice.trials] == ["small", "middle", "large"]
     assert choice.kept.name == "middle"
+    assert len(seen) == 3
     for part in seen:  # photographs 0 and 8 are set aside, those that are held out are not there
         assert [one.name for one in part.given] == ["1", "2", "3", "4", "5", "6", "7"]
     assert choice.aside == 2
@@ -91,6 +93,9 @@ def test_one_that_fails_is_worse_than_any(tmp_path):
     known = {"a": Known(1, 0.3, failing=True), "b": Known(2, 0.9), "c": Known(3, 0.1, failing=True)}
     choice, _ = ended_on(known, tmp_path)
     assert choice.kept.name == "b"
+    assert "no trial ended well" not in choice.note
+    none, _ = ended_on({"a": Known(1, 0.3, failing=True)}, tmp_path)
+    assert "no trial ended well: lower task.optimiser.learning_rate" in none.note
     assert np.isinf(choice.trials[0].errors).all()
 
 
@@ -100,6 +105,9 @@ def test_the_noise_is_that_of_tiles_not_of_pixels():
     assert replace(one, errors=tiles - 0.01).better_than(one)  # by as much everywhere
     apart = np.tile([0.3, -0.25], 8)
     assert not replace(one, errors=tiles - apart).better_than(one)  # .025 on average, with a standard error of .07
+    for share, better in ((0.9, False), (1.1, True)):
+        gain = share * apart.std(ddof=1) / 4 - apart.mean()
+        assert replace(one, errors=tiles - apart - gain).better_than(one) is better
     assert replace(one, errors=tiles - apart - 0.1).better_than(one)
 
 
@@ -112,7 +120,12 @@ def test_tiles_cover_photographs_of_any_size(tmp_path):
 
 @pytest.mark.parametrize(
     ("changed", "says"),
-    [({"candidates": ()}, "task.auto.candidates"), ({"trial": 0.0}, "task.auto.trial"), ({"patience": 0}, "patience")],
+    [
+        ({"candidates": ()}, "task.auto.candidates"),
+        ({"candidates": ("network_1x8", "network_1x8")}, "must name each once"),
+        ({"trial": 0.0}, "task.auto.trial"),
+        ({"patience": 0}, "patience"),
+    ],
 )
 def test_settings_that_cannot_be_are_refused(changed, says):
     with pytest.raises(ValueError, match=says):

@@ -192,11 +192,27 @@ def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
 
 @pytest.mark.parametrize("field", ["union_3", "prior", "sphere"])
 def test_a_field_without_colours_is_told(scene, tmp_path, field):
-    words = (
-        f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH, grid_N or auto"
-    )
+    words = f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
     with pytest.raises(BadInput, match=words):
         executed(run_in(tmp_path, scene, field=field))
+
+
+@pytest.mark.parametrize("candidates", [("network_1x8", "occupancy_16"), ("sphere",), ("network_1x8", "auto")])
+def test_candidates_that_cannot_be_are_refused_before_photographs_are_taken(scene, tmp_path, monkeypatch, candidates):
+    monkeypatch.setattr(
+        "bench.tasks.reconstruction.find_subject", lambda *_, **__: pytest.fail("photographs were taken")
+    )
+    with pytest.raises((BadInput, Unsupported), match=r"has no colours|needs a distance"):
+        executed(run_in(tmp_path, scene, renderer="newton", field="auto"), **{"auto.candidates": candidates})
+
+
+def test_the_order_of_candidates_does_not_matter(scene, tmp_path):
+    found = []
+    for place, order in enumerate((1, -1)):
+        run = without_pictures(run_in(folder(tmp_path, str(place)), scene, field="auto"))
+        record = executed(run, **{"auto.candidates": ("network_2x16", "network_1x8")[::order]})
+        found.append((record.metrics["field"], record.metrics["field_error"], record.metrics["psnr"]))
+    assert found[0] == found[1]
 
 
 def folder(parent: Path, name: str) -> Path:

@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bench.pictures import style
+from bench.records.record import RunStatus
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import ONE_WAY, SCALE, Record, error, grouped, index, setting
+from bench.report.data.records import ONE_WAY, SCALE, Record, error, family, grouped, index, setting
 from bench.report.data.statistics import geometric_mean, median
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -29,11 +30,11 @@ COLUMNS = (
 )
 RUNS = (FAMILY, configured("depths", "task", "depths"), *IDENTITY, *metrics(*METRICS), *LOOP)
 NOTES = (
-    "All scans are of one object, so there is no interval: a ratio is the geometric mean over scans of the error with "
-    "measured depths over that with exact ones.",
-    "Exact depths are those of the mesh at the pixels that the scanner measured. Points of a scan that lie beside the "
-    "mesh's silhouette are given in the measured case alone.",
-    "A run that did not end ok counts as infinite.",
+    "Scans of one object depend on each other, so there is no interval: a ratio is the geometric mean over scans of "
+    "the error with measured depths over that with exact ones.",
+    "Exact depths are those of the mesh at the pixels that the scanner measured; the mask is that of the mesh in both.",
+    "A run that did not end ok counts as infinite. One that was refused, as where a folder has fewer scans, does not "
+    "count.",
 )
 Pairs = dict[str, list[tuple[float, float]]]  # by metric, a scan's error with exact and with measured depths
 
@@ -60,7 +61,8 @@ def make(experiment: Experiment) -> Result:
 
 def _pairs(records: Sequence[Record]) -> Pairs:
     """The errors of each scan of which there are runs with both kinds of depths."""
-    scans = grouped(records, lambda record: (index(record), record["seed"]))
+    run = [record for record in records if record["status"] != RunStatus.REFUSED]
+    scans = grouped(run, lambda record: (family(record), index(record), record["seed"]))
     both = [{setting(r["config"], "task", "depths"): r for r in runs} for runs in scans.values()]
     return {
         name: [(SCALE * error(two[EXACT], name), SCALE * error(two[MEASURED], name)) for two in both if len(two) == 2]
