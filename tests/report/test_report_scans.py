@@ -1,0 +1,77 @@
+"""The page of completions from a scanner's depths: pairs of runs that differ in their depths alone."""
+
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data.experiments import choose
+from bench.report.pages import scans
+from tests.report.test_report_paper import write_run
+
+DRAGON, BUNNY = "scans/dragon", "scans/bunny"
+
+
+def made(results, depths, error, *, folder=DRAGON, index=0, status="ok", renderer="newton"):
+    """A run whose three errors are `error`, twice and three times that, in thousandths."""
+    metrics = {name: place * error / 1000 for place, name in enumerate(scans.METRICS, 1)}
+    return write_run(
+        results, "scans", renderer, task="completion", dataset="scans", method="", renderer=renderer, status=status,
+        metrics=metrics if status == "ok" else {},
+        settings={"task": {"depths": depths}, "dataset": {"path": folder}, "index": index},
+    )  # fmt: skip
+
+
+def page(results):
+    return scans.make(choose(read_records(results)[0], scans.READS[0], results))
+
+
+def row(results) -> dict[str, str]:
+    (line,) = page(results).table.to_dict("records")
+    return line
+
+
+def test_ratios_are_of_pairs_of_one_scan(tmp_path):
+    for index, exact, measured in ((0, 1.0, 2.0), (1, 4.0, 2.0), (2, 9.0, 72.0)):
+        made(tmp_path, "exact", exact, index=index)
+        made(tmp_path, "measured", measured, index=index)
+    made(tmp_path, "exact", 1000.0, index=3)  # without a partner
+    line = row(tmp_path)
+    assert (line["Depth error, exact"], line["Depth error, measured"]) == ("4.00", "2.00")  # medians
+    assert line["Depth error, ratio"] == "2.00"  # of 2, 1/2 and 8
+    assert line["Chamfer, exact"] == "12.0" and line["Truth to prediction, exact"] == "8.00"
+    assert line["Failed"] == "0 of 7"
+
+
+def test_scans_of_two_objects_are_not_mixed(tmp_path):
+    for folder, exact, measured in ((DRAGON, 1.0, 2.0), (BUNNY, 100.0, 800.0)):
+        made(tmp_path, "exact", exact, folder=folder)
+        made(tmp_path, "measured", measured, folder=folder)
+    assert row(tmp_path)["Depth error, ratio"] == "4.00"  # of 2 and 8
+
+
+@pytest.mark.parametrize(("status", "measured", "ratio"), [("diverged", "∞", "–"), ("refused", "2.00", "2.00")])
+def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, measured, ratio):
+    made(tmp_path, "exact", 1.0)
+    made(tmp_path, "measured", 2.0)
+    made(tmp_path, "exact", 1.0, index=1)
+    made(tmp_path, "measured", 2.0, index=1, status=status)
+    line = row(tmp_path)
+    assert (line["Depth error, measured"], line["Depth error, ratio"]) == (measured, ratio)
+    assert line["Failed"] == "1 of 4"
+
+
+def test_its_figure_has_a_point_for_each_pair(tmp_path):
+    for index, measured in ((0, 2.0), (1, 0.5)):
+        made(tmp_path, "exact", 1.0, index=index)
+        made(tmp_path, "measured", measured, index=index)
+    axes = page(tmp_path).figure.axes
+    assert [axis.get_title() for axis in axes] == [f"{label} × 1000" for label in scans.METRICS.values()]
+    equal, points = axes[0].get_lines()
+    assert sorted(points.get_ydata()) == [0.5, 2.0] and list(points.get_xdata()) == [1.0, 1.0]
+    assert list(equal.get_xdata()) == list(equal.get_ydata())
+
+
+def test_without_a_pair_it_says_so(tmp_path):
+    made(tmp_path, "exact", 1.0)
+    result = page(tmp_path)
+    assert result.table.iloc[0]["Depth error, ratio"] == "–"
+    assert [text.get_text() for text in result.figure.axes[0].texts] == ["no run ended ok"]
