@@ -23,7 +23,7 @@ FORBIDDEN = {  # what the modules of a package may not import
 # The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
 ROOMS = (
     *("hints", "rows", "config", "progress", "records", "machine", "trackers", "shape_prior", "setup", "evaluate"),
-    *("pictures", "turntable", "solve", "models", "reconstruct", "stress", "tasks", "run", "report"),
+    *("pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks", "run", "report"),
 )
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 WITHOUT_TORCH = ("bench.records", "bench.report", "bench.pictures.style", "bench.pictures.size_chart")
