@@ -17,7 +17,7 @@ from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured,
 
 PLACE = 48
 EXACT, MEASURED = "exact", "measured"  # values of task.depths
-READS = (Selection("scans", ("completion",), ("dataset", "task"), ("depths",)),)
+READS = (Selection("scans", ("completion",), ("dataset", "task"), ("depths",), setup=("scenes", "pixels", "machine")),)
 METRICS = {"depth_mae": "depth error", ONE_WAY: "truth to prediction", "chamfer_l2": "Chamfer"}
 COLUMNS = (
     text("method", "Method"),
@@ -84,7 +84,7 @@ def _line(pairs: Pairs) -> dict[str, Any]:
 @style.styled
 def draw(found: dict[tuple[str, str], Pairs]) -> Figure:
     """A panel per metric: the error with measured depths over that with exact ones, a point per scan and method."""
-    figure, axes = chart.sheet(2.6, 1, len(METRICS))
+    figure, axes = chart.sheet(2.9, 1, len(METRICS))
     for axis, (name, label) in zip(axes[0], METRICS.items(), strict=True):
         known = [pair for pairs in found.values() for pair in pairs[name] if np.isfinite(pair).all()]
         if not known:
@@ -99,7 +99,7 @@ def draw(found: dict[tuple[str, str], Pairs]) -> Figure:
         axis.set(title=f"{label} × 1000", xlabel="exact depths", xlim=ends, ylim=ends)
         style.log_axis(axis, "x", ends)
         style.log_axis(axis, "y", ends)
-        axis.set_aspect("equal")
+        axis.set_box_aspect(1)
     axes[0, 0].set_ylabel("measured depths")
     style.legend_below(figure, *axes.flat)
     return figure
