@@ -37,8 +37,8 @@ def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> M
     return extract(Grid(load_file(path)["values"], REACH), grid=2 * SAMPLES, reach=REACH)
 
 
-def most_alike(image: Float[Tensor, "3 height width"], images: Sequence[ImagesOf]) -> int:
-    """The shape one of whose images has the least mean squared difference of colours from an image."""
+def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf]) -> int:
+    """The shape one of whose images has the least mean squared difference from an image, mask included."""
     shown = [torch.stack([one.image(view) for view in range(len(one.cameras))]) for one in images]
     return int(torch.stack([(one - image).square().mean(dim=(1, 2, 3)).min() for one in shown]).argmin())
 

@@ -15,7 +15,7 @@ from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest, file_lock
 from datasets.dataset import Dataset, Split, seed_of
-from datasets.photographs import Photography
+from datasets.photographs import GREY, Photography
 from datasets.truth import Truth, sample_surface
 from datasets.views import ViewSampler
 from renderers.camera import Camera, sphere_span
@@ -46,9 +46,9 @@ class ImagesOf:
     points: Float[Tensor, "points 3"]
     inside: Bool[Tensor, " points"]
 
-    def image(self, view: int) -> Float[Tensor, "3 height width"]:
-        """An image as encoders take it, from 0 to 1."""
-        return as_input(self.colours[view].float() / 255)
+    def image(self, view: int) -> Float[Tensor, "4 height width"]:
+        """An image as encoders take it; see `as_input`."""
+        return as_input(self.colours[view].float() / 255, self.masks[view])
 
     def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
         """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth."""
@@ -69,9 +69,12 @@ class ImagesOf:
         )
 
 
-def as_input(colours: Float[Tensor, "height width 3"]) -> Float[Tensor, "3 height width"]:
-    """An image in the order of axes that encoders take."""
-    return colours.permute(2, 0, 1).contiguous()
+def as_input(
+    colours: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
+) -> Float[Tensor, "4 height width"]:
+    """An image as encoders take it: colours from 0 to 1, grey outside of the mask, and the mask."""
+    channels = torch.where(mask[..., None], colours, GREY).permute(2, 0, 1)
+    return torch.cat([channels, mask[None].float()])
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from renderers.fields.occupancy import OccupancyNetwork
 
 OCCUPANCY, DISTANCE = "occupancy", "distance"
 READINGS = {OCCUPANCY: OccupancyOf, DISTANCE: ScaledOccupancyOf}
+PLACES = 4  # rows and columns to which the encoder's last features are averaged
+CODE_SIZE = 0.3  # standard deviation of the numbers of a code
 GROUPS = 8  # of channels that are normalised together
 
 
@@ -50,28 +52,30 @@ class SingleView(nn.Module):
 
     Source: DVR (Niemeyer et al. 2020), Sec. 3.5: a ResNet-18 whose last layer gives a code of 256, and the network of
         `OccupancyNetwork`.
-    Deviates: the ResNet is not trained before; groups of channels are normalised, not batches, since a step has few
-        images; at desk it has one block in each of four narrow stages; the shape begins as a sphere.
+    Deviates: the ResNet is not trained before; it is given the mask as well; groups of channels are normalised, not
+        batches, since a step has few images; its last features keep 4 x 4 places, and a code is normalised; at desk it
+        has one block in each of four narrow stages; the shape begins as a sphere.
     """
 
     def __init__(self, settings: SingleViewNetwork) -> None:
         super().__init__()
         self.settings = settings
-        stages: list[nn.Module] = [nn.Conv2d(3, settings.channels[0], 7, stride=2, padding=3, bias=False)]
+        stages: list[nn.Module] = [nn.Conv2d(4, settings.channels[0], 7, stride=2, padding=3, bias=False)]
         previous = settings.channels[0]
         for place, channels in enumerate(settings.channels):
             for block in range(settings.blocks):
                 stride = 2 if place and not block else 1
                 stages.append(_Residual(previous, channels, stride))
                 previous = channels
-        self.stages = nn.Sequential(*stages, nn.ReLU())
-        self.code = nn.Linear(previous, settings.code_length)
+        self.stages = nn.Sequential(*stages, nn.ReLU(), nn.AdaptiveAvgPool2d(PLACES), nn.Flatten())
+        self.code = nn.Linear(previous * PLACES**2, settings.code_length)
         self.decoder = OccupancyNetwork(width=settings.width, code_length=settings.code_length)
         begin_as_sphere(self.decoder, settings.radius)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch code_length"]:
-        """The codes of images with colours from 0 to 1."""
-        return self.code(self.stages(2 * images - 1).mean(dim=(-2, -1)))
+    def forward(self, images: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch code_length"]:
+        """The codes of images; see `bench.single_view.images.as_input`."""
+        code = self.code(self.stages(2 * images - 1))
+        return CODE_SIZE * torch.nn.functional.layer_norm(code, code.shape[-1:])
 
     def at(self, code: Float[Tensor, " code_length"]) -> OccupancyOf:
         """The shape of a code, with colours."""

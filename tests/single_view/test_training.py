@@ -91,6 +91,14 @@ def test_images_are_of_the_shape_from_other_cameras_and_points_know_where_they_a
     assert not torch.allclose(cameras[0], cameras[1])
 
 
+def test_an_encoder_is_given_colours_on_the_shape_and_the_mask(images):
+    one = images[2]
+    shown = one.image(1)
+    assert torch.equal(shown[3] > 0, one.masks[1]) and set(shown[3].unique().tolist()) == {0.0, 1.0}
+    assert torch.equal(shown[:3].permute(1, 2, 0)[one.masks[1]], one.colours[1][one.masks[1]].float() / 255)
+    assert bool((shown[:3, ~one.masks[1]] == 0.5).all())
+
+
 def test_images_are_made_once(tmp_path, images, monkeypatch):
     first = IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
     monkeypatch.setattr(Imaging, "of_shape", lambda *_: pytest.fail("made again"))
@@ -126,7 +134,7 @@ def test_every_code_begins_as_the_same_sphere(reads, kind):
         shape = model.at(code)
         assert shape.kind is kind
         assert bool((shape(0.3 * directions) < 0).all()) and bool((shape(0.75 * directions) > 0).all())
-    assert model(torch.rand(2, 3, 16, 16)).shape == (2, 6)
+    assert model(torch.rand(2, 4, 16, 16)).shape == (2, 6)
 
 
 def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
@@ -207,7 +215,7 @@ def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path,
     assert set(record["validation"]) == {"iou_network", "iou_mean_code"} and 0 < record["validation"]["iou_network"] < 1
     assert record["seconds"]["training"] > 0 and len(record["mean_code"]) == 6
     model, _ = made.load(path)
-    image = torch.rand(1, 3, 16, 16)
+    image = torch.rand(1, 4, 16, 16)
     assert torch.equal(model(image), made.load(path)[0](image))
     monkeypatch.setattr("bench.single_view.store.train", lambda *_: pytest.fail("trained again"))
     assert made.make(tmp_path, CPU, silent) == path
