@@ -63,7 +63,7 @@ def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, render
     run = replace(run, inputs=replace(run.inputs, field=FieldChoice("network_2x16", None)))
     depths = Depths("20%", 0.01)
     subject = find_subject(task.images, depths, run.inputs, longest=24, every=task.held_out, masks=True)
-    check(task.problem(subject, run))
+    check(task.problem(run.inputs.field.name, subject, run))
 
 
 def check(problem: Objective) -> None:
