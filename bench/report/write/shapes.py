@@ -30,7 +30,7 @@ from bench.report.write.table import Column, text
 
 ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
 MOST_COLUMNS = 8
-HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore")  # of which more is better
+HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore", "iou", "normal_consistency")  # more is better
 
 
 def _values(value: float | None) -> str:

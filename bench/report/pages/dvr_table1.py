@@ -1,0 +1,113 @@
+"""Table 1 of DVR: shape from one image, by what the training may know, measured and published."""
+
+from dataclasses import replace
+
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import Row, by_shape, error, measured, run_key
+from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
+from bench.report.write import chart
+from bench.report.write.result import Result
+from bench.report.write.shapes import lines_of
+from bench.report.write.table import (
+    FAMILY,
+    IDENTITY,
+    LOOP,
+    Column,
+    metrics,
+    shown,
+    text,
+    thousandfold,
+    to_data,
+    to_table,
+)
+
+PLACE = 44
+READS = (
+    Selection("dvr_table1", ("single_view",), ("dataset", "task", "supervision", "silhouette"), setup=("machine",)),
+)
+NAMES = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
+MEAN = "single_view_mean"  # the row that others are compared with
+# DVR (Niemeyer et al. 2020), Table 1: Chamfer-L1, in tenths of the largest edge of a shape's bounding box.
+PUBLISHED = {
+    "car": {"DVR, RGB": 0.196, "DVR, depth": 0.179, "ONet (3D)": 0.181},
+    "sofa": {"DVR, RGB": 0.224, "DVR, depth": 0.221, "ONet (3D)": 0.217},
+    "table": {"DVR, RGB": 0.280, "DVR, depth": 0.180, "ONet (3D)": 0.185},
+    "plane": {"DVR, RGB": 0.190, "DVR, depth": 0.143, "ONet (3D)": 0.151},
+}
+NOTES = (
+    "Shapes that no training has seen, each from one image; its other images judge the mask and the colours. "
+    "Chamfer-L1 in scene units, times 1000.",
+    "Rows without a training: the zero set of the training shapes' mean distance, the training shape with the nearest "
+    "image, and the training shape that is best by the truth, which no retrieval can beat.",
+    "“Over the mean shape”: the ratio of geometric means of Chamfer-L1 over the same shapes; below 1 is better.",
+    "“Published” is DVR, Table 1: ShapeNet, Chamfer-L1 in tenths of the largest edge of a shape's bounding box, which "
+    "cannot be compared directly with the measured rows.",
+)
+COLUMNS = (
+    *(text("family", "Family"), text("method", "Training"), Column("iou", "IoU")),
+    Column("chamfer_l1", "Chamfer-L1", show=thousandfold),
+    shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
+    shown("Over the mean shape", lambda line: str(line["ratio"]) if line.get("ratio") else ""),
+    *(Column("normal_consistency", "Normals"), Column("mask_iou", "Mask IoU"), Column("psnr", "PSNR")),
+    *(text("failed", "Failed"), text("published", "Published")),
+)
+RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LOOP)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family and row."""
+    lines, cells = [], {}
+    for name, records in experiment.families().items():
+        part = replace(experiment, records=records)
+        errors = {
+            row: {run_key(record): error(record, "chamfer_l1") for record in found}
+            for row, found in part.rows().items()
+        }
+        mean = next((values for row, values in errors.items() if row.preset == MEAN), None)
+        for line, (row, values) in zip(lines_of(part, NAMES), errors.items(), strict=True):
+            cells[name, row] = bootstrap(by_shape(values), median, seed=0)
+            lines.append({"family": name, **line, "interval": cells[name, row], "ratio": _over(values, mean, row)})
+        published = PUBLISHED.get(name.partition("/")[0], {})
+        lines += [
+            {"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published.items()
+        ]
+    return Result(
+        experiment,
+        "Shape from one image.",
+        "Medians over shapes, by what the training of the network may know.",
+        interval="95 % bootstrap intervals over shapes",
+        estimates=cells.values(),
+        remarks=NOTES,
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, lines),
+        figure=draw(experiment),
+    )
+
+
+def _over(values: dict, mean: dict | None, row: Row) -> Interval | None:
+    """The ratio to the mean shape over the shapes that both have."""
+    both = sorted(set(values) & set(mean or {}), key=str)
+    if mean is None or not both or row.preset == MEAN:
+        return None
+    return geometric_ratio(by_shape({key: values[key] for key in both}), by_shape({key: mean[key] for key in both}))
+
+
+@style.styled
+def draw(experiment: Experiment) -> Figure:
+    """A panel per family: the IoU of each shape, a column per row, the median as a line."""
+    families = experiment.families()
+    figure, axes = chart.sheet(2.8, 1, len(families), sharey="row")
+    for axis, (name, records) in zip(axes[0], families.items(), strict=True):
+        rows = replace(experiment, records=records).rows()
+        for place, (row, found) in enumerate(rows.items()):
+            known = [value for record in found if (value := measured(record, "iou")) is not None]
+            if known:
+                chart.points(axis, row.preset, [place] * len(known), known, ms=3, alpha=0.6)
+                axis.plot([place - 0.3, place + 0.3], [median(known)] * 2, color="#222222", lw=1.2)
+        axis.set_xticks(range(len(rows)), [row.name for row in rows], rotation=35, ha="right", fontsize=6)
+        axis.set(title=name, ylim=(0, 1))
+    axes[0, 0].set_ylabel("IoU")
+    return figure
