@@ -27,6 +27,7 @@ PASSIVE = (
         "bench/trackers",
         "bench/merge",
         "bench/tune",
+        "bench/train",
         "bench/photos",
         "bench/turntable",
         "bench/progress.py",

@@ -1,7 +1,7 @@
 """Shape and colour from one image, by a network trained on many shapes (DVR, Sec. 4.1)."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import surface_of
+from bench.evaluate.evaluate import OWN, Evaluation, surface_of
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
 from bench.reconstruct.pictures import draw_reconstruction, draw_surface
 from bench.reconstruct.subject import Subject
@@ -27,6 +27,7 @@ from datasets.photographs import Photography
 from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput, check_at_least, check_choice
+from renderers.fields.coloured import OccupancyOf
 
 NETWORK, MEAN, NEAREST, BEST = "network", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
@@ -34,6 +35,7 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
     "before: of the mean code of all training images",
 }
 REMEDY = "give the same command to `python -m bench.train` first"
+COLOURS = ("psnr", "ssim")  # scores of colours
 DECIDING = ("images", "image_pixels", "network", "supervision", "training")  # settings that determine the network
 
 
@@ -101,19 +103,24 @@ class OneImage:
         check_kind(inputs.renderer, model.at(mean))
         record.notes = [*record.notes, told(trained), "the renderer took part in the training, and judges as own_"]
         with run.off_clock():
-            before = judge(model.at(mean), subject, inputs)
-            record.metrics_start = before.metrics | {"iou": overlap(model.at(mean), images, inputs.device)}
+            before = self._judged(model.at(mean), images, subject, inputs)
+            record.metrics_start = before.metrics
         clock = time.perf_counter()
         with torch.no_grad():
             shape = model.at(model(images.image(self.given)[None].to(inputs.device))[0])
             surface_of(shape, inputs)
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         with run.off_clock():
-            after = judge(shape, subject, inputs)
-            after.metrics["iou"] = overlap(shape, images, inputs.device)
-            note_result(run, after)
+            note_result(run, self._judged(shape, images, subject, inputs))
             if inputs.evaluation.picture is not None:
                 draw_reconstruction(run.folder, inputs, shape, subject, [], _title(run))
+
+    def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
+        """The scores of a network's shape; of its colours only where its training knew some."""
+        found = judge(shape, subject, inputs)
+        known = self.supervision.losses.colour or self.supervision.losses.colour_gradient
+        scores = {name: x for name, x in found.metrics.items() if known or name.removeprefix(OWN) not in COLOURS}
+        return replace(found, metrics=scores | {"iou": overlap(shape, images, inputs.device)})
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""

@@ -64,6 +64,14 @@ def test_it_is_trained_and_gives_a_shape_with_colours(folder, network):
         assert (run / name).stat().st_size > 1000
 
 
+def test_colours_are_not_judged_where_the_training_knew_none(folder, capsys):
+    volume = ("supervision=occupancy", f"results_dir={folder}", "evaluation.picture=null")
+    assert trained(capsys, *TINY, *volume)[0] == 0
+    record = record_of(command(*TINY, *volume).out)
+    assert {"iou", "chamfer_l1", "own_mask_iou"} < set(record["metrics"])
+    assert not {"psnr", "ssim", "own_psnr", "own_ssim"} & {*record["metrics"], *record["metrics_start"]}
+
+
 def test_without_its_network_it_names_the_command(tmp_path):
     done = command(*TINY, f"results_dir={tmp_path}")
     assert done.code != 0
