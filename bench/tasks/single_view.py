@@ -101,7 +101,8 @@ class OneImage:
         model = model.to(inputs.device)
         mean = torch.tensor(trained["mean_code"], device=inputs.device)
         check_kind(inputs.renderer, model.at(mean))
-        record.notes = [*record.notes, told(trained), "the renderer took part in the training, and judges as own_"]
+        part = "took part in the training, and" if self.supervision.renders else "took no part in the training; it"
+        record.notes = [*record.notes, told(trained), f"the renderer {part} judges as own_"]
         with run.off_clock():
             before = self._judged(model.at(mean), images, subject, inputs)
             record.metrics_start = before.metrics
