@@ -15,6 +15,7 @@ from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest, file_lock
 from datasets.dataset import Dataset, Split, seed_of
+from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography
 from datasets.truth import Truth, sample_surface
 from datasets.views import ViewSampler
@@ -108,7 +109,8 @@ class Imaging:
 
     def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:
         """The images of one shape, from cameras and with a texture of its own."""
-        truth, mesh, seed = (made := dataset.mesh(split, index)) and Truth(made), made, seed_of(split, index)
+        mesh, seed = dataset.mesh(split, index), seed_of(split, index)
+        truth = Truth(mesh)
         cameras = [self.sampler.draw(seed * self.photography.views + view) for view in range(self.photography.views)]
         shots = self.photography.take_from(truth, cameras, seed=seed)
         points = _points(mesh, seed)
@@ -126,7 +128,8 @@ class Imaging:
         return replace(self, sampler=replace(self.sampler, resolution=pixels))
 
 
-def _points(mesh, seed: int) -> Float[np.ndarray, "points 3"]:
+def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:
+    """Points in the cube, then points near the surface."""
     draw = np.random.default_rng([seed, 3])
     near = sample_surface(mesh, POINTS // 2, seed)[0] + NEAR * draw.standard_normal((POINTS // 2, 3))
     return np.concatenate([draw.uniform(-CUBE, CUBE, (POINTS - len(near), 3)), near])
