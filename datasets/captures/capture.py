@@ -77,11 +77,13 @@ def read_capture(
         raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
     given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
     sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(given)
+    largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
+    whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
     return Capture(
         layout.format,
         tuple(shot.within(sphere.centre, sphere.radius) for shot in shots),
         source if masked else "",
         sphere,
-        layout.notes,
+        (*layout.notes, *whole),
     )

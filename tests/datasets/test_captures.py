@@ -380,3 +380,14 @@ def test_a_hull_is_no_smaller_than_the_ball(tmp_path):
     place = torch.from_numpy((CENTRE - capture.sphere.centre) / capture.sphere.radius).float()
     ball = sphere(RADIUS / capture.sphere.radius, tuple(place.tolist()))
     assert hull.watertight and ball(torch.from_numpy(hull.vertices).float()).min() > -0.05
+
+
+def test_photographs_that_are_smaller_than_was_asked_for_are_told(tmp_path):
+    nerf(tmp_path)
+    small = read_capture(tmp_path, longest=16)
+    assert not any("pixels, not" in note for note in small.notes)
+    size = max(small.shots[0].colours.shape)
+    assert size == 16
+    whole = read_capture(tmp_path, longest=4096)
+    largest = max(max(shot.colours.shape) for shot in whole.shots)
+    assert whole.notes[-1] == f"the photographs have at most {largest} pixels, not 4096"
