@@ -18,6 +18,7 @@ from renderers.checks import BadInput
 from renderers.field import Field
 from renderers.rendering import Renderer
 
+TILES = 4  # of a view along each side
 FREE = 4  # points known to lie outside, on each ray that has some
 
 
@@ -205,6 +206,12 @@ def held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], foo
     mask = part.observed if part.mask is None else part.mask
     numbered = group.to(known.device)[known].unique(return_inverse=True)[1]
     return HeldOut(part.rays, part.depth / part.depth_of_distance, part.observed, mask, numbered, footprint)
+
+
+def tiles(height: int, width: int) -> Int[Tensor, " pixels"]:
+    """The tile of each pixel of a view, from 0, by rows: what is held out together, or judged as one."""
+    rows, columns = torch.arange(height) * TILES // height, torch.arange(width) * TILES // width
+    return (rows[:, None] * TILES + columns).flatten()
 
 
 def generator(seed: int, iteration: int) -> torch.Generator:

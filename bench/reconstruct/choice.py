@@ -6,9 +6,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from bench.models.model import Size
+from bench.models.observations import TILES, tiles
 from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
 from bench.records.record import RunStatus
@@ -19,8 +21,6 @@ from datasets.shot import Shot
 from renderers.checks import check_at_least, check_share
 
 ASIDE = 8  # of so many given photographs one is set aside for the trials
-TILES = 4  # of a photograph along each side: a group of pixels whose errors are taken as one
-BYTES = 4  # of a float32
 DEFINITIONS = {
     "field": "the field that field=auto ended on",
     "field_free, field_stored, field_bytes": "the numbers of its field and its colours, all of which are learnt, and "
@@ -146,10 +146,10 @@ class Choice:
 
     def metrics(self, loop: float) -> dict[str, Any]:
         """The metrics of `DEFINITIONS`, for a run whose loop took so many seconds."""
-        free, error = self.kept.free, float(self.kept.errors.mean())
-        size = {"field_free": free, "field_stored": free, "field_bytes": BYTES * free}
+        size, error = Size(self.kept.free, self.kept.free), float(self.kept.errors.mean())
+        sizes = {"field_free": size.free, "field_stored": size.stored, "field_bytes": size.bytes}
         overhead = {"field_overhead": 1 + self.seconds / max(loop, 1e-9), "fields_tried": len(self.trials)}
-        return {"field": self.kept.name, **size, "field_error": error, **overhead}
+        return {"field": self.kept.name, **sizes, "field_error": error, **overhead}
 
 
 def _tried(
@@ -163,16 +163,11 @@ def _tried(
 
     optimise(problem, brief, run.inputs.device, history=history, on_step=on_step)
     costs = free, history.seconds["forward"] + history.seconds["backward"], history.counts.value
-    groups = torch.cat([_tiles(shot) + place * TILES**2 for place, shot in enumerate(aside)])
+    groups = torch.cat(
+        [tiles(shot.camera.height, shot.camera.width) + place * TILES**2 for place, shot in enumerate(aside)]
+    )
     if history.status is not RunStatus.OK:
         return Trial(name, np.full(len(aside) * TILES**2, np.inf), *costs)
     errors = problem.colour_errors(Stack.of(aside, None, run.inputs.device).pixels).cpu()
     sums = torch.bincount(groups, errors.double()) / torch.bincount(groups)
     return Trial(name, sums.numpy(), *costs)
-
-
-def _tiles(shot: Shot) -> Int[Tensor, " pixels"]:
-    """The tile of each pixel, by rows."""
-    height, width = shot.camera.height, shot.camera.width
-    rows, columns = torch.arange(height) * TILES // height, torch.arange(width) * TILES // width
-    return (rows[:, None] * TILES + columns).flatten()

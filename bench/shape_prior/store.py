@@ -12,6 +12,7 @@ import torch
 from omegaconf import DictConfig
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from bench.config import build
 from bench.machine.environment import describe
@@ -79,11 +80,16 @@ def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: 
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{dataset.name}-{record['key']}.safetensors"
-    scratch = path.with_suffix(f".{os.getpid()}.partial")  # one per process: runs may be simultaneous
-    save_file({**prior.decoder.state_dict(), "codes": prior.codes}, scratch)
     write_text(path.with_suffix(".json"), to_json(record))
-    scratch.replace(path)
+    save_whole({**prior.decoder.state_dict(), "codes": prior.codes}, path)
     return path
+
+
+def save_whole(tensors: dict[str, Tensor], path: Path) -> None:
+    """Writes tensors atomically: another process finds all of the file, or none."""
+    scratch = path.with_suffix(f".{os.getpid()}.partial")  # one per process: runs may be simultaneous
+    save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, scratch)
+    scratch.replace(path)
 
 
 def probe(dataset: Dataset) -> list[float]:

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from bench.evaluate.evaluate import Surface, surface_metrics
 from bench.progress import Report
 from bench.records.files import digest, file_lock
+from bench.shape_prior.store import save_whole
 from bench.single_view.images import ImagesOf
 from datasets.dataset import Dataset, Split
 from datasets.extract import extract
@@ -33,7 +34,7 @@ def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> M
             for index in range(count):
                 progress("averaging shapes", index, count)
                 total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(SAMPLES, REACH)
-            save_file({"values": torch.from_numpy(total / count).float()}, path)
+            save_whole({"values": torch.from_numpy(total / count).float()}, path)
     return extract(Grid(load_file(path)["values"], REACH), grid=2 * SAMPLES, reach=REACH)
 
 

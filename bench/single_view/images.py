@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest, file_lock
+from bench.shape_prior.store import save_whole
 from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography
@@ -104,7 +105,7 @@ class Imaging:
                     made.append(self.of_shape(dataset, split, index))
                 progress("rendering images", count, count)
                 tensors = _packed(made)
-                save_file(tensors, path)
+                save_whole(tensors, path)
         return _unpacked(tensors)
 
     def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from bench.machine.environment import describe
 from bench.progress import Report
 from bench.records.files import digest, file_lock, to_json, write_text
-from bench.shape_prior.store import SHIPPED
+from bench.shape_prior.store import SHIPPED, save_whole
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.training import Course, Failed, Supervision, TrainingSettings, train
@@ -110,9 +110,7 @@ class Recipe:
             found = _found(model, course, unseen, mean, device)
             seconds = {"images": made, "training": course.seconds}
             self._write(path, {"status": "ok", "reason": "", "seconds": seconds, **found}, device)
-            scratch = path.with_suffix(".writing")
-            save_file({name: tensor.cpu() for name, tensor in model.state_dict().items()}, scratch)
-            scratch.replace(path)
+            save_whole(model.state_dict(), path)
         return path
 
     def _write(self, path: Path, more: dict[str, Any], device: torch.device) -> None:

@@ -3,21 +3,23 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import cos, isfinite, pi
+from math import isfinite
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from bench.progress import Report
 from bench.reconstruct.losses import Losses
+from bench.shape_prior.store import save_whole
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
+from bench.solve.problem import OptimiserSettings
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Meter, occupancy_logits
-from renderers.fields.coloured import LOGIT_WIDTH
+from renderers.fields.coloured import LOGIT_WIDTH, OccupancyOf
 from renderers.rendering import Renderer, at_iteration
 
 LARGEST_GRADIENT = 1.0  # norm to which a step's gradient is shortened
@@ -77,7 +79,7 @@ class TrainingSettings:
 
     def rate(self, step: int) -> float:
         """The learning rate of a step, counted from 0."""
-        return self.learning_rate * 0.5 * (1 + cos(pi * step / self.steps))
+        return OptimiserSettings(self.steps, self.learning_rate, "cosine").rate(step)
 
 
 @dataclass
@@ -87,18 +89,16 @@ class Course:
     losses: list[float] = field(default_factory=list)
     seconds: float = 0.0
     counts: Counts = field(default_factory=Counts)
-    reason: str = ""  # why it ended early
 
 
 class Failed(ValueError):
-    """The loss or a weight became NaN; `kept` is the number of steps of the last state on disk."""
+    """The loss or a weight became NaN at a step; `kept` is the number of steps of the last state on disk."""
 
     def __init__(self, step: int, kept: int, path: Path) -> None:
         super().__init__(
             f"the training failed: not a number at step {step}; the state after {kept} steps is in {path}: "
             "lower task.training.learning_rate"
         )
-        self.step, self.kept = step, kept
 
 
 def train(
@@ -129,12 +129,15 @@ def train(
     torch.manual_seed(settings.seed)
     model = SingleView(network).to(device)
     optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
-    begun = _restored(state, model, optimiser, course)
+    begun, lessons = (
+        _restored(state, model, optimiser, course),
+        Lessons(images, supervision, renderer, settings, device),
+    )
     for step in range(begun, settings.steps):
         started = time.perf_counter()
         for group in optimiser.param_groups:
             group["lr"] = settings.rate(step)
-        loss = _step(model, images, supervision, at_iteration(renderer, step), settings, step, course.counts, device)
+        loss = lessons.give(model, step, course.counts)
         norm = torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
         if not isfinite(loss) or not bool(norm.isfinite()):
             raise Failed(step, step - step % settings.keep_every, state)
@@ -148,59 +151,50 @@ def train(
     return model.eval().requires_grad_(False), course
 
 
-def _step(
-    model: SingleView,
-    images: Sequence[ImagesOf],
-    supervision: Supervision,
-    renderer: Renderer,
-    settings: TrainingSettings,
-    step: int,
-    counts: Counts,
-    device: torch.device,
-) -> float:
-    """The mean loss over a step's shapes, whose gradients are left in the weights; one shape's graph at a time."""
-    draw = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
-    torch.manual_seed(draw.initial_seed())  # of what the losses draw
-    chosen = torch.randperm(len(images), generator=draw)[: settings.shapes_per_step].tolist()
-    views = len(images[0].cameras)
-    inputs = torch.randint(views, (len(chosen),), generator=draw).tolist()
-    shown = torch.stack([images[shape].image(view) for shape, view in zip(chosen, inputs, strict=True)])
-    for parameter in model.parameters():
-        parameter.grad = None
-    codes = model(shown.to(device))
-    cut = codes.detach().requires_grad_()
-    total = 0.0
-    for place, shape in enumerate(chosen):
-        terms = _terms(model, cut[place], images[shape], supervision, renderer, settings.rays, draw, counts, device)
-        loss = torch.stack(terms).sum() / len(chosen)
-        loss.backward()
-        total += loss.item()
-    codes.backward(cut.grad)
-    return total
+@dataclass(frozen=True)
+class Lessons:
+    """What the steps of a training are made of; see `train`."""
 
+    images: Sequence[ImagesOf]
+    supervision: Supervision
+    renderer: Renderer
+    settings: TrainingSettings
+    device: torch.device
 
-def _terms(
-    model: SingleView,
-    code: Tensor,
-    images: ImagesOf,
-    supervision: Supervision,
-    renderer: Renderer,
-    rays: int,
-    draw: torch.Generator,
-    counts: Counts,
-    device: torch.device,
-) -> list[Tensor]:
-    shape, terms = model.at(code), []
-    if supervision.renders:
-        view = int(torch.randint(len(images.cameras), (1,), generator=draw))
-        pixels = images.pixels(view, rays, draw, device)
-        terms.append(supervision.losses(renderer, shape, Meter(shape, counts), pixels)["total"])
-    if supervision.occupancy:
-        known = torch.randint(len(images.points), (supervision.points,), generator=draw)
-        logits = occupancy_logits(shape, shape(images.points[known].to(device)), width=LOGIT_WIDTH)
-        inside = images.inside[known].to(logits)
-        terms.append(supervision.occupancy * binary_cross_entropy_with_logits(logits, inside))
-    return terms
+    def give(self, model: SingleView, step: int, counts: Counts) -> float:
+        """The mean loss over a step's shapes, whose gradients are left in the weights; one shape's graph at a time."""
+        draw = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + step)
+        torch.manual_seed(draw.initial_seed())  # of what the losses draw
+        chosen = torch.randperm(len(self.images), generator=draw)[: self.settings.shapes_per_step].tolist()
+        inputs = torch.randint(len(self.images[0].cameras), (len(chosen),), generator=draw).tolist()
+        shown = torch.stack([self.images[shape].image(view) for shape, view in zip(chosen, inputs, strict=True)])
+        for parameter in model.parameters():
+            parameter.grad = None
+        codes = model(shown.to(self.device))
+        cut, renderer, total = codes.detach().requires_grad_(), at_iteration(self.renderer, step), 0.0
+        for place, number in enumerate(chosen):
+            shape = model.at(cut[place])
+            terms = self._terms(renderer, shape, Meter(shape, counts), self.images[number], draw)
+            loss = torch.stack(terms).sum() / len(chosen)
+            loss.backward()
+            total += loss.item()
+        codes.backward(cut.grad)
+        return total
+
+    def _terms(
+        self, renderer: Renderer, shape: OccupancyOf, metered: Meter, images: ImagesOf, draw: torch.Generator
+    ) -> list[Tensor]:
+        terms, given = [], self.supervision
+        if given.renders:
+            view = int(torch.randint(len(images.cameras), (1,), generator=draw))
+            pixels = images.pixels(view, self.settings.rays, draw, self.device)
+            terms.append(given.losses(renderer, shape, metered, pixels)["total"])
+        if given.occupancy:
+            known = torch.randint(len(images.points), (given.points,), generator=draw)
+            logits = occupancy_logits(shape, shape(images.points[known].to(self.device)), width=LOGIT_WIDTH)
+            inside = images.inside[known].to(logits)
+            terms.append(given.occupancy * binary_cross_entropy_with_logits(logits, inside))
+        return terms
 
 
 def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> None:
@@ -210,9 +204,7 @@ def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Co
     tensors["losses"] = torch.tensor(course.losses, dtype=torch.float64)
     spent = (course.seconds, course.counts.value, course.counts.gradient, course.counts.coarse)
     tensors["spent"] = torch.tensor(spent, dtype=torch.float64)
-    scratch = path.with_suffix(".writing")
-    save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, scratch)
-    scratch.replace(path)
+    save_whole(tensors, path)
 
 
 def _restored(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> int:

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bench.models.field import solve_by_growth
-from bench.models.observations import Holdout, Observations, hold_out, together
+from bench.models.observations import Holdout, Observations, hold_out, tiles, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
@@ -24,7 +24,7 @@ from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
 MEASURED, EXACT = "measured", "exact"
-HELD_OUT, TILES = 0.2, 4  # share of the observations that is held out; tiles of the view along each side
+HELD_OUT = 0.2  # share of the observations that is held out, by tiles of the view
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,10 @@ class Completion:
     ) -> tuple[Observations, Given]:
         """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
         view, observed = self._given(scene, renderer, seed=seed, device=device)
-        camera, (rows, columns) = scene.view.camera, observed.shape
-        tile = (torch.arange(rows) * TILES // rows)[:, None] * TILES + torch.arange(columns) * TILES // columns
+        camera = scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         split = Holdout(HELD_OUT, (), half_pixel, seed)
-        held = hold_out(together([view]), tile.flatten(), split, rays=observed.numel())
+        held = hold_out(together([view]), tiles(*observed.shape), split, rays=observed.numel())
         return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
     def _given(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bench.reconstruct.choice import ASIDE, TILES, AutoField, Choice, Trial
+from bench.models.observations import TILES
+from bench.reconstruct.choice import ASIDE, AutoField, Choice, Trial
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.subject import Subject
 from bench.solve.problem import OptimiserSettings

@@ -10,11 +10,10 @@ import trimesh
 
 from bench.config import load
 from bench.reconstruct.losses import Losses
-from bench.single_view import training
 from bench.single_view.images import NEAR, POINTS, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.store import Recipe, overlap
-from bench.single_view.training import Failed, Supervision, TrainingSettings, train
+from bench.single_view.training import Failed, Lessons, Supervision, TrainingSettings, train
 from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.views import ViewSampler
@@ -186,13 +185,13 @@ def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_p
 
 
 def test_a_step_that_is_no_number_keeps_the_last_state(images, renderer, tmp_path, monkeypatch):
-    step = training._step
+    give = Lessons.give
 
-    def spoilt(model, *rest):
-        loss = step(model, *rest)
-        return float("nan") if rest[4] == 5 else loss
+    def spoilt(self, model, step, counts):
+        loss = give(self, model, step, counts)
+        return float("nan") if step == 5 else loss
 
-    monkeypatch.setattr(training, "_step", spoilt)
+    monkeypatch.setattr(Lessons, "give", spoilt)
     with pytest.raises(Failed, match=r"number at step 5; the state after 4 steps is in .*: lower task\.training"):
         trained(images, renderer, tmp_path / "s.state")
     assert (tmp_path / "s.state").exists()
