@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from datasets.scene import see
 from datasets.shot import Shot
-from datasets.textures import TEXTURES, Texture, make_texture
+from datasets.textures import ONE_COLOUR, TEXTURES, Texture, make_texture
 from datasets.truth import Truth
 from datasets.views import look_at
 from renderers.camera import Camera
@@ -57,8 +57,8 @@ class Photography:
         check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
         check_choice("shading", self.shading, ("unlit", "lambertian"))
         check_choice("background", self.background, ("grey", "noise"))
-        if (self.texture, self.shading) == ("plain", "unlit"):
-            raise ValueError("a plain texture without shading has nothing to compare: set shading=lambertian")
+        if self.texture in ONE_COLOUR and self.shading == "unlit":
+            raise ValueError("a texture of one colour without shading has nothing to compare: set shading=lambertian")
         for name in ("noise", "blur", "exposure"):
             check_at_least(f"{name}", getattr(self, name), 0, f"{name}=0 switches it off")
 

@@ -8,12 +8,14 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
 PHOTOGRAPHS = ("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "rocket")  # that scikit-image ships
-TEXTURES = ("noise", "plain", *PHOTOGRAPHS)
+ONE_COLOUR = ("painted", "plain")
+TEXTURES = ("noise", *ONE_COLOUR, *PHOTOGRAPHS)
 LATTICE = 64  # random colours per axis, after which solid noise repeats
 OCTAVES = 3  # each halves the cells and the weight
 CONTRAST = 2.0  # factor that spreads averages of random numbers, which lie near a half
 SHARPNESS = 4.0  # power of the normal's components in the blend of the three projections
 PLAIN = 0.75  # brightness of a surface without texture
+PAINT = (0.3, 1.0)  # range of the channels of a paint
 
 
 Texture = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
@@ -24,14 +26,18 @@ def make_texture(name: str, size: float, seed: int) -> Texture:
     """A texture by name.
 
     Args:
-        name: "noise", "plain", or a photograph, projected along x, y and z and blended by the normal.
+        name: "noise"; "plain", grey; "painted", one random colour; or a photograph, projected along x, y and z and
+            blended by the normal.
         size: of noise's coarsest cells, or of a photograph's shorter side on the surface, in scene units.
-        seed: of noise.
+        seed: of noise and paint.
     """
     if name == "noise":
         return lambda points, normals: _solid_noise(points, size, seed)
     if name == "plain":
         return lambda points, normals: np.full(points.shape, PLAIN)
+    if name == "painted":
+        paint = np.random.default_rng(seed).uniform(*PAINT, 3)
+        return lambda points, normals: np.broadcast_to(paint, points.shape)
     return lambda points, normals: _triplanar(points, normals, photograph(name), size)
 
 

@@ -20,6 +20,7 @@ from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
+from datasets.photographs import turned
 from datasets.scene import View
 from datasets.shot import Shot
 from renderers.camera import Camera
@@ -47,6 +48,37 @@ def draw_reconstruction(
 def draw_surface(folder: Path, inputs: RunInputs, mesh: Mesh, subject: Subject, title: str) -> None:
     """Writes summary.png, input.png and images.npz of a mesh with colours."""
     _save(folder, painter(mesh), inputs, subject, title)
+
+
+def draw_picture(
+    folder: Path, mesh: Mesh, given: Float[Tensor, "4 height width"], camera: Camera, size: int, title: str
+) -> None:
+    """Writes summary.png: a picture of one's own, and the shape from the view that is most alike and from others.
+
+    Args:
+        folder: of the run.
+        mesh: the shape, with colours.
+        given: the picture as the encoder is given it.
+        camera: the view that is most alike.
+        size: pixels of a rendering.
+        title: of the picture.
+    """
+    seen = painter(mesh)
+    camera = camera.resized(size, size)
+    views = [seen(turned(camera, angle)) for angle in (0.0, np.pi / 2, np.pi)]
+    with rc_context(SCREEN):
+        figure = Figure(figsize=(9.6, 2.9), layout="constrained")
+        axes = figure.subplots(1, 5)
+        axes[0].imshow(given[:3].permute(1, 2, 0).numpy(), interpolation="nearest")
+        for axis, (view, image) in zip(axes[1:4], views, strict=True):
+            axis.imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
+        axes[4].imshow(normals_image(views[0][0]))
+        names = ("given, as the encoder sees it", "view most alike", "turned by 90°", "turned by 180°", "its normals")
+        for axis, name in zip(axes, names, strict=True):
+            bare(axis)
+            axis.set_title(name, fontsize=8)
+        figure.suptitle(title)
+        figure.savefig(folder / "summary.png", dpi=110, bbox_inches="tight")
 
 
 def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:

@@ -37,6 +37,7 @@ PASSIVE = (
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
+FILE_KEYS = ("path", "image_path", "mask_path")  # of files that a run reads
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"
@@ -69,11 +70,11 @@ class Identity:
 
     @cached_property
     def code(self) -> str:
-        """Hash of our code and the user's, of the versions of libraries, and of the files that keys `path` name."""
+        """Hash of our code and the user's, of the versions of libraries, and of the files that `FILE_KEYS` name."""
         named = [str(package) for package in self.config.get("packages") or []]
         named += [target.split(".")[0] for target in _values(self.config, "_target_")]
         users = tuple(sorted(set(named) - set(OURS)))
-        files = [_content(Path(path)) for path in _values(self.config, "path")]
+        files = [_content(Path(path)) for key in FILE_KEYS for path in _values(self.config, key)]
         return digest([_our_code(), *(_package(name) for name in users), *files])
 
 

@@ -52,6 +52,17 @@ class ImagesOf:
         """An image as encoders take it; see `as_input`."""
         return as_input(self.colours[view].float() / 255, self.masks[view])
 
+    def first(self, views: int | None) -> "ImagesOf":
+        """The first images, or all of them; the points stay."""
+        kept = slice(views)
+        return replace(
+            self,
+            cameras=self.cameras[kept],
+            colours=self.colours[kept],
+            masks=self.masks[kept],
+            depths=self.depths[kept],
+        )
+
     def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
         """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth."""
         camera = self.cameras[view]

@@ -20,6 +20,7 @@ from bench.records.files import digest, file_lock, to_json, write_text
 from bench.shape_prior.store import SHIPPED, save_whole
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
+from bench.single_view.own_image import filled_share
 from bench.single_view.training import Course, Failed, Supervision, TrainingSettings, train
 from datasets.dataset import Dataset, Split
 from renderers.checks import BadInput
@@ -94,7 +95,8 @@ class Recipe:
                 return found
             path = cache / f"{self.stem}.safetensors"
             started = time.perf_counter()
-            images = self.imaging.images(self.dataset, Split.TRAIN, self.training.shapes, cache, progress)
+            rendered = self.imaging.images(self.dataset, Split.TRAIN, self.training.shapes, cache, progress)
+            images = [one.first(self.training.views) for one in rendered]
             made = time.perf_counter() - started
             state = path.with_suffix(".state")
             try:
@@ -109,6 +111,7 @@ class Recipe:
             unseen = self.imaging.images(self.dataset, Split.VALIDATION, VALIDATION, cache, progress)
             found = _found(model, course, unseen, mean, device)
             seconds = {"images": made, "training": course.seconds}
+            found["filled"] = filled_share(torch.cat([one.masks for one in rendered]))
             self._write(path, {"status": "ok", "reason": "", "seconds": seconds, **found}, device)
             save_whole(model.state_dict(), path)
         return path

@@ -56,6 +56,7 @@ class TrainingSettings:
 
     Args:
         shapes: number of training shapes.
+        views: images of each that are used, the first of those that are rendered; None: all.
         steps: optimiser steps, each on `shapes_per_step` shapes, an input image and another one of each.
         shapes_per_step: their number.
         rays: of each shape's other image.
@@ -65,6 +66,7 @@ class TrainingSettings:
     """
 
     shapes: int
+    views: int | None
     steps: int
     shapes_per_step: int
     rays: int
@@ -75,6 +77,7 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         for name in ("shapes", "steps", "shapes_per_step", "rays", "keep_every"):
             check_at_least(f"task.training.{name}", getattr(self, name), 1, "conf/scale has values that work")
+        check_at_least("task.training.views", self.views or 1, 1, "24 are rendered")
         check_positive("task.training.learning_rate", self.learning_rate, "1e-3 works")
 
     def rate(self, step: int) -> float:

@@ -70,12 +70,17 @@ class GivenView:
         return GivenView(
             settings=settings,
             renderer=renderer,
-            rays=view.camera.rays().to(device),
-            depth=view.depth.to(device),
-            depth_of_distance=view.camera.depth(torch.ones(view.depth.shape)).to(device),
-            observed=observed.to(device),
-            mask=None if mask is None else mask.to(device),
-        )
+            rays=view.camera.rays(),
+            depth=view.depth,
+            depth_of_distance=view.camera.depth(torch.ones(view.depth.shape)),
+            observed=observed,
+            mask=mask,
+        ).to(device)
+
+    def to(self, device: torch.device) -> "GivenView":
+        """The same on a device."""
+        parts = {name: getattr(self, name).to(device) for name in ("rays", "depth", "depth_of_distance", "observed")}
+        return replace(self, **parts, mask=None if self.mask is None else self.mask.to(device))
 
     def some(self, rays: Int[Tensor, " n"]) -> "GivenView":
         """The observations of some rays of one row."""

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,19 +10,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.evaluate.colours import vertex_colours
 from bench.evaluate.evaluate import OWN, Evaluation, surface_of
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
-from bench.reconstruct.pictures import draw_reconstruction, draw_surface
+from bench.reconstruct.pictures import draw_picture, draw_reconstruction, draw_surface
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import with_colours
+from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
-from bench.single_view.network import SingleViewNetwork
+from bench.single_view.network import SingleView, SingleViewNetwork
+from bench.single_view.own_image import best_view, read_picture
+from bench.single_view.search import MaskSearch
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.problem import check_field_gradient, check_kind
-from bench.solve.solve import COSTS, note_result
+from bench.solve.solve import COSTS, descend, failure_of, note_result
 from datasets.dataset import Split
 from datasets.photographs import Photography
 from datasets.shot import Shot
@@ -29,14 +34,21 @@ from datasets.truth import Truth
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.fields.coloured import OccupancyOf
 
-NETWORK, MEAN, NEAREST, BEST = "network", "mean", "nearest", "best"
+NETWORK, CODE, MEAN, NEAREST, BEST = "network", "code", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
     "before: of the mean code of all training images",
 }
-REMEDY = "give the same command to `python -m bench.train` first"
+REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
 COLOURS = ("psnr", "ssim")  # scores of colours
 DECIDING = ("images", "image_pixels", "network", "supervision", "training")  # settings that determine the network
+FITTED = "fitted_mask_iou"
+OF_PICTURE = {
+    FITTED: "Of the mask of the given picture and the silhouette of the shape from the best of many views, both scaled "
+    "to the same box: number of pixels that are foreground in both divided by the number that are foreground in at "
+    "least one. The camera of the picture is not known, so that nothing else can be judged.",
+}
+TRIED = 200  # views in the search for that of a picture
 
 
 @dataclass(frozen=True)
@@ -44,14 +56,18 @@ class OneImage:
     """A shape from one image of it; the other images of the shape judge it.
 
     Args:
-        method: "network"; or without one, the "mean" of the training shapes, that with the "nearest" image, or the one
-            that is "best" by the truth.
+        method: "network"; or without one, the prior's "code" that is found by the image's mask, the "mean" of the
+            training shapes, that with the "nearest" image, or the one that is "best" by the truth.
         images: that are rendered of each shape, from random cameras of `view`.
         image_pixels: height and width of these.
         given: number of the image that is given.
         network: its sizes.
         supervision: what its training may know.
         training: of the network, by `python -m bench.train`.
+        search: of the prior's code.
+        train: whether a run trains the network where there is none; else it is refused.
+        image_path: of a picture of one's own, which takes the place of the dataset's shape; None without.
+        mask_path: of its mask; None: its alpha channel.
     """
 
     method: str
@@ -61,12 +77,25 @@ class OneImage:
     network: SingleViewNetwork
     supervision: Supervision
     training: TrainingSettings
+    search: MaskSearch
+    train: bool = False
+    image_path: str | None = None
+    mask_path: str | None = None
 
     def __post_init__(self) -> None:
-        check_choice("task.method", self.method, (NETWORK, MEAN, NEAREST, BEST))
+        check_choice("task.method", self.method, (NETWORK, CODE, MEAN, NEAREST, BEST))
         check_at_least("task.image_pixels", self.image_pixels, 16, "64 shows the shape")
         if not 0 <= self.given < self.images.views:
             raise ValueError(f"task.given must be one of the {self.images.views} images, not {self.given}: 0")
+        if self.image_path is not None and self.method != NETWORK:
+            raise ValueError(f"task.image_path needs task.method=network, not {self.method}: a picture has no truth")
+        if self.mask_path is not None and self.image_path is None:
+            raise ValueError("task.mask_path is the mask of a picture: give task.image_path as well")
+
+    @property
+    def knows_colours(self) -> bool:
+        """Whether the training knows any colour."""
+        return any((self.supervision.losses.colour, self.supervision.losses.colour_gradient))
 
     def recipe(self, inputs: RunInputs, config: dict[str, Any]) -> Recipe:
         """What determines the network that a run's configuration asks for.
@@ -84,25 +113,29 @@ class OneImage:
     def execute(self, run: RunContext) -> None:
         """Infers the shape and judges it."""
         inputs, record = run.inputs, run.record
-        record.definitions = DEFINITIONS | COSTS
         recipe = self.recipe(inputs, record.config)
+        record.evaluations = {"value": 0, "gradient": 0}
+        if self.image_path is not None:
+            self._see(run, recipe, Path(self.image_path))
+            return
+        record.definitions = DEFINITIONS | COSTS
         images = recipe.imaging.of_shape(recipe.dataset, Split(record.config["split"]), record.config["index"])
         subject = subject_of(images, self.given, inputs)
-        record.evaluations = {"value": 0, "gradient": 0}
-        (self._infer if self.method == NETWORK else self._look_up)(run, recipe, images, subject)
+        if self.method == NETWORK:
+            self._infer(run, recipe, images, subject)
+        elif self.method == CODE:
+            self._search(run, images, subject)
+        else:
+            self._look_up(run, recipe, images, subject)
 
     def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """The shape that the network gives; before, that of the mean code."""
         inputs, record = run.inputs, run.record
-        path = recipe.find(inputs.cache)
-        if path is None:
-            raise BadInput(f"no network was trained for these settings: {REMEDY}")
-        model, trained = recipe.load(path)
-        model = model.to(inputs.device)
+        model, trained = self._network(run, recipe)
         mean = torch.tensor(trained["mean_code"], device=inputs.device)
         check_kind(inputs.renderer, model.at(mean))
         part = "took part in the training, and" if self.supervision.renders else "took no part in the training; it"
-        record.notes = [*record.notes, told(trained), f"the renderer {part} judges as own_"]
+        record.notes = [*record.notes, f"the renderer {part} judges as own_"]
         with run.off_clock():
             before = self._judged(model.at(mean), images, subject, inputs)
             record.metrics_start = before.metrics
@@ -116,12 +149,66 @@ class OneImage:
             if inputs.evaluation.picture is not None:
                 draw_reconstruction(run.folder, inputs, shape, subject, [], _title(run))
 
+    def _network(self, run: RunContext, recipe: Recipe) -> tuple[SingleView, dict[str, Any]]:
+        """The network and the record of its training, which is told in the run's notes."""
+        inputs = run.inputs
+        path = recipe.find(inputs.cache)
+        if path is None and self.train:
+            with run.off_clock():
+                path = recipe.make(inputs.cache, inputs.device, run.progress)
+        if path is None:
+            raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}")
+        model, trained = recipe.load(path)
+        run.record.notes = [*run.record.notes, told(trained)]
+        return model.to(inputs.device), trained
+
+    def _see(self, run: RunContext, recipe: Recipe, path: Path) -> None:
+        """The shape that the network gives for a picture of one's own, and the view from which it looks most alike."""
+        inputs, record = run.inputs, run.record
+        record.scene, record.definitions = path.name, OF_PICTURE | COSTS
+        model, trained = self._network(run, recipe)
+        mask = None if self.mask_path is None else Path(self.mask_path)
+        picture = read_picture(path, mask, self.image_pixels, trained["filled"])
+        clock = time.perf_counter()
+        with torch.no_grad():
+            shape = model.at(model(picture[None].to(inputs.device))[0])
+            mesh = surface_of(shape, inputs)
+        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        with run.off_clock():
+            if mesh is None:
+                note_result(run, Evaluation({FITTED: 0.0}, None, (RunStatus.EMPTY, "the field has no surface")))
+                return
+            if self.knows_colours:
+                mesh = replace(mesh, colours=vertex_colours(shape, mesh, inputs.device))
+            cameras = [recipe.imaging.sampler.draw(place) for place in range(TRIED)]
+            camera, overlapping = best_view(mesh, cameras, picture[3] > 0.5, trained["filled"])
+            note_result(run, Evaluation({FITTED: overlapping}, mesh))
+            record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
+            if inputs.evaluation.picture is not None:
+                draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, _title(run))
+
     def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
         found = judge(shape, subject, inputs)
-        known = self.supervision.losses.colour or self.supervision.losses.colour_gradient
-        scores = {name: x for name, x in found.metrics.items() if known or name.removeprefix(OWN) not in COLOURS}
+        scores = {
+            name: x for name, x in found.metrics.items() if self.knows_colours or name.removeprefix(OWN) not in COLOURS
+        }
         return replace(found, metrics=scores | {"iou": overlap(shape, images, inputs.device)})
+
+    def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
+        """The shape of the code that is found, with the colours of the given image."""
+        inputs = run.inputs
+        problem = self.search.problem(subject.given[0], inputs)
+        check_kind(inputs.renderer, problem.field())
+        history = descend(problem, self.search.optimiser, run, lambda iteration: {})
+        with run.off_clock():
+            mesh = surface_of(problem.field(), inputs)
+            mesh = None if mesh is None else with_colours(mesh, subject.given)
+            after = judge_mesh(mesh, subject, inputs)
+            after.metrics["iou"] = overlap(problem.field(), images, inputs.device)
+            note_result(run, replace(after, failure=failure_of(history, after)))
+            if inputs.evaluation.picture is not None and mesh is not None:
+                draw_surface(run.folder, inputs, mesh, subject, _title(run))
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""

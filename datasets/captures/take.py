@@ -1,5 +1,7 @@
 """Reads a file's frame: its photograph, made smaller, without distortion."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -29,15 +31,8 @@ def take(frame: Frame, longest: int) -> Shot:
             f"{frame.image} has {image.width} x {image.height} pixels, its camera {width} x {height}: crop neither, or "
             "write the camera for this image"
         )
-    share = min(longest / max(image.width, image.height), 1.0)
-    size = max(round(image.width * share), 1), max(round(image.height * share), 1)
-    alpha = "A" in image.getbands() or "transparency" in image.info
-    pixels = np.asarray(image.convert("RGBA" if alpha else "RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
-    colours, opaque = pixels[..., :3], pixels[..., 3:] if alpha and pixels[..., 3].min() < 1 else None
-    if opaque is not None:
-        colours = colours * opaque + BACKGROUND * (1 - opaque)
-    if frame.mask is not None:
-        opaque = _mask(frame, (image.width, image.height), size)
+    colours, opaque = _smaller(image, frame.mask, longest)
+    size = colours.shape[1], colours.shape[0]
     scale = np.array([[size[0] / width], [size[1] / height], [1.0]])
     intrinsics = scale * frame.intrinsics
     if any(frame.distortion):
@@ -52,6 +47,36 @@ def take(frame: Frame, longest: int) -> Shot:
     return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask)
 
 
+def read_image(
+    path: Path, mask: Path | None, longest: int
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 1"] | None]:
+    """Colours and mask of an image, each from 0 to 1; the mask is a file's, or the image's alpha channel, or None.
+
+    Args:
+        path: of the image.
+        mask: of its mask.
+        longest: most pixels along the longer side.
+
+    Raises:
+        BadInput: where a file cannot be read, or image and mask have different sizes.
+    """
+    return _smaller(_opened(path), mask, longest)
+
+
+def _smaller(
+    image: Image.Image, mask: Path | None, longest: int
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 1"] | None]:
+    """See `read_image`."""
+    share = min(longest / max(image.width, image.height), 1.0)
+    size = max(round(image.width * share), 1), max(round(image.height * share), 1)
+    alpha = "A" in image.getbands() or "transparency" in image.info
+    pixels = np.asarray(image.convert("RGBA" if alpha else "RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
+    colours, opaque = pixels[..., :3], pixels[..., 3:] if alpha and pixels[..., 3].min() < 1 else None
+    if opaque is not None:
+        colours = colours * opaque + BACKGROUND * (1 - opaque)
+    return colours, opaque if mask is None else _mask(mask, (image.width, image.height), size)
+
+
 def _opened(path: object) -> Image.Image:
     try:
         image = ImageOps.exif_transpose(Image.open(str(path)))
@@ -64,12 +89,12 @@ def _opened(path: object) -> Image.Image:
     return image
 
 
-def _mask(frame: Frame, full: tuple[int, int], size: tuple[int, int]) -> Float[np.ndarray, "height width 1"]:
-    """A frame's mask, from 0 to 1, at the size of its made-smaller photograph."""
-    image = _opened(frame.mask)
+def _mask(path: Path, full: tuple[int, int], size: tuple[int, int]) -> Float[np.ndarray, "height width 1"]:
+    """A file's mask, from 0 to 1, made smaller with its photograph, which has `full` pixels."""
+    image = _opened(path)
     if (image.width, image.height) != full:
         raise BadInput(
-            f"{frame.mask} has {image.width} x {image.height} pixels, its image {full[0]} x {full[1]}: a mask has the "
+            f"{path} has {image.width} x {image.height} pixels, its image {full[0]} x {full[1]}: a mask has the "
             "size of its image"
         )
     grey = image.getchannel("A") if image.mode in ("LA", "RGBA") and image.getextrema()[-1][0] < 255 else image

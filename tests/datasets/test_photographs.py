@@ -12,7 +12,7 @@ from bench.tasks.photographs import sample
 from datasets.mesh import Mesh
 from datasets.photographs import HIGHEST, Photography, around, turned
 from datasets.shot import Shot
-from datasets.textures import PHOTOGRAPHS, TEXTURES, make_texture
+from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
 from datasets.truth import Truth
 from tests.tiny import camera_of
 
@@ -48,12 +48,13 @@ def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
     assert np.array_equal(colours, make_texture(name, 0.5, seed=3)(points, normals))
     nearby = texture(points + 1e-5, normals)
     assert np.abs(nearby - colours).max() < 0.02  # no jump
-    assert (colours.std() > 0.05) == (name != "plain")
+    assert (colours.std(axis=0).max() > 0.05) == (name not in ONE_COLOUR)
 
 
-def test_noise_has_another_colour_for_each_seed():
+@pytest.mark.parametrize("name", ["noise", "painted"])
+def test_each_seed_has_colours_of_its_own(name):
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    first, second = (make_texture("noise", 0.3, seed)(points, points) for seed in (0, 1))
+    first, second = (make_texture(name, 0.3, seed)(points, points) for seed in (0, 1))
     assert np.abs(first - second).mean() > 0.1
 
 
@@ -173,7 +174,7 @@ def test_a_camera_that_sees_nothing_is_refused(ball):
     ("changed", "message"),
     [
         ({"views": 1}, "views must be at least 2"),
-        ({"texture": "wood"}, "texture must be one of noise, plain"),
+        ({"texture": "wood"}, "texture must be one of noise, painted, plain"),
         ({"texture_size": 0.0}, "texture_size must be positive"),
         ({"shading": "pbr"}, "shading must be one of"),
         ({"background": "sky"}, "background must be one of"),

@@ -34,7 +34,7 @@ LOSSES = Losses(
 RGB = Supervision(LOSSES, occupancy=0.0, points=64)
 VOLUME = Supervision(replace(LOSSES, colour=0.0, silhouette_weight=0.0), occupancy=1.0, points=256)
 SETTINGS = TrainingSettings(
-    shapes=3, steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
+    shapes=3, views=None, steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
 )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Shape from one image from the command line: trained, inferred, judged, and the rows that need no network."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from unittest import mock
@@ -10,15 +11,19 @@ import pytest
 import torch
 import trimesh
 from hydra.core.global_hydra import GlobalHydra
+from PIL import Image
 
 from bench.records.read import read_records
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
+from bench.single_view.own_image import best_view, filled_share, read_picture
 from bench.tasks.single_view import DEFINITIONS, Inside
 from bench.train.__main__ import main
 from datasets.dataset import Split
+from datasets.mesh import Mesh
+from datasets.scene import see
 from datasets.truth import Truth
 from tests.run.driving import command, record_of
-from tests.single_view.test_training import IMAGING, Balls, images  # noqa: F401, a fixture
+from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
 from tests.tiny import silent
 
 TINY = (
@@ -74,8 +79,109 @@ def test_colours_are_not_judged_where_the_training_knew_none(folder, capsys):
 
 def test_without_its_network_it_names_the_command(tmp_path):
     done = command(*TINY, f"results_dir={tmp_path}")
-    assert done.code != 0
-    assert "no network was trained for these settings: give the same command to `python -m bench.train`" in done.err
+    assert done.code == 2
+    assert "no network was trained for sphere with these settings: add task.train=true" in done.err
+    assert not list((tmp_path / "runs").glob("*"))
+
+
+def test_a_run_trains_its_network_where_it_is_asked_to(tmp_path):
+    small = ("evaluation.picture=null", "task.train=true", f"results_dir={tmp_path}")
+    done = command(*TINY, *small)
+    assert done.code == 0, done.err
+    assert len(list((tmp_path / "priors").glob("single_view-*.safetensors"))) == 1
+    seconds = record_of(done.out)["seconds"]
+    assert seconds["evaluation"] > seconds["forward"]
+
+
+def test_the_code_of_the_prior_is_found_by_the_mask(tmp_path):
+    small = [one for one in TINY[1:] if not one.startswith("task.training")]
+    small += ["prior.steps=100", "prior.shapes=3", "task.search.optimiser.iterations=8", f"results_dir={tmp_path}"]
+    done = command("+method=single_view_code", *small)
+    assert done.code == 0, done.err
+    record = record_of(done.out)
+    assert 0 < record["metrics"]["iou"] <= 1 and record["evaluations"]["value"] > 0
+    curve = (Path(done.out.splitlines()[-1]) / "curve.jsonl").read_text().splitlines()
+    losses = [json.loads(line)["total"] for line in curve]
+    assert len(losses) == 8 and losses[-1] < losses[0]
+
+
+@pytest.fixture(scope="module")
+def picture(images, tmp_path_factory) -> Path:  # noqa: F811
+    """A large ball left of the middle of 120 x 80 pixels, with an alpha channel."""
+    rows, columns = np.mgrid[:80, :120]
+    inside = (rows - 40) ** 2 + (columns - 35) ** 2 < 25**2
+    pixels = np.stack([200 * inside, 90 * inside, 30 * inside, 255 * inside], axis=-1).astype(np.uint8)
+    path = tmp_path_factory.mktemp("picture") / "ball.png"
+    Image.fromarray(pixels).save(path)
+    Image.fromarray(pixels[..., :3]).save(path.with_name("opaque.png"))
+    Image.fromarray(pixels[..., 3]).save(path.with_name("mask.png"))
+    Image.fromarray(pixels[:40, :, 3]).save(path.with_name("half.png"))
+    Image.fromarray(np.full((80, 120), 255, np.uint8)).save(path.with_name("white.png"))
+    Image.fromarray(np.zeros((80, 120), np.uint8)).save(path.with_name("black.png"))
+    return path
+
+
+@pytest.mark.parametrize("files", [("ball",), ("opaque", "mask")])
+def test_a_picture_of_ones_own_has_a_shape(folder, network, picture, files):
+    given = [f"task.{key}_path={picture.with_name(name)}.png" for key, name in zip(("image", "mask"), files)]  # noqa: B905
+    done = command(*TINY, *given, f"results_dir={folder}")
+    assert done.code == 0, done.err
+    record, run = record_of(done.out), Path(done.out.splitlines()[-1])
+    assert record["scene"] == f"{files[0]}.png"
+    assert (
+        set(record["metrics"]) == {"fitted_mask_iou"} and record["metrics"]["fitted_mask_iou"] > 0.7
+    )  # of 16 x 16 pixels
+    assert "the network was trained on 3 shapes of sphere" in " ".join(record["notes"])
+    assert (run / "mesh.ply").is_file() and (run / "summary.png").stat().st_size > 1000
+
+
+def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path):
+    picture = Path(shutil.copy(picture, tmp_path))
+    given = (f"task.image_path={picture}", f"results_dir={folder}", "evaluation.picture=null")
+    assert not record_of(command(*TINY, *given).out)["reused"]
+    assert record_of(command(*TINY, *given).out)["reused"]
+    Image.open(picture).rotate(90).save(picture)
+    assert not record_of(command(*TINY, *given).out)["reused"]
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (("image=opaque",), "opaque.png has no mask: give task.mask_path=FILE"),
+        (("image=opaque", "mask=half"), "has 120 x 40 pixels, its image 120 x 80"),
+        (("image=opaque", "mask=white"), "is white everywhere: make it black beside the object"),
+        (("image=opaque", "mask=black"), "shows no object of 16 pixels"),
+        (("image=missing",), "cannot be read as an image"),
+        (("mask=mask",), "task.mask_path is the mask of a picture: give task.image_path as well"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_told(folder, network, picture, given, says):
+    files = [f"task.{one.replace('=', f'_path={picture.parent}/')}.png" for one in given]
+    done = command(*TINY, *files, f"results_dir={folder}")
+    assert done.code == 2
+    assert says in done.err and len(done.err.splitlines()) == 1
+
+
+def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
+    filled = filled_share(torch.cat([one.masks for one in images]))
+    sides = [max(np.ptp(np.flatnonzero(m.any(0))), np.ptp(np.flatnonzero(m.any(1)))) + 1 for m in images[1].masks]
+    assert filled == pytest.approx(np.median(sides) / 16, abs=1 / 16)
+    framed = read_picture(picture, None, 32, 0.5)
+    rows, columns = framed[3].nonzero().T
+    for found in (rows, columns):
+        assert (found.min() + found.max()) / 2 == pytest.approx(15.5, abs=1)
+        assert np.ptp(found.numpy()) + 1 == pytest.approx(16, abs=1)
+    assert framed[:3, 16, 16].numpy() == pytest.approx(np.array([200, 90, 30]) / 255, abs=0.01)
+    assert framed[:3, 0, 0].tolist() == [0.5] * 3
+
+
+def test_the_view_that_is_most_alike_is_that_of_the_mask():
+    mesh = Mesh(Balls().mesh(Split.TEST, 1).vertices * [1.5, 0.5, 0.8], Balls().mesh(Split.TEST, 1).faces)
+    cameras = [SAMPLER.draw(place) for place in range(6)]
+    mask = see(Truth(mesh), cameras[4]).mask
+    filled = filled_share(mask[None])
+    camera, overlapping = best_view(mesh, cameras, mask, filled)
+    assert torch.equal(camera.world_to_camera, cameras[4].world_to_camera) and overlapping > 0.9
 
 
 def test_another_renderer_or_setting_is_another_network(folder, network):

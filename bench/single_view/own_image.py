@@ -1,0 +1,83 @@
+"""A picture of one's own, framed as the images of a training are; and the view from which a shape is most like it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.evaluate.evaluate import mask_iou
+from bench.single_view.images import as_input
+from datasets.captures.take import read_image
+from datasets.mesh import Mesh
+from datasets.scene import see
+from datasets.truth import Truth
+from renderers.camera import Camera
+from renderers.checks import BadInput
+
+LONGEST = 1024  # pixels of a picture that are read
+SMALLEST = 16  # pixels along an object's longer side
+
+
+def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> Float[Tensor, "4 _ _"]:
+    """A picture as encoders take it, cut so that the object fills a share of it.
+
+    Args:
+        path: of the picture.
+        mask: of its mask; None for the picture's alpha channel.
+        pixels: height and width of what is given back.
+        filled: see `filled_share`.
+
+    Raises:
+        BadInput: where a file cannot be read, there is no mask, or it fits neither the picture nor an object.
+    """
+    colours, opaque = read_image(path, mask, LONGEST)
+    if opaque is None:
+        raise BadInput(f"{path} has no mask: give task.mask_path=FILE, white on the object, or an alpha channel")
+    inside = torch.from_numpy(opaque[..., 0] > 0.5)
+    if bool(inside.all()):
+        raise BadInput(f"the mask {mask or path} is white everywhere: make it black beside the object")
+    if not bool(inside.any()) or _box(inside)[2] < SMALLEST:
+        raise BadInput(f"the mask {mask or path} shows no object of {SMALLEST} pixels: make it white on the object")
+    channels = torch.from_numpy(np.concatenate([colours, opaque], axis=-1)).permute(2, 0, 1)
+    cut = _framed(channels, inside, pixels, filled)
+    return as_input(cut[:3].permute(1, 2, 0), cut[3] > 0.5)
+
+
+def filled_share(masks: Bool[Tensor, "images height width"]) -> float:
+    """The longer side of an object's box over the image's, the median over images."""
+    return float(np.median([_box(mask)[2] / len(mask) for mask in masks]))
+
+
+def best_view(
+    mesh: Mesh, cameras: Sequence[Camera], mask: Bool[Tensor, "pixels pixels"], filled: float
+) -> tuple[Camera, float]:
+    """The camera whose silhouette of a mesh, framed alike, overlaps most with a mask; and that overlap, an IoU."""
+    truth, overlaps = Truth(mesh, closed=False), []
+    for camera in cameras:
+        seen = see(truth, camera).mask
+        framed = _framed(seen[None].float(), seen, len(mask), filled)[0] > 0.5 if bool(seen.any()) else ~mask
+        overlaps.append(mask_iou(framed.numpy(), mask.numpy()))
+    place = int(np.argmax(overlaps))
+    return cameras[place], overlaps[place]
+
+
+def _box(mask: Bool[Tensor, "height width"]) -> tuple[float, float, int]:
+    """The centre of the rows and of the columns in which a mask has a pixel, and the longer side of that box."""
+    rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
+    (top, bottom), (left, right) = (map(int, (found.min(), found.max() + 1)) for found in (rows, columns))
+    return (top + bottom) / 2, (left + right) / 2, max(bottom - top, right - left)
+
+
+def _framed(
+    channels: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"], pixels: int, filled: float
+) -> Float[Tensor, "channels _ _"]:
+    """The square about a mask's box that the box fills a share of, made smaller; 0 beyond the image."""
+    row, column, longer = _box(mask)
+    side = max(round(longer / filled), 1)
+    top, left = round(row + side / 2), round(column + side / 2)  # in the image with a margin of `side`
+    padded = torch.nn.functional.pad(channels, (side,) * 4)
+    window = padded[:, top : top + side, left : left + side]
+    return torch.nn.functional.interpolate(window[None], size=(pixels, pixels), mode="area")[0]
