@@ -15,9 +15,11 @@ from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest, file_lock
 from bench.shape_prior.store import save_whole
+from datasets.captures.hull import carve
 from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography
+from datasets.shot import Shot
 from datasets.truth import Truth, sample_surface
 from datasets.views import ViewSampler
 from renderers.camera import Camera, sphere_span
@@ -25,6 +27,7 @@ from renderers.camera import Camera, sphere_span
 VERSION = 1  # raise it when the images or points change, so that no file of the old ones is used
 POINTS = 8192  # of known occupancy per shape: half in the cube, half near the surface
 NEAR = 0.05  # scene units: standard deviation of the latter from the surface
+NEAR_HULL = 0.07  # the same, from points in the visual hull
 CUBE = 1.0  # half the side of the cube
 
 
@@ -52,8 +55,8 @@ class ImagesOf:
         """An image as encoders take it; see `as_input`."""
         return as_input(self.colours[view].float() / 255, self.masks[view])
 
-    def first(self, views: int | None) -> "ImagesOf":
-        """The first images, or all of them; the points stay."""
+    def first(self, views: int) -> "ImagesOf":
+        """The first images; the points stay."""
         kept = slice(views)
         return replace(
             self,
@@ -62,6 +65,24 @@ class ImagesOf:
             masks=self.masks[kept],
             depths=self.depths[kept],
         )
+
+    def shots(self) -> tuple[Shot, ...]:
+        """The images as photographs."""
+        parts = zip(self.cameras, self.colours, self.masks, self.depths, strict=True)
+        return tuple(
+            Shot(str(place), camera, colours.float() / 255, mask, depth)
+            for place, (camera, colours, mask, depth) in enumerate(parts)
+        )
+
+    def in_hull(self, seed: int) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
+        """Points in the cube and points near the visual hull of the masks, and whether each lies in the hull."""
+        draw, shots = torch.Generator().manual_seed(seed), self.shots()
+        anywhere = CUBE * (2 * torch.rand(2 * POINTS, 3, generator=draw) - 1)
+        inside = carve(shots, anywhere) < 0
+        found = anywhere[inside] if bool(inside.any()) else anywhere
+        near = found[torch.randint(len(found), (POINTS,), generator=draw)]
+        near = near + NEAR_HULL * torch.randn(POINTS, 3, generator=draw)
+        return torch.cat([anywhere[:POINTS], near]), torch.cat([inside[:POINTS], carve(shots, near) < 0])
 
     def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
         """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth."""
@@ -134,10 +155,6 @@ class Imaging:
             torch.from_numpy(points).float(),
             torch.from_numpy(truth.signed_distance(points) < 0),
         )
-
-    def resized(self, pixels: int) -> "Imaging":
-        """The same with images of another size."""
-        return replace(self, sampler=replace(self.sampler, resolution=pixels))
 
 
 def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:

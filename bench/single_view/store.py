@@ -37,6 +37,8 @@ class Recipe:
 
     Args:
         dataset: of its shapes.
+        shapes: number of training shapes.
+        views: images of each that are used, the first of those that are rendered.
         imaging: of their images.
         network: its sizes.
         supervision: what it may know.
@@ -46,6 +48,8 @@ class Recipe:
     """
 
     dataset: Dataset
+    shapes: int
+    views: int
     imaging: Imaging
     network: SingleViewNetwork
     supervision: Supervision
@@ -95,8 +99,8 @@ class Recipe:
                 return found
             path = cache / f"{self.stem}.safetensors"
             started = time.perf_counter()
-            rendered = self.imaging.images(self.dataset, Split.TRAIN, self.training.shapes, cache, progress)
-            images = [one.first(self.training.views) for one in rendered]
+            rendered = self.imaging.images(self.dataset, Split.TRAIN, self.shapes, cache, progress)
+            images = [one.first(self.views) for one in rendered]
             made = time.perf_counter() - started
             state = path.with_suffix(".state")
             try:

@@ -3,10 +3,12 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import isfinite
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool, Float
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
@@ -32,22 +34,27 @@ class Supervision:
     Args:
         losses: of renderings: of colours and masks (2D), of depths (2.5D); see `bench.reconstruct.losses.Losses`.
         occupancy: weight of the cross entropy at points of known occupancy (3D; Occupancy Networks, Eq. 3).
-        points: of known occupancy, of each shape in a step.
+        hull: share of the steps, the first, that learn from the visual hull of the masks in place of all else, by the
+            same cross entropy and without a rendering: the images' masks alone, and many times quicker.
+        points: of a cross entropy, of each shape in a step.
     """
 
     losses: Losses
     occupancy: float
+    hull: float
     points: int
 
     def __post_init__(self) -> None:
         check_at_least("supervision.occupancy", self.occupancy, 0, "0 switches the term off")
+        if not 0 <= self.hull <= 1:
+            raise ValueError(f"supervision.hull must be a share of the steps, 0 to 1, not {self.hull:g}")
         check_at_least("supervision.points", self.points, 1, "1024 work")
 
     @property
     def renders(self) -> bool:
         """Whether any term is of a rendering."""
         losses = self.losses
-        return any((losses.colour, losses.colour_gradient, losses.depth, losses.silhouette_weight))
+        return self.hull < 1 and any((losses.colour, losses.colour_gradient, losses.depth, losses.silhouette_weight))
 
 
 @dataclass(frozen=True)
@@ -55,8 +62,6 @@ class TrainingSettings:
     """How a network is trained.
 
     Args:
-        shapes: number of training shapes.
-        views: images of each that are used, the first of those that are rendered; None: all.
         steps: optimiser steps, each on `shapes_per_step` shapes, an input image and another one of each.
         shapes_per_step: their number.
         rays: of each shape's other image.
@@ -65,8 +70,6 @@ class TrainingSettings:
         seed: of weights, batches and rays.
     """
 
-    shapes: int
-    views: int | None
     steps: int
     shapes_per_step: int
     rays: int
@@ -75,9 +78,8 @@ class TrainingSettings:
     seed: int
 
     def __post_init__(self) -> None:
-        for name in ("shapes", "steps", "shapes_per_step", "rays", "keep_every"):
+        for name in ("steps", "shapes_per_step", "rays", "keep_every"):
             check_at_least(f"task.training.{name}", getattr(self, name), 1, "conf/scale has values that work")
-        check_at_least("task.training.views", self.views or 1, 1, "24 are rendered")
         check_positive("task.training.learning_rate", self.learning_rate, "1e-3 works")
 
     def rate(self, step: int) -> float:
@@ -177,7 +179,10 @@ class Lessons:
         cut, renderer, total = codes.detach().requires_grad_(), at_iteration(self.renderer, step), 0.0
         for place, number in enumerate(chosen):
             shape = model.at(cut[place])
-            terms = self._terms(renderer, shape, Meter(shape, counts), self.images[number], draw)
+            if step < self.supervision.hull * self.settings.steps:
+                terms = [self._known(shape, *self._hulls[number], draw)]
+            else:
+                terms = self._terms(renderer, shape, Meter(shape, counts), self.images[number], draw)
             loss = torch.stack(terms).sum() / len(chosen)
             loss.backward()
             total += loss.item()
@@ -193,11 +198,24 @@ class Lessons:
             pixels = images.pixels(view, self.settings.rays, draw, self.device)
             terms.append(given.losses(renderer, shape, metered, pixels)["total"])
         if given.occupancy:
-            known = torch.randint(len(images.points), (given.points,), generator=draw)
-            logits = occupancy_logits(shape, shape(images.points[known].to(self.device)), width=LOGIT_WIDTH)
-            inside = images.inside[known].to(logits)
-            terms.append(given.occupancy * binary_cross_entropy_with_logits(logits, inside))
+            terms.append(given.occupancy * self._known(shape, images.points, images.inside, draw))
         return terms
+
+    @cached_property
+    def _hulls(self) -> list[tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]]:
+        return [one.in_hull(self.settings.seed) for one in self.images]
+
+    def _known(
+        self,
+        shape: OccupancyOf,
+        points: Float[Tensor, "points 3"],
+        inside: Bool[Tensor, " points"],
+        draw: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """The cross entropy at some points of which it is known whether they lie inside."""
+        some = torch.randint(len(points), (self.supervision.points,), generator=draw)
+        logits = occupancy_logits(shape, shape(points[some].to(self.device)), width=LOGIT_WIDTH)
+        return binary_cross_entropy_with_logits(logits, inside[some].to(logits))
 
 
 def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> None:

@@ -29,7 +29,6 @@ from bench.solve.problem import check_field_gradient, check_kind
 from bench.solve.solve import COSTS, descend, failure_of, note_result
 from datasets.dataset import Split
 from datasets.photographs import Photography
-from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.fields.coloured import OccupancyOf
@@ -41,7 +40,10 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
 }
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
 COLOURS = ("psnr", "ssim")  # scores of colours
-DECIDING = ("images", "image_pixels", "network", "supervision", "training")  # settings that determine the network
+DECIDING = (  # settings that determine the network
+    *("images", "image_pixels", "elevation", "shapes", "views"),
+    *("network", "supervision", "training"),
+)
 FITTED = "fitted_mask_iou"
 OF_PICTURE = {
     FITTED: "Of the mask of the given picture and the silhouette of the shape from the best of many views, both scaled "
@@ -60,6 +62,9 @@ class OneImage:
             training shapes, that with the "nearest" image, or the one that is "best" by the truth.
         images: that are rendered of each shape, from random cameras of `view`.
         image_pixels: height and width of these.
+        elevation: range of the cameras' angles above the horizon, in degrees; their azimuths are those of `view`.
+        shapes: of the training.
+        views: images of each that the training uses, the first ones.
         given: number of the image that is given.
         network: its sizes.
         supervision: what its training may know.
@@ -73,6 +78,9 @@ class OneImage:
     method: str
     images: Photography
     image_pixels: int
+    elevation: tuple[float, float]
+    shapes: int
+    views: int
     given: int
     network: SingleViewNetwork
     supervision: Supervision
@@ -85,6 +93,9 @@ class OneImage:
     def __post_init__(self) -> None:
         check_choice("task.method", self.method, (NETWORK, CODE, MEAN, NEAREST, BEST))
         check_at_least("task.image_pixels", self.image_pixels, 16, "64 shows the shape")
+        check_at_least("task.shapes", self.shapes, 1, "conf/scale has numbers that work")
+        if not 1 <= self.views <= self.images.views:
+            raise ValueError(f"task.views must be 1 to task.images.views={self.images.views}, not {self.views}")
         if not 0 <= self.given < self.images.views:
             raise ValueError(f"task.given must be one of the {self.images.views} images, not {self.given}: 0")
         if self.image_path is not None and self.method != NETWORK:
@@ -107,8 +118,18 @@ class OneImage:
         check_field_gradient(inputs.renderer)
         settings = {name: config["task"][name] for name in DECIDING} | {"view": config["view"]}
         settings["renderer"] = {k: v for k, v in config["renderer"].items() if not k.startswith("_") or k == "_target_"}
-        imaging = Imaging(self.images, inputs.views).resized(self.image_pixels)
-        return Recipe(inputs.dataset, imaging, self.network, self.supervision, self.training, inputs.renderer, settings)
+        sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
+        return Recipe(
+            inputs.dataset,
+            self.shapes,
+            self.views,
+            Imaging(self.images, sampler),
+            self.network,
+            self.supervision,
+            self.training,
+            inputs.renderer,
+            settings,
+        )
 
     def execute(self, run: RunContext) -> None:
         """Infers the shape and judges it."""
@@ -212,7 +233,7 @@ class OneImage:
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
-        inputs, record, count = run.inputs, run.record, self.training.shapes
+        inputs, record, count = run.inputs, run.record, self.shapes
         record.notes = [*record.notes, "no network and no renderer took part"]
         if self.method == MEAN:
             mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.given
@@ -224,7 +245,7 @@ class OneImage:
             else:
                 place = best_shape(inputs.scene.mesh, recipe.dataset, count)
             record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
-            mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), shots_of(others[place])
+            mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), others[place].shots()
             record.notes.append(f"training shape {place}")
         with run.off_clock():
             mesh = None if mesh is None else with_colours(mesh, seen)
@@ -251,27 +272,19 @@ def _title(run: RunContext) -> str:
     return f"{record.task}, {record.name}, {record.scene}: {record.status}"
 
 
-def shots_of(images: ImagesOf) -> tuple[Shot, ...]:
-    """The images as photographs."""
-    parts = zip(images.cameras, images.colours, images.masks, images.depths, strict=True)
-    return tuple(
-        Shot(str(place), camera, colours.float() / 255, mask, depth)
-        for place, (camera, colours, mask, depth) in enumerate(parts)
-    )
-
-
 def subject_of(images: ImagesOf, given: int, inputs: RunInputs) -> Subject:
     """The given image, and all others as those that judge."""
-    shots = shots_of(images)
+    shots = images.shots()
     others = tuple(shot for place, shot in enumerate(shots) if place != given)
     return Subject((shots[given],), others or (shots[given],), inputs.scene.mesh, "")
 
 
 def told(trained: dict[str, Any]) -> str:
     """What a network was trained on, in words."""
-    training, found = trained["settings"]["training"], trained["validation"]
+    settings, found = trained["settings"], trained["validation"]
     return (
-        f"the network was trained on {training['shapes']} shapes of {trained['dataset']['name']} for "
-        f"{training['steps']} steps, {np.round(trained['seconds']['training'] / 60, 1)} min; on validation shapes its "
-        f"IoU is {found['iou_network']:.3f}, that of the mean code {found['iou_mean_code']:.3f}"
+        f"the network was trained on {settings['shapes']} shapes of {trained['dataset']['name']}, "
+        f"{settings['views']} images each, for {settings['training']['steps']} steps, "
+        f"{np.round(trained['seconds']['training'] / 60, 1)} min; on validation shapes its IoU is "
+        f"{found['iou_network']:.3f}, that of the mean code {found['iou_mean_code']:.3f}"
     )

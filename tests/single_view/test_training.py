@@ -31,10 +31,10 @@ LOSSES = Losses(
     colour=1.0, colour_gradient=0.0, depth=0.0, depth_loss="depth", silhouette=CrossEntropy(sharpness=30.0, weight=1.0),
     silhouette_weight=0.3, smoothness=0.0, normals=0.0, eikonal=0.1,
 )  # fmt: skip
-RGB = Supervision(LOSSES, occupancy=0.0, points=64)
-VOLUME = Supervision(replace(LOSSES, colour=0.0, silhouette_weight=0.0), occupancy=1.0, points=256)
+RGB = Supervision(LOSSES, occupancy=0.0, hull=0.0, points=64)
+VOLUME = Supervision(replace(LOSSES, colour=0.0, silhouette_weight=0.0), occupancy=1.0, hull=0.0, points=256)
 SETTINGS = TrainingSettings(
-    shapes=3, views=None, steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
+    steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
 )  # fmt: skip
 
 
@@ -145,6 +145,47 @@ def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
     assert min(own) > 0.6 and min(own[0], own[2]) > max(other) + 0.2
 
 
+def test_it_learns_from_the_visual_hull_which_ball_an_image_shows(images, renderer, tmp_path):
+    masks = replace(VOLUME, occupancy=0.0, hull=1.0)
+    assert not masks.renders
+    model, course = trained(images, renderer, tmp_path / "s", masks, steps=150, shapes_per_step=3, keep_every=1000)
+    assert course.counts.value == 0
+    codes, hulls = [model(one.image(0)[None])[0] for one in images], [one.in_hull(1) for one in images]
+
+    def right(code: torch.Tensor, hull: tuple[torch.Tensor, torch.Tensor]) -> float:
+        return float(((model.at(code)(hull[0]) < 0) == hull[1]).float().mean())
+
+    assert min(map(right, codes, hulls)) > 0.85
+    assert max(right(codes[2], hulls[0]), right(codes[0], hulls[2])) < 0.75
+
+
+def test_the_hull_comes_first_and_the_renderer_after_it(images, renderer, tmp_path, monkeypatch):
+    seen = []
+    known = Lessons._known
+    monkeypatch.setattr(Lessons, "_known", lambda self, *given: seen.append("hull") or known(self, *given))
+    _, course = trained(
+        images, renderer, tmp_path / "s", replace(RGB, hull=0.5), progress=lambda *told: seen.append(told[1])
+    )
+    assert seen == ["hull", "hull", 1, "hull", "hull", 2, "hull", "hull", 3, 4, 5, 6]
+    assert course.counts.value > 0
+
+
+def test_points_in_the_hull_are_in_all_masks(images):
+    one = images[1]
+    points, inside = one.in_hull(0)
+    assert len(points) == 2 * POINTS and float(points[:POINTS].abs().max()) <= 1
+    ball = points.norm(dim=1) < 0.5
+    assert bool(inside[ball].all()) and not bool(inside.all())
+    for camera, mask in zip(one.cameras, one.masks, strict=True):
+        column, row = camera.project(points)[0].T
+        beside = (column < 0) | (row < 0) | (column > 16) | (row > 16)
+        shown = mask[row.long().clamp(0, 15), column.long().clamp(0, 15)]
+        far = ~torch.nn.functional.max_pool2d(mask[None].float(), 3, 1, 1)[0].bool()
+        away = far[row.long().clamp(0, 15), column.long().clamp(0, 15)] & ~beside
+        assert not bool(inside[away].any()) and bool(shown[inside & ~beside].float().mean() > 0.9)
+    assert torch.equal(points, one.in_hull(0)[0]) and not torch.equal(points, one.in_hull(1)[0])
+
+
 @pytest.mark.parametrize(("name", "reads"), [("newton", "distance"), ("dvr", "occupancy")])
 def test_renderings_teach_the_encoder_as_well(images, name, reads, tmp_path):
     network = replace(NETWORK, reads=reads)
@@ -199,9 +240,7 @@ def test_a_step_that_is_no_number_keeps_the_last_state(images, renderer, tmp_pat
 
 def recipe(renderer, **changed) -> Recipe:
     settings = replace(SETTINGS, steps=3, **changed)
-    return Recipe(
-        Balls(), IMAGING, NETWORK, RGB, settings, renderer, {"training": {"shapes": 3, "steps": settings.steps}}
-    )
+    return Recipe(Balls(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
 
 
 def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path, monkeypatch):
@@ -268,6 +307,7 @@ def test_the_overlap_is_that_of_volumes(images):
         (SETTINGS, {"steps": 0}, "task.training.steps"),
         (SETTINGS, {"learning_rate": 0.0}, "task.training.learning_rate"),
         (RGB, {"occupancy": -1.0}, "supervision.occupancy"),
+        (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
         (RGB, {"points": 0}, "supervision.points"),
     ],
 )

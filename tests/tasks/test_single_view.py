@@ -27,9 +27,9 @@ from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401
 from tests.tiny import silent
 
 TINY = (
-    "+method=single_view", "dataset=sphere", "scale=smoke", "isolation=off", "threads=1", "task.training.shapes=3",
+    "+method=single_view", "dataset=sphere", "scale=smoke", "isolation=off", "threads=1", "task.shapes=3",
     "task.training.steps=4", "task.training.shapes_per_step=2", "task.training.rays=16", "task.images.views=3",
-    "task.image_pixels=16", "evaluation.grid=24", "evaluation.points=200", "evaluation.picture=32",
+    "task.views=3", "task.image_pixels=16", "evaluation.grid=24", "evaluation.points=200", "evaluation.picture=32",
 )  # fmt: skip
 
 
@@ -61,7 +61,10 @@ def test_it_is_trained_and_gives_a_shape_with_colours(folder, network):
     known = {part for key in DEFINITIONS for part in key.split(", ")}
     assert {"iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr"} < set(record["metrics"]) <= known
     assert set(record["metrics_start"]) == set(record["metrics"])
-    assert any(note.startswith("the network was trained on 3 shapes of sphere for 4 steps") for note in record["notes"])
+    assert any(
+        note.startswith("the network was trained on 3 shapes of sphere, 3 images each, for 4 steps")
+        for note in record["notes"]
+    )
     assert 0 < record["seconds"]["forward"] < record["seconds"]["total"]
     mesh = trimesh.load_mesh(run / "mesh.ply", process=False)
     assert mesh.visual.kind == "vertex"
@@ -199,8 +202,8 @@ def test_only_this_task_has_a_network_to_train(capsys):
 
 @pytest.mark.parametrize("method", ["mean", "nearest", "best"])
 def test_rows_without_a_network_are_judged_alike(tmp_path, method):
-    small = [one for one in TINY[1:] if not one.startswith("task.training.s")]
-    done = command(f"+method=single_view_{method}", *small, "task.training.shapes=3", f"results_dir={tmp_path}")
+    small = [one for one in TINY[1:] if not one.startswith(("task.training", "task.shapes"))]
+    done = command(f"+method=single_view_{method}", *small, "task.shapes=3", f"results_dir={tmp_path}")
     assert done.code == 0, done.err
     record = record_of(done.out)
     assert {"iou", "chamfer_l1", "mask_iou", "psnr"} < set(record["metrics"])
