@@ -89,6 +89,8 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
     shot = subject.held_out[len(subject.held_out) // 2]
     view, image = seen(_larger(shot.camera, inputs))
     arrays = {"photograph": shot.colours, "colours": image, "normals": picture_normals(view), "hit": view.mask}
+    if len(subject.given) == 1:
+        arrays["given"] = subject.given[0].colours
     plain = {name: (array if name == "hit" else array.half()).numpy() for name, array in arrays.items()}
     np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
@@ -140,15 +142,18 @@ def _error(seen: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
 def _input(subject: Subject) -> Figure:
     """Some of the given photographs."""
     shots = spread(subject.given, MOST_GIVEN)
-    rows = -(-len(shots) // 4)
+    columns = min(len(shots), 4)
+    rows = -(-len(shots) // columns)
     tall = shots[0].camera.height / shots[0].camera.width
-    figure = Figure(figsize=(6.4, 1.6 * tall * rows + 0.4), layout="constrained")
-    axes = figure.subplots(rows, 4, squeeze=False)
+    figure = Figure(figsize=(1.6 * max(columns, 2), 1.6 * tall * rows + 0.4), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
     for axis, shot in zip(axes.flat, shots, strict=False):
         axis.imshow(shot.colours.numpy())
-    figure.suptitle(f"{len(shots)} of {len(subject.given)} given photographs")
+    figure.suptitle(
+        "the given photograph" if columns == 1 else f"{len(shots)} of {len(subject.given)} given photographs"
+    )
     return figure
 
 

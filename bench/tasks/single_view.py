@@ -181,6 +181,9 @@ class OneImage:
             raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}")
         model, trained = recipe.load(path)
         run.record.notes = [*run.record.notes, told(trained)]
+        if not self.knows_colours:
+            for weights in model.decoder.texture_head.parameters():
+                weights.zero_()  # grey, in place of the colours that the training began with
         return model.to(inputs.device), trained
 
     def _see(self, run: RunContext, recipe: Recipe, path: Path) -> None:

@@ -1,7 +1,7 @@
 """Pieces that the pages on shapes from photographs share: lines of the table, curves, pictures."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ from bench.report.data.statistics import median
 from bench.report.write import chart, pictures
 from bench.report.write.table import Column, text
 
-ARRAYS = ("photograph", "colours", "normals", "hit")  # of images.npz
+ARRAYS = ("colours", "normals", "hit")  # of images.npz, of each row
+HELD_OUT = {"photograph": "held out"}  # arrays that are the same for all rows, and what they are
 MOST_COLUMNS = 8
 HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore", "iou", "normal_consistency")  # more is better
 
@@ -128,11 +129,13 @@ def scene_of(record: Record) -> str:
 
 
 @style.styled
-def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[str]) -> tuple[Figure, list[str]]:
-    """For each scene a held-out photograph and each row's colours, normals below; a note for each missing one."""
+def draw_pictures(
+    experiment: Experiment, rows: Sequence[Row], scenes: Sequence[str], photographs: Mapping[str, str] = HELD_OUT
+) -> tuple[Figure, list[str]]:
+    """For each scene the photographs and each row's colours, normals below; a note for each missing one."""
     blocks, notes = [], []
     for scene in scenes:
-        cells, missing = _cells(experiment, rows, scene)
+        cells, missing = _cells(experiment, rows, scene, photographs)
         blocks += [cells[start : start + MOST_COLUMNS] for start in range(0, len(cells), MOST_COLUMNS)]
         notes += missing
     columns = max(map(len, blocks), default=1)
@@ -147,15 +150,17 @@ def draw_pictures(experiment: Experiment, rows: Sequence[Row], scenes: Sequence[
     return figure, notes
 
 
-def _cells(experiment: Experiment, rows: Sequence[Row], scene: str) -> tuple[list[Any], list[str]]:
-    cells, notes, shown = [], [], False
+def _cells(
+    experiment: Experiment, rows: Sequence[Row], scene: str, photographs: Mapping[str, str]
+) -> tuple[list[Any], list[str]]:
+    cells, notes, shown, names = [], [], False, (*photographs, *ARRAYS)
     for row in rows:
         record = next((r for r in experiment.records if scene_of(r) == scene and row_of(r) == row), None)
-        found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), ARRAYS)
+        found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), names)
         if why:
             notes.append(f"No pictures of {row.name}, {scene}: {why}.")
         elif not shown:
-            cells.insert(0, (f"{scene}, held out", {"colours": found["photograph"]}))
+            cells = [(f"{scene}, {what}", {"colours": found[name]}) for name, what in photographs.items()] + cells
             shown = True
         cells.append((row.name, found))
     masks = [images["hit"] for _, images in cells if "hit" in images]

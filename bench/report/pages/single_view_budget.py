@@ -1,0 +1,121 @@
+"""How much a network of one image needs: the error over its training shapes, and over the images of each."""
+
+from dataclasses import replace
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import SCALE, Record, Row, by_shape, error, grouped, measured, run_key, setting
+from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
+from bench.report.write import chart
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, text, to_data, to_table
+
+PLACE = 46
+READS = (
+    Selection(
+        "single_view_budget",
+        ("single_view",),
+        ("dataset", "task", "supervision"),
+        ("shapes", "views"),
+        setup=("machine",),
+    ),
+)
+NOTES = (
+    "Each point is a training of its own, with the same number of steps; all are judged by the same shapes. "
+    "A failed run counts as infinite.",
+    "“Over the largest”: the ratio of geometric means of Chamfer-L1 to those of the largest training, over the same "
+    "shapes; above 1 is worse.",
+)
+COLUMNS = (
+    *(text("family", "Family"), text("method", "Training"), Column("shapes", "Shapes"), Column("views", "Images each")),
+    *(text("found", "Chamfer-L1"), Column("iou", "IoU"), text("ratio", "Over the largest"), text("failed", "Failed")),
+)
+RUNS = (
+    *(FAMILY, configured("shapes", "task", "shapes"), configured("views", "task", "views"), *IDENTITY),
+    *metrics("chamfer_l1", "iou", "normal_consistency", "mask_iou"),
+)
+Budget = tuple[int, int]  # training shapes, and images of each
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family, row and budget."""
+    lines, estimates = [], []
+    for name, records in experiment.families().items():
+        for row, of_row in replace(experiment, records=records).rows().items():
+            budgets = dict(sorted(grouped(of_row, _budget).items()))
+            for budget, found in budgets.items():
+                estimates.append(_estimate(found))
+                lines.append({"family": name, "method": row.name, **_line(budget, budgets)})
+    return Result(
+        experiment,
+        "Shape from one image, by the size of the training.",
+        "Chamfer-L1 in scene units, times 1000, medians over shapes.",
+        interval="95 % bootstrap intervals over shapes",
+        estimates=estimates,
+        remarks=NOTES,
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, lines),
+        figure=draw(experiment),
+    )
+
+
+def _budget(record: Record) -> Budget:
+    task = record["config"]["task"]
+    return setting(task, "shapes"), setting(task, "views")
+
+
+def _errors(records: list[Record]) -> dict:
+    return {run_key(record): error(record, "chamfer_l1") for record in records}
+
+
+def _estimate(records: list[Record]) -> Interval:
+    return bootstrap(by_shape(_errors(records)), median, seed=0).times(SCALE)
+
+
+def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, object]:
+    found = budgets[budget]
+    known = [value for record in found if (value := measured(record, "iou")) is not None]
+    largest = max(budgets, key=lambda one: one[0] * one[1])
+    errors, least = _errors(found), _errors(budgets[largest])
+    both = sorted(set(errors) & set(least), key=str)
+    ratio = ""
+    if budget != largest and both:
+        parts = (by_shape({key: values[key] for key in both}) for values in (errors, least))
+        ratio = str(geometric_ratio(*parts))
+    return {
+        "shapes": budget[0],
+        "views": budget[1],
+        "found": str(_estimate(found)),
+        "iou": median(known) if known else None,
+        "ratio": ratio,
+        "failed": f"{sum(record['status'] != 'ok' for record in found)} of {len(found)}",
+    }
+
+
+@style.styled
+def draw(experiment: Experiment) -> Figure:
+    """A line of panels per family: the error over the images of each shape, and over the shapes."""
+    families = experiment.families()
+    figure, axes = chart.sheet(2.6 * len(families), len(families), 2, sharey="row")
+    for (left, right), (name, records) in zip(axes, families.items(), strict=True):
+        for row, of_row in replace(experiment, records=records).rows().items():
+            budgets = grouped(of_row, _budget)
+            most = (max(shapes for shapes, _ in budgets), max(views for _, views in budgets))
+            _curve(left, row, {views: runs for (shapes, views), runs in budgets.items() if shapes == most[0]})
+            _curve(right, row, {shapes: runs for (shapes, views), runs in budgets.items() if views == most[1]})
+            left.set_xlabel(f"images of each of {most[0]} training shapes")
+            right.set_xlabel(f"training shapes, {most[1]} images of each")
+        left.set_ylabel(f"{name}: Chamfer-L1 × 1000")
+    style.legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _curve(axis: Axes, row: Row, runs: dict[int, list[Record]]) -> None:
+    sizes = sorted(runs)
+    chart.estimates(axis, row.preset, sizes, [_estimate(runs[size]) for size in sizes], bars=True, label=row.name)
+    axis.set_xscale("log", base=2)
+    axis.set_xticks(sizes, [str(size) for size in sizes])
+    axis.minorticks_off()
