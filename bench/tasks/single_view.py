@@ -38,6 +38,7 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
     "before: of the mean code of all training images",
 }
+TRAINING = {"seconds.training": "of the network, once for all shapes; not part of the run's time"}
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
 COLOURS = ("psnr", "ssim")  # scores of colours
 DECIDING = (  # settings that determine the network
@@ -139,7 +140,7 @@ class OneImage:
         if self.image_path is not None:
             self._see(run, recipe, Path(self.image_path))
             return
-        record.definitions = DEFINITIONS | COSTS
+        record.definitions = DEFINITIONS | COSTS | TRAINING
         images = recipe.imaging.of_shape(recipe.dataset, Split(record.config["split"]), record.config["index"])
         subject = subject_of(images, self.given, inputs)
         if self.method == NETWORK:
@@ -181,6 +182,7 @@ class OneImage:
             raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}")
         model, trained = recipe.load(path)
         run.record.notes = [*run.record.notes, told(trained)]
+        run.record.seconds |= {"training": trained["seconds"]["training"]}
         if not self.knows_colours:
             for weights in model.decoder.texture_head.parameters():
                 weights.zero_()  # grey, in place of the colours that the training began with
@@ -189,7 +191,7 @@ class OneImage:
     def _see(self, run: RunContext, recipe: Recipe, path: Path) -> None:
         """The shape that the network gives for a picture of one's own, and the view from which it looks most alike."""
         inputs, record = run.inputs, run.record
-        record.scene, record.definitions = path.name, OF_PICTURE | COSTS
+        record.scene, record.definitions = path.name, OF_PICTURE | COSTS | TRAINING
         model, trained = self._network(run, recipe)
         mask = None if self.mask_path is None else Path(self.mask_path)
         picture = read_picture(path, mask, self.image_pixels, trained["filled"])

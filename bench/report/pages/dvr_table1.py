@@ -5,8 +5,9 @@ from dataclasses import replace
 from matplotlib.figure import Figure
 
 from bench.pictures import style
+from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import Row, by_shape, error, measured, run_key
+from bench.report.data.records import Row, by_shape, error, measured, median_of_known, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -52,6 +53,7 @@ COLUMNS = (
     shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
     shown("Over the mean shape", lambda line: str(line["ratio"]) if line.get("ratio") else ""),
     *(Column("normal_consistency", "Normals"), Column("mask_iou", "Mask IoU"), Column("psnr", "PSNR")),
+    *(Column("training", "Trained in", show=format.seconds), Column("seconds", "Inference", show=format.seconds)),
     *(text("failed", "Failed"), text("published", "Published")),
 )
 RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LOOP)
@@ -69,7 +71,9 @@ def make(experiment: Experiment) -> Result:
         mean = next((values for row, values in errors.items() if row.preset == MEAN), None)
         for line, (row, values) in zip(lines_of(part, NAMES), errors.items(), strict=True):
             cells[name, row] = bootstrap(by_shape(values), median, seed=0)
-            lines.append({"family": name, **line, "interval": cells[name, row], "ratio": _over(values, mean, row)})
+            trained = median_of_known(setting(record, "seconds", "training") for record in part.rows()[row])
+            more = {"interval": cells[name, row], "ratio": _over(values, mean, row), "training": trained}
+            lines.append({"family": name, **line, **more})
         published = PUBLISHED.get(name.partition("/")[0], {})
         lines += [
             {"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published.items()
