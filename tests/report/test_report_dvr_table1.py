@@ -1,20 +1,22 @@
 """The page of shapes from one image: medians by family and row, and ratios to the mean shape."""
 
+import numpy as np
 import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import dvr_table1
+from bench.report.pages import dvr_table1, single_view_budget, single_view_figures
 from tests.report.test_report_paper import write_run
+from tests.report.test_report_shapes import images, titles
 
 ROWS = {"RGB": "single_view", "Mean shape": "single_view_mean"}
 
 
-def made(results, row, chamfer, *, dataset="car", index=0, status="ok"):
+def made(results, row, chamfer, *, dataset="car", index=0, status="ok", seconds=None):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
         results, "dvr_table1", row, task="single_view", dataset=dataset, method=ROWS[row], renderer="newton",
-        status=status, metrics=metrics if status == "ok" else {},
+        status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {},
         settings={"dataset": {"name": dataset}, "index": index},
     )  # fmt: skip
 
@@ -37,6 +39,54 @@ def test_a_line_has_medians_and_the_ratio_to_the_mean_shape_over_the_same_shapes
     assert found["sofa", "RGB"]["Chamfer-L1"] == "25.0" and found["sofa", "RGB"]["Over the mean shape"] == ""
     assert found["car", "published: DVR, RGB"]["Published"] == "0.196"
     assert found["sofa", "published: DVR, depth"]["Published"] == "0.221"
+
+
+def test_a_line_has_the_seconds_of_the_training_and_of_the_inference(tmp_path):
+    for index, spent in enumerate((0.5, 0.7, 0.6)):
+        made(tmp_path, "RGB", 0.1, index=index, seconds={"forward": spent, "backward": 0.0, "training": 90.0})
+        made(tmp_path, "Mean shape", 0.2, index=index)
+    found = lines(tmp_path)
+    assert (found["car", "RGB"]["Trained in"], found["car", "RGB"]["Inference"]) == ("90.0 s", "600 ms")
+    assert (found["car", "Mean shape"]["Trained in"], found["car", "Mean shape"]["Inference"]) == ("–", "–")
+
+
+def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
+    for index, chamfer in enumerate((0.3, 0.1, 0.4, 0.2)):
+        folder = made(tmp_path, "RGB", chamfer, index=index)
+        images(folder, (1.0, 0.0, 0.0))
+        with np.load(folder / "images.npz") as file:
+            np.savez(folder / "images.npz", **file, given=np.full((4, 4, 3), index / 4))
+        made(tmp_path, "Mean shape", 0.5 - chamfer, index=index)
+    result = single_view_figures.make(choose(read_records(tmp_path)[0], single_view_figures.READS[0], tmp_path))
+    shown = ["car 1, given", "car 1, another image", "RGB", "Mean shape"]
+    assert titles(result.figure) == [*shown, "car 2, given", "car 2, another image", "RGB", "Mean shape"]
+    first, third = (result.figure.axes[place].get_images()[0].get_array() for place in (0, 8))
+    assert (first == 0.25).all() and (third == 0.5).all()
+    assert "No pictures of Mean shape, car 2: no images.npz." in result.notes
+
+
+def budget(results, shapes, views, chamfer, index):
+    return write_run(
+        results, "single_view_budget", "RGB and depth", task="single_view", method="single_view_rgb_depth",
+        metrics={"iou": 0.8, "chamfer_l1": chamfer},
+        settings={"dataset": {"name": "car"}, "index": index, "task": {"shapes": shapes, "views": views}},
+    )  # fmt: skip
+
+
+def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
+    errors = {(96, 1): 0.08, (96, 24): 0.02, (96, 4): 0.04, (12, 24): 0.06}
+    for (shapes, views), chamfer in errors.items():
+        for index in range(3):
+            budget(tmp_path, shapes, views, chamfer, index)
+    result = single_view_budget.make(choose(read_records(tmp_path)[0], single_view_budget.READS[0], tmp_path))
+    table = result.table.set_index(["Shapes", "Images each"])
+    assert list(table.index) == [("12", "24"), ("96", "1"), ("96", "4"), ("96", "24")]
+    assert table["Chamfer-L1"].str.split().str[0].tolist() == ["60.0", "80.0", "40.0", "20.0"]
+    assert table["Over the largest"].tolist() == ["3.00 (n = 3)", "4.00 (n = 3)", "2.00 (n = 3)", ""]
+    left, right = result.figure.axes
+    drawn = [axis.containers[0].lines[0].get_xydata().tolist() for axis in (left, right)]
+    assert drawn == [[[1, 80], [4, 40], [24, 20]], [[12, 60], [96, 20]]]
+    assert "96 training shapes" in left.get_xlabel() and "24 images" in right.get_xlabel()
 
 
 @pytest.mark.parametrize("status", ["crashed", "empty"])

@@ -30,7 +30,7 @@ NOTES = (
     "shapes; above 1 is worse.",
 )
 COLUMNS = (
-    *(text("family", "Family"), text("method", "Training"), Column("shapes", "Shapes"), Column("views", "Images each")),
+    *(text("family", "Family"), text("method", "Training"), text("shapes", "Shapes"), text("views", "Images each")),
     *(text("found", "Chamfer-L1"), Column("iou", "IoU"), text("ratio", "Over the largest"), text("failed", "Failed")),
 )
 RUNS = (
@@ -86,8 +86,8 @@ def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, obje
         parts = (by_shape({key: values[key] for key in both}) for values in (errors, least))
         ratio = str(geometric_ratio(*parts))
     return {
-        "shapes": budget[0],
-        "views": budget[1],
+        "shapes": str(budget[0]),
+        "views": str(budget[1]),
         "found": str(_estimate(found)),
         "iou": median(known) if known else None,
         "ratio": ratio,
