@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from math import log
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -260,7 +261,7 @@ def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None 
     """
     if not 0 < threshold < 1:
         raise ValueError(f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5")
-    level = torch.tensor(threshold, dtype=torch.float64).logit().item()
+    level = log(threshold / (1 - threshold))
     return _OccupancyField(logits, level, flops)  # pyright: ignore[reportReturnType] (it is frozen)
 
 

@@ -77,11 +77,11 @@ class ImagesOf:
     def in_hull(self, seed: int) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
         """Points in the cube and points near the visual hull of the masks, and whether each lies in the hull."""
         draw, shots = torch.Generator().manual_seed(seed), self.shots()
-        anywhere = CUBE * (2 * torch.rand(2 * POINTS, 3, generator=draw) - 1)
+        anywhere = CUBE * (2 * torch.rand(2 * POINTS, 3, generator=draw, device="cpu") - 1)
         inside = carve(shots, anywhere) < 0
         found = anywhere[inside] if bool(inside.any()) else anywhere
-        near = found[torch.randint(len(found), (POINTS,), generator=draw)]
-        near = near + NEAR_HULL * torch.randn(POINTS, 3, generator=draw)
+        near = found[torch.randint(len(found), (POINTS,), generator=draw, device="cpu")]
+        near = near + NEAR_HULL * torch.randn(POINTS, 3, generator=draw, device="cpu")
         return torch.cat([anywhere[:POINTS], near]), torch.cat([inside[:POINTS], carve(shots, near) < 0])
 
     def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
@@ -89,8 +89,8 @@ class ImagesOf:
         camera = self.cameras[view]
         rays = camera.rays().flat()
         meets = sphere_span(rays)[2].nonzero().squeeze(-1)
-        chosen = meets[torch.randint(len(meets), (count,), generator=generator)]
-        at_one = camera.depth(torch.ones(camera.height, camera.width)).flatten()[chosen]
+        chosen = meets[torch.randint(len(meets), (count,), generator=generator, device="cpu")]
+        at_one = camera.depth(torch.ones_like(self.depths[view])).flatten()[chosen]
         mask, depth = self.masks[view].flatten()[chosen], self.depths[view].flatten()[chosen]
         return Pixels(
             rays[chosen].to(device),

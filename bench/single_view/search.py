@@ -39,8 +39,8 @@ class MaskSearch:
     def problem(self, shot: Shot, inputs: RunInputs) -> CodeProblem:
         """The problem of an image with a mask; it starts from code zero, the mean shape."""
         size = (shot.camera.height, shot.camera.width)
-        none = torch.zeros(size, dtype=torch.bool)
-        given = GivenView(
-            self, inputs.renderer, shot.camera.rays(), torch.zeros(size), torch.ones(size), none, shot.mask
-        ).to(inputs.device)
+        none = torch.zeros(size, dtype=torch.bool, device="cpu")
+        given = GivenView(self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask).to(
+            inputs.device
+        )
         return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device)

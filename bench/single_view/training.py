@@ -132,7 +132,8 @@ def train(
         Failed: where the loss or a weight is not a number; `state` stays.
     """
     torch.manual_seed(settings.seed)
-    model = SingleView(network).to(device)
+    with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
+        model = SingleView(network).to(device)
     optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
     begun, lessons = (
         _restored(state, model, optimiser, course),
@@ -170,8 +171,10 @@ class Lessons:
         """The mean loss over a step's shapes, whose gradients are left in the weights; one shape's graph at a time."""
         draw = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + step)
         torch.manual_seed(draw.initial_seed())  # of what the losses draw
-        chosen = torch.randperm(len(self.images), generator=draw)[: self.settings.shapes_per_step].tolist()
-        inputs = torch.randint(len(self.images[0].cameras), (len(chosen),), generator=draw).tolist()
+        chosen = torch.randperm(len(self.images), generator=draw, device="cpu")[
+            : self.settings.shapes_per_step
+        ].tolist()
+        inputs = torch.randint(len(self.images[0].cameras), (len(chosen),), generator=draw, device="cpu").tolist()
         shown = torch.stack([self.images[shape].image(view) for shape, view in zip(chosen, inputs, strict=True)])
         for parameter in model.parameters():
             parameter.grad = None
@@ -194,7 +197,7 @@ class Lessons:
     ) -> list[Tensor]:
         terms, given = [], self.supervision
         if given.renders:
-            view = int(torch.randint(len(images.cameras), (1,), generator=draw))
+            view = int(torch.randint(len(images.cameras), (1,), generator=draw, device="cpu"))
             pixels = images.pixels(view, self.settings.rays, draw, self.device)
             terms.append(given.losses(renderer, shape, metered, pixels)["total"])
         if given.occupancy:
@@ -213,7 +216,7 @@ class Lessons:
         draw: torch.Generator,
     ) -> Float[Tensor, ""]:
         """The cross entropy at some points of which it is known whether they lie inside."""
-        some = torch.randint(len(points), (self.supervision.points,), generator=draw)
+        some = torch.randint(len(points), (self.supervision.points,), generator=draw, device="cpu")
         logits = occupancy_logits(shape, shape(points[some].to(self.device)), width=LOGIT_WIDTH)
         return binary_cross_entropy_with_logits(logits, inside[some].to(logits))
 
@@ -222,9 +225,9 @@ def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Co
     tensors = {f"weights.{name}": tensor for name, tensor in model.state_dict().items()}
     for place, moments in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{place}.{name}": tensor for name, tensor in moments.items()}
-    tensors["losses"] = torch.tensor(course.losses, dtype=torch.float64)
+    tensors["losses"] = torch.tensor(course.losses, dtype=torch.float64, device="cpu")
     spent = (course.seconds, course.counts.value, course.counts.gradient, course.counts.coarse)
-    tensors["spent"] = torch.tensor(spent, dtype=torch.float64)
+    tensors["spent"] = torch.tensor(spent, dtype=torch.float64, device="cpu")
     save_whole(tensors, path)
 
 

@@ -42,12 +42,12 @@ def carve(shots: Sequence[Shot], points: Float[Tensor, "*batch 3"]) -> Float[Ten
 
 
 def _carved(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    least, seen = torch.ones(len(points)), torch.zeros(len(points))
-    left = torch.arange(len(points))  # not yet far outside of a mask
+    least, seen = torch.ones_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    left = torch.arange(len(points), device=points.device)  # not yet far outside of a mask
     for shot in shots:
         assert shot.mask is not None
         pixels, depth = shot.camera.project(points[left])
-        size = torch.tensor([shot.camera.width, shot.camera.height])
+        size = torch.tensor([shot.camera.width, shot.camera.height], device=points.device)
         inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
         places = (2 * pixels / size - 1)[None, :, None]
         mask = shot.mask.float()[None, None]

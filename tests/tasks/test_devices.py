@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 from bench.config import CONF, build, load, register
 from bench.reconstruct.subject import Depths, find_subject
 from bench.setup.fields import FieldChoice
+from bench.single_view.training import train
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import Objective, OptimiserSettings
 from bench.tasks.pose import Pose, PoseProblem
@@ -18,7 +19,8 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
 from renderers.fields.analytic import sphere
-from tests.tiny import CPU, ball_prior, camera_of, run_of
+from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
+from tests.tiny import CPU, ball_prior, camera_of, run_of, silent
 
 CASES = {
     "completion": ("task.points=50",),
@@ -64,6 +66,21 @@ def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, render
     depths = Depths("20%", 0.01)
     subject = find_subject(task.images, depths, run.inputs, longest=24, every=task.held_out, masks=True)
     check(task.problem(run.inputs.field.name, subject, run))
+
+
+@pytest.mark.parametrize(("renderer", "reads"), [("newton", "distance"), ("idr", "distance"), ("dvr", "occupancy")])
+def test_a_training_from_images_stays_on_its_device(images, tmp_path, renderer, reads):  # noqa: F811
+    supervision = replace(RGB, hull=0.5, occupancy=1.0, losses=replace(RGB.losses, depth=1.0))
+    settings, network = replace(SETTINGS, steps=4), replace(NETWORK, reads=reads)
+    torch.set_default_device("meta")
+    try:
+        model, course = train(
+            images, network, supervision, load("renderer", renderer), settings, tmp_path / "state", CPU, silent
+        )
+    finally:
+        torch.set_default_device(None)
+    assert len(course.losses) == 4 and np.isfinite(course.losses).all()
+    assert all(parameter.device == CPU and parameter.isfinite().all() for parameter in model.parameters())
 
 
 def check(problem: Objective) -> None:
