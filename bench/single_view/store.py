@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from bench.machine.environment import describe
 from bench.progress import Report
 from bench.records.files import digest, file_lock, to_json, write_text
-from bench.shape_prior.store import SHIPPED, save_whole
+from bench.shape_prior.store import save_whole
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import filled_share
@@ -26,6 +26,7 @@ from datasets.dataset import Dataset, Split
 from renderers.checks import BadInput
 from renderers.rendering import Renderer
 
+SHIPPED = Path(__file__).resolve().parents[2] / "datasets" / "networks"
 VERSION = 1  # raise it when training changes, so that no network of the old training is used
 Values = Callable[[Float[torch.Tensor, "n 3"]], Float[torch.Tensor, " n"]]  # negative inside
 VALIDATION = 8  # shapes on which a new network is evaluated, from their first images
@@ -71,6 +72,10 @@ class Recipe:
         """The network's file: shipped, or in `cache`; None where it was not trained yet."""
         found = [folder / f"{self.stem}.safetensors" for folder in (SHIPPED, cache)]
         return next((path for path in found if path.exists()), None)
+
+    def shipped(self) -> bool:
+        """Whether a network of the dataset is shipped, with whatever settings."""
+        return any(SHIPPED.glob(f"single_view-{self.dataset.name}-*.safetensors"))
 
     def load(self, path: Path) -> tuple[SingleView, dict[str, Any]]:
         """The network of a file, and the record of its training.

@@ -39,6 +39,7 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
     "before: of the mean code of all training images",
 }
 TRAINING = {"seconds.training": "of the network, once for all shapes; not part of the run's time"}
+SHIPPED_ROW = "+method=single_view"  # the settings of the networks that are shipped
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
 COLOURS = ("psnr", "ssim")  # scores of colours
 DECIDING = (  # settings that determine the network
@@ -179,7 +180,11 @@ class OneImage:
             with run.off_clock():
                 path = recipe.make(inputs.cache, inputs.device, run.progress)
         if path is None:
-            raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}")
+            known = recipe.shipped()
+            other = (
+                f"; the shipped one of {recipe.dataset.name} has those of {SHIPPED_ROW} at scale=desk" if known else ""
+            )
+            raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}{other}")
         model, trained = recipe.load(path)
         run.record.notes = [*run.record.notes, told(trained)]
         run.record.seconds |= {"training": trained["seconds"]["training"]}

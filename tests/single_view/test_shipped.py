@@ -1,0 +1,55 @@
+"""The networks that are shipped: found by the row's default settings, small, better than the mean code."""
+
+import json
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from bench.config import CONF, build, register
+from bench.setup.inputs import set_up
+from bench.single_view.store import SHIPPED, overlap
+from datasets.dataset import Split
+from tests.tiny import CPU, silent
+
+NETWORKS = sorted(SHIPPED.glob("*.safetensors"))
+
+
+@pytest.fixture(params=NETWORKS, ids=[path.stem.split("-")[1] for path in NETWORKS])
+def shipped(request, tmp_path):
+    """The file, and the recipe of its family's default configuration."""
+    register()
+    name = request.param.stem.split("-")[1]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", ["+method=single_view", f"dataset={name}", f"results_dir={tmp_path}"])
+    threads = torch.get_num_threads()
+    inputs = set_up(config, silent)
+    torch.set_num_threads(threads)
+    plain = OmegaConf.to_container(config, resolve=True)
+    return request.param, build(config.task, "task").recipe(inputs, plain), inputs.cache
+
+
+def test_families_have_one():
+    assert {path.stem.split("-")[1] for path in NETWORKS} >= {"car", "sofa"}
+    assert {path.stem for path in SHIPPED.glob("*.json")} == {path.stem for path in NETWORKS}
+
+
+def test_it_is_that_of_the_default_configuration_and_knows_unseen_shapes(shipped):
+    path, recipe, cache = shipped
+    assert recipe.find(cache) == path
+    assert path.stat().st_size < 3_500_000
+    model, record = recipe.load(path)
+    assert record["status"] == "ok" and record["key"] == recipe.key
+    assert record["validation"]["iou_network"] > record["validation"]["iou_mean_code"] + 0.03
+    images = recipe.imaging.of_shape(recipe.dataset, Split.VALIDATION, 0)
+    found = overlap(model.at(model(images.image(0)[None])[0]), images, CPU)
+    mean = overlap(model.at(torch.tensor(record["mean_code"])), images, CPU)
+    assert found > max(mean, 0.6)
+
+
+def test_its_record_tells_the_training_and_no_machine_path(shipped):
+    record = json.loads(shipped[0].with_suffix(".json").read_text())
+    assert record["settings"]["supervision"]["losses"]["colour"] > 0
+    assert {"images", "training"} <= set(record["seconds"]) and record["filled"] > 0.2
+    assert "/tmp" not in json.dumps(record) and "/work" not in json.dumps(record)
