@@ -92,6 +92,14 @@ def save_whole(tensors: dict[str, Tensor], path: Path) -> None:
     scratch.replace(path)
 
 
+def load_whole(path: Path) -> dict[str, Tensor] | None:
+    """The tensors of a file; None where there is none, or it was cut short, so that it is made again."""
+    try:
+        return load_file(path) if path.exists() else None
+    except (SafetensorError, OSError):
+        return None
+
+
 def probe(dataset: Dataset) -> list[float]:
     """Area and volume of the first two training shapes: a test compares them, to detect a change of the sampler."""
     meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]

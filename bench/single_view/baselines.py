@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor
 
 from bench.evaluate.evaluate import Surface, surface_metrics
 from bench.progress import Report
 from bench.records.files import digest, file_lock
-from bench.shape_prior.store import save_whole
+from bench.shape_prior.store import load_whole, save_whole
 from bench.single_view.images import ImagesOf
 from datasets.dataset import Dataset, Split
 from datasets.extract import extract
@@ -20,22 +19,26 @@ from datasets.mesh import Mesh
 from datasets.truth import Truth, sample_surface
 from renderers.fields.grid import Grid
 
+VERSION = 1  # raise it when the mean changes
 SAMPLES, REACH = 64, 1.05  # of the mean distance: per axis, and half the cube's side
 COMPARED = 2000  # points of a surface in the search for the best shape
 
 
 def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> Mesh | None:
     """The zero set of the mean signed distance of the first `count` training shapes, kept in `cache`."""
-    name = f"mean-{dataset.name}-{digest({'dataset': dataset.identity(), 'count': count, 'samples': SAMPLES})}"
+    settings = {"dataset": dataset.identity(), "count": count, "samples": SAMPLES, "reach": REACH, "version": VERSION}
+    name = f"mean-{dataset.name}-{digest(settings)}"
     path = cache / f"{name}.safetensors"
     with file_lock(cache, name):
-        if not path.exists():
+        tensors = load_whole(path)
+        if tensors is None:
             total = np.zeros((SAMPLES,) * 3)
             for index in range(count):
                 progress("averaging shapes", index, count)
                 total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(SAMPLES, REACH)
-            save_whole({"values": torch.from_numpy(total / count).float()}, path)
-    return extract(Grid(load_file(path)["values"], REACH), grid=2 * SAMPLES, reach=REACH)
+            tensors = {"values": torch.from_numpy(total / count).float()}
+            save_whole(tensors, path)
+    return extract(Grid(tensors["values"], REACH), grid=2 * SAMPLES, reach=REACH)
 
 
 def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf]) -> int:

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest, file_lock
-from bench.shape_prior.store import save_whole
+from bench.shape_prior.store import load_whole, save_whole
 from datasets.captures.hull import carve
 from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
@@ -129,7 +127,7 @@ class Imaging:
         key = digest({**settings, "photography": asdict(self.photography), "sampler": asdict(self.sampler)})
         path = cache / f"images-{dataset.name}-{split}-{key}.safetensors"
         with file_lock(cache, path.stem):
-            tensors = _read(path)
+            tensors = load_whole(path)
             if tensors is None:
                 made = []
                 for index in range(count):
@@ -162,13 +160,6 @@ def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:
     draw = np.random.default_rng([seed, 3])
     near = sample_surface(mesh, POINTS // 2, seed)[0] + NEAR * draw.standard_normal((POINTS // 2, 3))
     return np.concatenate([draw.uniform(-CUBE, CUBE, (POINTS - len(near), 3)), near])
-
-
-def _read(path: Path) -> dict[str, Tensor] | None:
-    try:
-        return load_file(path) if path.exists() else None
-    except (SafetensorError, OSError):
-        return None  # cut short when the disk was full: made again
 
 
 def _packed(made: Sequence[ImagesOf]) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from bench.machine.environment import describe
 from bench.progress import Report
 from bench.records.files import digest, file_lock, to_json, write_text
 from bench.shape_prior.store import save_whole
+from bench.single_view.images import VERSION as IMAGES
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import filled_share
@@ -29,6 +30,7 @@ from renderers.rendering import Renderer
 SHIPPED = Path(__file__).resolve().parents[2] / "datasets" / "networks"
 VERSION = 1  # raise it when training changes, so that no network of the old training is used
 Values = Callable[[Float[torch.Tensor, "n 3"]], Float[torch.Tensor, " n"]]  # negative inside
+TOLD = {"dataset", "settings", "seconds", "mean_code", "filled", "validation"}  # of a record
 VALIDATION = 8  # shapes on which a new network is evaluated, from their first images
 
 
@@ -45,7 +47,7 @@ class Recipe:
         supervision: what it may know.
         training: of it.
         renderer: through which it is trained.
-        settings: all of these as plain data.
+        settings: all of these as plain data, without what changes no weight.
     """
 
     dataset: Dataset
@@ -61,7 +63,8 @@ class Recipe:
     @property
     def key(self) -> str:
         """A hash of what determines the weights."""
-        return digest({"version": VERSION, "dataset": self.dataset.identity(), "settings": self.settings})
+        versions = [VERSION, IMAGES]
+        return digest({"versions": versions, "dataset": self.dataset.identity(), "settings": self.settings})
 
     @property
     def stem(self) -> str:
@@ -84,9 +87,12 @@ class Recipe:
             BadInput: where one of its files is missing or cannot be read.
         """
         try:
-            model = SingleView(self.network)
+            with torch.random.fork_rng():  # its first weights are drawn
+                model = SingleView(self.network)
             model.load_state_dict(load_file(path))
             record = json.loads(path.with_suffix(".json").read_text())
+            if missing := TOLD - set(record):
+                raise ValueError(f"its record lacks {', '.join(sorted(missing))}")
         except (SafetensorError, OSError, RuntimeError, ValueError) as error:
             what = " ".join(str(error).split())[:160]
             raise BadInput(f"the network {path} cannot be read ({what}): delete it, and train it again") from error
@@ -99,7 +105,7 @@ class Recipe:
             Failed: where the loss is not a number; the record says so, and the last good state stays.
         """
         cache.mkdir(parents=True, exist_ok=True)
-        with file_lock(cache, self.stem):
+        with file_lock(cache, self.stem), torch.random.fork_rng():
             if (found := self.find(cache)) is not None:
                 return found
             path = cache / f"{self.stem}.safetensors"
@@ -120,9 +126,10 @@ class Recipe:
             unseen = self.imaging.images(self.dataset, Split.VALIDATION, VALIDATION, cache, progress)
             found = _found(model, course, unseen, mean, device)
             seconds = {"images": made, "training": course.seconds}
-            found["filled"] = filled_share(torch.cat([one.masks for one in rendered]))
+            found["filled"] = filled_share(torch.cat([one.masks for one in images]))
             self._write(path, {"status": "ok", "reason": "", "seconds": seconds, **found}, device)
             save_whole(model.state_dict(), path)
+            state.unlink(missing_ok=True)
         return path
 
     def _write(self, path: Path, more: dict[str, Any], device: torch.device) -> None:

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from bench.progress import Report
 from bench.reconstruct.losses import Losses
-from bench.shape_prior.store import save_whole
+from bench.shape_prior.store import load_whole, save_whole
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.solve.problem import OptimiserSettings
@@ -48,6 +47,8 @@ class Supervision:
         check_at_least("supervision.occupancy", self.occupancy, 0, "0 switches the term off")
         if not 0 <= self.hull <= 1:
             raise ValueError(f"supervision.hull must be a share of the steps, 0 to 1, not {self.hull:g}")
+        if self.hull < 1 and not self.renders and not self.occupancy:
+            raise ValueError("supervision has no term after the hull's steps: give a weight, or supervision.hull=1")
         check_at_least("supervision.points", self.points, 1, "1024 work")
 
     @property
@@ -62,9 +63,9 @@ class TrainingSettings:
     """How a network is trained.
 
     Args:
-        steps: optimiser steps, each on `shapes_per_step` shapes, an input image and another one of each.
+        steps: optimiser steps, each on `shapes_per_step` shapes, of each a random image to encode and one to compare.
         shapes_per_step: their number.
-        rays: of each shape's other image.
+        rays: of the image that is compared.
         learning_rate: of Adam at the start; it falls to zero along a cosine.
         keep_every: steps after which the state is kept on disk, for a training that is stopped.
         seed: of weights, batches and rays.
@@ -97,13 +98,11 @@ class Course:
 
 
 class Failed(ValueError):
-    """The loss or a weight became NaN at a step; `kept` is the number of steps of the last state on disk."""
+    """The loss or its gradient is not finite at a step; `kept` is the number of steps of the last state on disk."""
 
     def __init__(self, step: int, kept: int, path: Path) -> None:
-        super().__init__(
-            f"the training failed: not a number at step {step}; the state after {kept} steps is in {path}: "
-            "lower task.training.learning_rate"
-        )
+        state = f"; the state after {kept} steps is in {path}" if kept else ""
+        super().__init__(f"the training failed: not a number at step {step}{state}: lower task.training.learning_rate")
 
 
 def train(
@@ -124,12 +123,12 @@ def train(
         supervision: what it may know.
         renderer: through which shapes are compared with images.
         settings: of the training.
-        state: file of the state of a training under way; removed at the end.
+        state: file of the state of the training, also of one that has ended, until the caller has stored the network.
         device: of the training.
         progress: of its steps.
 
     Raises:
-        Failed: where the loss or a weight is not a number; `state` stays.
+        Failed: where the loss or its gradient is not finite; `state` stays.
     """
     torch.manual_seed(settings.seed)
     with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
@@ -151,9 +150,8 @@ def train(
         course.losses.append(loss)
         course.seconds += time.perf_counter() - started
         progress("training", step + 1, settings.steps, loss)
-        if (step + 1) % settings.keep_every == 0 and step + 1 < settings.steps:
+        if (step + 1) % settings.keep_every == 0 or step + 1 == settings.steps:
             _keep(state, model, optimiser, course)
-    state.unlink(missing_ok=True)
     return model.eval().requires_grad_(False), course
 
 
@@ -233,9 +231,9 @@ def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Co
 
 def _restored(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> int:
     """Fills model, optimiser and course from a kept state, if there is one; gives the number of its steps."""
-    if not path.exists():
+    tensors = load_whole(path)
+    if tensors is None:
         return 0
-    tensors = load_file(path)
     weights, adam = (
         {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
         for start in ("weights.", "adam.")

@@ -1,7 +1,7 @@
 """Shape and colour from one image, by a network trained on many shapes (DVR, Sec. 4.1)."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from bench.reconstruct.pictures import draw_picture, draw_reconstruction, draw_s
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import with_colours
 from bench.records.record import RunStatus
+from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext, RunInputs
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
@@ -118,9 +119,12 @@ class OneImage:
             config: resolved, as plain data.
         """
         check_field_gradient(inputs.renderer)
-        settings = {name: config["task"][name] for name in DECIDING} | {"view": config["view"]}
-        settings["renderer"] = {k: v for k, v in config["renderer"].items() if not k.startswith("_") or k == "_target_"}
         sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
+        settings = {name: config["task"][name] for name in DECIDING} | {"view": asdict(sampler)}
+        settings["training"] = {name: x for name, x in settings["training"].items() if name != "keep_every"}
+        if self.supervision.renders:
+            renderer = {k: v for k, v in config["renderer"].items() if not k.startswith("_") or k == "_target_"}
+            settings["renderer"] = renderer | ({"auto": config["auto"]} if AUTO in renderer.values() else {})
         return Recipe(
             inputs.dataset,
             self.shapes,

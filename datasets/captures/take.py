@@ -81,7 +81,7 @@ def _opened(path: object) -> Image.Image:
     try:
         image = ImageOps.exif_transpose(Image.open(str(path)))
         image.load()
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
         values = np.asarray(image, np.float64)

@@ -222,7 +222,15 @@ def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_p
     assert torch.equal(weights(again), weights(whole))
     assert more.losses == course.losses
     assert more.counts == course.counts
-    assert not state.exists()
+    ended, _ = trained(images, renderer, state, progress=lambda *told: pytest.fail("trained again"))
+    assert torch.equal(weights(ended), weights(whole))  # its state stays until the network is stored
+
+
+def test_a_state_that_was_cut_short_is_begun_anew(images, renderer, tmp_path):
+    whole, _ = trained(images, renderer, tmp_path / "whole.state")
+    cut = tmp_path / "cut.state"
+    cut.write_bytes((tmp_path / "whole.state").read_bytes()[:1000])
+    assert torch.equal(weights(trained(images, renderer, cut)[0]), weights(whole))
 
 
 def test_a_step_that_is_no_number_keeps_the_last_state(images, renderer, tmp_path, monkeypatch):
@@ -257,6 +265,29 @@ def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path,
     assert torch.equal(model(image), made.load(path)[0](image))
     monkeypatch.setattr("bench.single_view.store.train", lambda *_: pytest.fail("trained again"))
     assert made.make(tmp_path, CPU, silent) == path
+    assert not list(tmp_path.glob("*.state"))
+
+
+def test_a_training_that_is_stopped_after_its_last_step_is_not_lost(renderer, tmp_path, monkeypatch):
+    def stop(*_) -> None:
+        raise Stopped
+
+    made = recipe(renderer)
+    with monkeypatch.context() as patched, pytest.raises(Stopped):
+        patched.setattr("bench.single_view.store._found", stop)
+        made.make(tmp_path, CPU, silent)
+    monkeypatch.setattr(Lessons, "give", lambda *_: pytest.fail("trained again"))
+    assert made.make(tmp_path, CPU, silent).exists()
+
+
+def test_neither_training_nor_loading_changes_later_draws(renderer, tmp_path):
+    drawn = []
+    for _ in range(2):  # trained, then found
+        torch.manual_seed(5)
+        recipe(renderer).load(recipe(renderer).make(tmp_path, CPU, silent))
+        drawn.append(torch.rand(1).item())
+    torch.manual_seed(5)
+    assert drawn == [torch.rand(1).item()] * 2
 
 
 def test_one_that_fails_has_a_record(renderer, tmp_path, monkeypatch):
@@ -273,7 +304,7 @@ def test_one_that_fails_has_a_record(renderer, tmp_path, monkeypatch):
     assert made.find(tmp_path) is None
 
 
-@pytest.mark.parametrize("spoil", ["cut", "other", "no record"])
+@pytest.mark.parametrize("spoil", ["cut", "other", "no record", "less"])
 def test_a_damaged_network_is_told(renderer, tmp_path, spoil):
     made = recipe(renderer)
     path = made.make(tmp_path, CPU, silent)
@@ -281,6 +312,9 @@ def test_a_damaged_network_is_told(renderer, tmp_path, spoil):
         path.write_bytes(path.read_bytes()[:100])
     elif spoil == "other":
         made = replace(made, network=replace(NETWORK, width=8))
+    elif spoil == "less":
+        record = json.loads(path.with_suffix(".json").read_text())
+        path.with_suffix(".json").write_text(json.dumps({k: v for k, v in record.items() if k != "filled"}))
     else:
         path.with_suffix(".json").unlink()
     with pytest.raises(BadInput, match=r"cannot be read \(.*\): delete it, and train it again"):
@@ -308,6 +342,7 @@ def test_the_overlap_is_that_of_volumes(images):
         (SETTINGS, {"learning_rate": 0.0}, "task.training.learning_rate"),
         (RGB, {"occupancy": -1.0}, "supervision.occupancy"),
         (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
+        (VOLUME, {"occupancy": 0.0}, "supervision has no term after the hull's steps: give a weight"),
         (RGB, {"points": 0}, "supervision.points"),
     ],
 )

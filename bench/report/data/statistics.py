@@ -139,7 +139,7 @@ def geometric(groups: Groups, *, level: float = 0.95) -> Interval:
 def geometric_ratio(first: Groups, second: Groups, *, level: float = 0.95) -> Interval:
     """The ratio of two geometric means over the same shapes, with Student's interval of the shapes' ratios.
 
-    See `geometric`.
+    Where both fail on a shape, neither is better: its ratio is 1. See `geometric`.
 
     Raises:
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
@@ -147,7 +147,8 @@ def geometric_ratio(first: Groups, second: Groups, *, level: float = 0.95) -> In
     if _sizes(first) != _sizes(second):
         raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
     pairs = zip(first, second, strict=True)
-    return _of_logarithms(np.array([np.mean(_logs(a)) - np.mean(_logs(b)) for a, b in pairs]), level)
+    means = [(float(np.mean(_logs(a))), float(np.mean(_logs(b)))) for a, b in pairs]
+    return _of_logarithms(np.array([0.0 if one == other else one - other for one, other in means]), level)
 
 
 def _logs(group: Any) -> np.ndarray:

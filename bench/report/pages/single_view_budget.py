@@ -7,10 +7,11 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, Record, Row, by_shape, error, grouped, measured, run_key, setting
+from bench.report.data.records import SCALE, Record, Row, by_shape, error, grouped, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
 from bench.report.write import chart
 from bench.report.write.result import Result
+from bench.report.write.shapes import middle
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, text, to_data, to_table
 
 PLACE = 46
@@ -77,7 +78,6 @@ def _estimate(records: list[Record]) -> Interval:
 
 def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, object]:
     found = budgets[budget]
-    known = [value for record in found if (value := measured(record, "iou")) is not None]
     largest = max(budgets, key=lambda one: one[0] * one[1])
     errors, least = _errors(found), _errors(budgets[largest])
     both = sorted(set(errors) & set(least), key=str)
@@ -89,7 +89,7 @@ def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, obje
         "shapes": str(budget[0]),
         "views": str(budget[1]),
         "found": str(_estimate(found)),
-        "iou": median(known) if known else None,
+        "iou": middle(found, "iou"),
         "ratio": ratio,
         "failed": f"{sum(record['status'] != 'ok' for record in found)} of {len(found)}",
     }

@@ -54,14 +54,14 @@ def lines_of(experiment: Experiment, names: Sequence[str]) -> list[dict[str, Any
 def _line(records: list[Record], names: Sequence[str]) -> dict[str, Any]:
     finished = [record for record in records if record["status"] == "ok"]
     return {
-        **{name: _middle(records, name) for name in names},
+        **{name: middle(records, name) for name in names},
         "failed": f"{len(records) - len(finished)} of {len(records)}",
         "seconds": median_of_known(map(loop_seconds, finished)),
         "evaluations": median_of_known(map(value_evaluations, finished)),
     }
 
 
-def _middle(records: list[Record], name: str) -> float | None:
+def middle(records: list[Record], name: str) -> float | None:
     """The median of a metric, with failed runs worst; None where runs that ended ok do not have it."""
     if any(measured(record, name) is None for record in records if record["status"] == "ok"):
         return None
