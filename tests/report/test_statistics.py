@@ -456,3 +456,11 @@ def test_the_ratio_of_geometric_means_is_paired_by_shape():
     assert found.points == pytest.approx((3.0,) * 6)
     with pytest.raises(ValueError, match="must have the same shapes"):
         geometric_ratio(first, first[:5])
+
+
+def test_where_both_fail_on_a_shape_the_ratio_is_1():
+    good, failed = np.array([2.0]), np.array([np.inf])
+    found = geometric_ratio([failed, *[2 * good] * 5], [failed, *[good] * 5])
+    assert found.points == pytest.approx((1.0, *[2.0] * 5))
+    assert found.value == pytest.approx(2 ** (5 / 6)) and found.low < found.value < found.high
+    assert geometric_ratio([failed, *[good] * 5], [good] * 6).value == np.inf

@@ -22,6 +22,7 @@ from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.scene import see
 from datasets.truth import Truth
+from renderers.checks import BadInput
 from tests.run.driving import command, record_of
 from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
 from tests.tiny import silent
@@ -163,6 +164,12 @@ def test_a_picture_that_cannot_be_is_told(folder, network, picture, given, says)
     done = command(*TINY, *files, f"results_dir={folder}")
     assert done.code == 2
     assert says in done.err and len(done.err.splitlines()) == 1
+
+
+def test_a_picture_that_is_far_too_large_is_told(picture, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(BadInput, match=r"ball\.png cannot be read as an image \(Image size"):
+        read_picture(picture, None, 32, 0.5)
 
 
 def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
