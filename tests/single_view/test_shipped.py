@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -42,10 +43,10 @@ def test_it_is_that_of_the_default_configuration_and_knows_unseen_shapes(shipped
     model, record = recipe.load(path)
     assert record["status"] == "ok" and record["key"] == recipe.key
     assert record["validation"]["iou_network"] > record["validation"]["iou_mean_code"] + 0.03
-    images = recipe.imaging.of_shape(recipe.dataset, Split.VALIDATION, 0)
-    found = overlap(model.at(model(images.image(0)[None])[0]), images, CPU)
-    mean = overlap(model.at(torch.tensor(record["mean_code"])), images, CPU)
-    assert found > max(mean, 0.6)
+    unseen = [recipe.imaging.of_shape(recipe.dataset, Split.VALIDATION, index) for index in range(4)]
+    found = [overlap(model.at(model(one.image(0)[None])[0]), one, CPU) for one in unseen]
+    mean = [overlap(model.at(torch.tensor(record["mean_code"])), one, CPU) for one in unseen]
+    assert np.mean(found) > max(np.mean(mean), 0.6)
 
 
 def test_its_record_tells_the_training_and_no_machine_path(shipped):
