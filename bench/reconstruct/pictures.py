@@ -35,8 +35,9 @@ WORST = 0.3  # mean difference of colours that is shown darkest
 def draw_reconstruction(
     folder: Path, inputs: RunInputs, field: Coloured, subject: Subject, curve: list[dict[str, Any]], title: str
 ) -> None:
-    """Writes summary.png, input.png, curve.png and images.npz."""
-    draw_curve(folder / "curve.png", curve)
+    """Writes summary.png, input.png, images.npz and, of a loop, curve.png."""
+    if curve:
+        draw_curve(folder / "curve.png", curve)
 
     def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
         view = picture_view(field, camera, inputs)

@@ -20,6 +20,7 @@ ROWS = (  # metric, its name in the table, factor, which direction is better
     ("fscore", "F-score", 1.0, "higher"),
     ("normal_consistency", "normal consistency", 1.0, "higher"),
     ("iou", "IoU of volumes", 1.0, "higher"),
+    ("fitted_mask_iou", "mask IoU from the best view", 1.0, "higher"),
     ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
     ("mask_iou", "mask IoU", 1.0, "higher"),
     ("psnr", "PSNR (dB)", 1.0, "higher"),

@@ -21,8 +21,8 @@ LONGEST = 1024  # pixels of a picture that are read
 SMALLEST = 16  # pixels along an object's longer side
 
 
-def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> Float[Tensor, "4 _ _"]:
-    """A picture as encoders take it, cut so that the object fills a share of it.
+def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> tuple[Float[Tensor, "4 _ _"], list[str]]:
+    """A picture as encoders take it, cut so that the object fills a share of it; and what is doubtful about it.
 
     Args:
         path: of the picture.
@@ -33,6 +33,9 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> F
     Raises:
         BadInput: where a file cannot be read, there is no mask, or it fits neither the picture nor an object.
     """
+    for file, key in ((path, "image_path"), (mask, "mask_path")):
+        if file is not None and not file.is_file():
+            raise BadInput(f"task.{key}={file} is no file: give the path of one")
     colours, opaque = read_image(path, mask, LONGEST)
     if opaque is None:
         raise BadInput(f"{path} has no mask: give task.mask_path=FILE, white on the object, or an alpha channel")
@@ -41,9 +44,16 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> F
         raise BadInput(f"the mask {mask or path} is white everywhere: make it black beside the object")
     if not bool(inside.any()) or _box(inside)[2] < SMALLEST:
         raise BadInput(f"the mask {mask or path} shows no object of {SMALLEST} pixels: make it white on the object")
+    sides = {"top": inside[0], "bottom": inside[-1], "left": inside[:, 0], "right": inside[:, -1]}
+    if all(bool(side.float().mean() > 0.5) for side in sides.values()):
+        raise BadInput(
+            f"the mask {mask or path} is white along the border: is it inverted? Make it white on the object"
+        )
+    cut_off = [name for name, side in sides.items() if bool(side.any())]
+    notes = [f"the object touches the border ({', '.join(cut_off)}): the network knows whole ones"] if cut_off else []
     channels = torch.from_numpy(np.concatenate([colours, opaque], axis=-1)).permute(2, 0, 1)
     cut = _framed(channels, inside, pixels, filled)
-    return as_input(cut[:3].permute(1, 2, 0), cut[3] > 0.5)
+    return as_input(cut[:3].permute(1, 2, 0), cut[3] > 0.5), notes
 
 
 def filled_share(masks: Bool[Tensor, "images height width"]) -> float:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from bench.progress import Report
+from bench.progress import Report, notice
 from bench.reconstruct.losses import Losses
 from bench.shape_prior.store import load_whole, save_whole
 from bench.single_view.images import ImagesOf
@@ -138,6 +138,8 @@ def train(
         _restored(state, model, optimiser, course),
         Lessons(images, supervision, renderer, settings, device),
     )
+    if 0 < begun < settings.steps:
+        notice(f"the training goes on after step {begun} of {settings.steps}")
     for step in range(begun, settings.steps):
         started = time.perf_counter()
         for group in optimiser.param_groups:

@@ -100,7 +100,11 @@ class OneImage:
         if not 1 <= self.views <= self.images.views:
             raise ValueError(f"task.views must be 1 to task.images.views={self.images.views}, not {self.views}")
         if not 0 <= self.given < self.images.views:
-            raise ValueError(f"task.given must be one of the {self.images.views} images, not {self.given}: 0")
+            raise ValueError(
+                f"task.given must be 0 to {self.images.views - 1}, not {self.given}: it is an image's number"
+            )
+        if not -90 < self.elevation[0] <= self.elevation[1] < 90:
+            raise ValueError(f"task.elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
         if self.image_path is not None and self.method != NETWORK:
             raise ValueError(f"task.image_path needs task.method=network, not {self.method}: a picture has no truth")
         if self.mask_path is not None and self.image_path is None:
@@ -203,7 +207,8 @@ class OneImage:
         record.scene, record.definitions = path.name, OF_PICTURE | COSTS | TRAINING
         model, trained = self._network(run, recipe)
         mask = None if self.mask_path is None else Path(self.mask_path)
-        picture = read_picture(path, mask, self.image_pixels, trained["filled"])
+        picture, doubts = read_picture(path, mask, self.image_pixels, trained["filled"])
+        record.notes = [*record.notes, *doubts]
         clock = time.perf_counter()
         with torch.no_grad():
             shape = model.at(model(picture[None].to(inputs.device))[0])

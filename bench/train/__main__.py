@@ -14,20 +14,21 @@ def main() -> int:
         from bench.config import build
         from bench.progress import run_progress
         from bench.setup.inputs import set_up
-        from bench.tasks.single_view import OneImage
+        from bench.tasks.single_view import OneImage, told
 
         task = build(config.task, "task", list(config.packages))
         if not isinstance(task, OneImage):
             raise ValueError(
-                "bench.train trains the network of task=single_view: add it; python -m bench.prior a prior's"
+                "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
+                "dataset=car; python -m bench.prior trains a prior"
             )
         plain = OmegaConf.to_container(config, resolve=True)
         assert isinstance(plain, dict)
         with run_progress("single_view") as progress:
             inputs = set_up(config, progress)
-            path = task.recipe(inputs, {str(key): value for key, value in plain.items()}).make(
-                inputs.cache, inputs.device, progress
-            )
+            recipe = task.recipe(inputs, {str(key): value for key, value in plain.items()})
+            path = recipe.make(inputs.cache, inputs.device, progress)
+        print(told(recipe.load(path)[1]), file=sys.stderr)
         print(path)
 
     return command_line(train)

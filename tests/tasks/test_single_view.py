@@ -121,6 +121,8 @@ def picture(images, tmp_path_factory) -> Path:  # noqa: F811
     Image.fromarray(pixels[..., 3]).save(path.with_name("mask.png"))
     Image.fromarray(pixels[:40, :, 3]).save(path.with_name("half.png"))
     Image.fromarray(np.full((80, 120), 255, np.uint8)).save(path.with_name("white.png"))
+    Image.fromarray(255 - pixels[..., 3]).save(path.with_name("inverted.png"))
+    Image.fromarray(pixels[:, 30:]).save(path.with_name("cut.png"))
     Image.fromarray(np.zeros((80, 120), np.uint8)).save(path.with_name("black.png"))
     return path
 
@@ -155,7 +157,8 @@ def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path)
         (("image=opaque", "mask=half"), "has 120 x 40 pixels, its image 120 x 80"),
         (("image=opaque", "mask=white"), "is white everywhere: make it black beside the object"),
         (("image=opaque", "mask=black"), "shows no object of 16 pixels"),
-        (("image=missing",), "cannot be read as an image"),
+        (("image=missing",), "missing.png is no file: give the path of one"),
+        (("image=opaque", "mask=inverted"), "is white along the border, as an inverted one"),
         (("mask=mask",), "task.mask_path is the mask of a picture: give task.image_path as well"),
     ],
 )
@@ -176,7 +179,11 @@ def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
     filled = filled_share(torch.cat([one.masks for one in images]))
     sides = [max(np.ptp(np.flatnonzero(m.any(0))), np.ptp(np.flatnonzero(m.any(1)))) + 1 for m in images[1].masks]
     assert filled == pytest.approx(np.median(sides) / 16, abs=1 / 16)
-    framed = read_picture(picture, None, 32, 0.5)
+    framed, doubts = read_picture(picture, None, 32, 0.5)
+    assert doubts == []
+    assert read_picture(picture.with_name("cut.png"), None, 32, 0.5)[1] == [
+        "the object touches the border (left): the network knows whole ones"
+    ]
     rows, columns = framed[3].nonzero().T
     for found in (rows, columns):
         assert (found.min() + found.max()) / 2 == pytest.approx(15.5, abs=1)
@@ -251,7 +258,7 @@ def test_inside_of_a_mesh_is_negative():
 def test_the_given_image_is_one_of_those_there_are(tmp_path):
     done = command(*TINY, "task.given=3", f"results_dir={tmp_path}")
     assert done.code != 0
-    assert "task.given must be one of the 3 images, not 3: 0" in done.err
+    assert "task.given must be 0 to 2, not 3" in done.err
 
 
 def test_its_record_is_that_of_the_training(network):

@@ -119,5 +119,5 @@ def draw(experiment: Experiment) -> Figure:
                 axis.plot([place - 0.3, place + 0.3], [median(known)] * 2, color="#222222", lw=1.2)
         axis.set_xticks(range(len(rows)), [row.name for row in rows], rotation=35, ha="right", fontsize=6)
         axis.set(title=name, ylim=(0, 1))
-    axes[0, 0].set_ylabel("IoU")
+    axes[0, 0].set_ylabel("IoU of each shape, and the median")
     return figure

@@ -108,7 +108,7 @@ def draw(experiment: Experiment) -> Figure:
             _curve(right, row, {shapes: runs for (shapes, views), runs in budgets.items() if views == most[1]})
             left.set_xlabel(f"images of each of {most[0]} training shapes")
             right.set_xlabel(f"training shapes, {most[1]} images of each")
-        left.set_ylabel(f"{name}: Chamfer-L1 × 1000")
+        left.set_ylabel(f"{name}: Chamfer-L1 × 1000 (scene units)")
     style.legend_below(figure, axes[0, 0])
     return figure
 
