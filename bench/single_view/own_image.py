@@ -46,9 +46,7 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
         raise BadInput(f"the mask {mask or path} shows no object of {SMALLEST} pixels: make it white on the object")
     sides = {"top": inside[0], "bottom": inside[-1], "left": inside[:, 0], "right": inside[:, -1]}
     if all(bool(side.float().mean() > 0.5) for side in sides.values()):
-        raise BadInput(
-            f"the mask {mask or path} is white along the border: is it inverted? Make it white on the object"
-        )
+        raise BadInput(f"the mask {mask or path} is white along the border, as an inverted one: make the object white")
     cut_off = [name for name, side in sides.items() if bool(side.any())]
     notes = [f"the object touches the border ({', '.join(cut_off)}): the network knows whole ones"] if cut_off else []
     channels = torch.from_numpy(np.concatenate([colours, opaque], axis=-1)).permute(2, 0, 1)
