@@ -130,13 +130,25 @@ def scene_of(record: Record) -> str:
 
 @style.styled
 def draw_pictures(
-    experiment: Experiment, rows: Sequence[Row], scenes: Sequence[str], photographs: Mapping[str, str] = HELD_OUT
+    experiment: Experiment,
+    rows: Sequence[Row],
+    scenes: Sequence[str],
+    photographs: Mapping[str, str] = HELD_OUT,
+    most: int = MOST_COLUMNS,
 ) -> tuple[Figure, list[str]]:
-    """For each scene the photographs and each row's colours, normals below; a note for each missing one."""
+    """For each scene the photographs and each row's colours, normals below; a note for each missing one.
+
+    Args:
+        experiment: with the runs.
+        rows: that are shown.
+        scenes: that are shown, see `scene_of`.
+        photographs: arrays of images.npz that all rows share, and what they are.
+        most: pictures side by side.
+    """
     blocks, notes = [], []
     for scene in scenes:
         cells, missing = _cells(experiment, rows, scene, photographs)
-        blocks += [cells[start : start + MOST_COLUMNS] for start in range(0, len(cells), MOST_COLUMNS)]
+        blocks += [cells[start : start + most] for start in range(0, len(cells), most)]
         notes += missing
     columns = max(map(len, blocks), default=1)
     figure, axes = chart.sheet(2.4 * style.WIDTH / columns * len(blocks), 2 * max(len(blocks), 1), columns)
@@ -145,7 +157,7 @@ def draw_pictures(
         axis.axis("off")
     for place, cells in enumerate(blocks):
         for (title, images), above, below in zip(cells, axes[2 * place], axes[2 * place + 1], strict=False):
-            above.set_title("\n".join(textwrap.wrap(title, 15)), fontsize=5.5)
+            above.set_title("\n".join(textwrap.wrap(title, 120 // most)), fontsize=5.5)
             _pair(above, below, images)
     return figure, notes
 
