@@ -14,7 +14,7 @@ from bench.report.write.result import Result
 from bench.report.write.shapes import middle
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, text, to_data, to_table
 
-PLACE = 46
+PLACE = 43
 READS = (
     Selection(
         "single_view_budget",

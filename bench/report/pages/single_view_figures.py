@@ -7,7 +7,7 @@ from bench.report.write.result import Result
 from bench.report.write.shapes import draw_pictures, scene_of
 from bench.report.write.table import FAMILY, IDENTITY, metrics, to_data
 
-PLACE = 45
+PLACE = 42
 READS = dvr_table1.READS
 PHOTOGRAPHS = {"given": "given", "photograph": "another image"}
 NOTES = (
