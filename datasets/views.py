@@ -14,6 +14,12 @@ from renderers.checks import check_at_least, check_positive
 STEEPEST = 89.0  # degrees
 
 
+def check_elevation(name: str, degrees: tuple[float, float]) -> None:
+    """Refuses a range that does not rise between the poles."""
+    if not -90 < degrees[0] <= degrees[1] < 90:
+        raise ValueError(f"{name} must rise within -90 to 90 degrees, not {list(degrees)}")
+
+
 @dataclass(frozen=True)
 class ViewSampler:
     """Draws cameras that look at the origin, world y up.
@@ -38,8 +44,7 @@ class ViewSampler:
             raise ValueError(f"field_of_view must lie between 0 and 180 degrees, not {self.field_of_view}")
         if not -inf < self.azimuth[0] <= self.azimuth[1] < inf:
             raise ValueError(f"azimuth must rise and be finite, in degrees, not {list(self.azimuth)}")
-        if not -90 < self.elevation[0] <= self.elevation[1] < 90:
-            raise ValueError(f"elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
+        check_elevation("elevation", self.elevation)
 
     @property
     def focal_length(self) -> float:

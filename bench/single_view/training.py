@@ -134,10 +134,8 @@ def train(
     with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
         model = SingleView(network).to(device)
     optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
-    begun, lessons = (
-        _restored(state, model, optimiser, course),
-        Lessons(images, supervision, renderer, settings, device),
-    )
+    begun = _restored(state, model, optimiser, course)
+    lessons = Lessons(images, supervision, renderer, settings, device)
     if 0 < begun < settings.steps:
         notice(f"the training goes on after step {begun} of {settings.steps}")
     for step in range(begun, settings.steps):

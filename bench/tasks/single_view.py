@@ -29,8 +29,10 @@ from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.problem import check_field_gradient, check_kind
 from bench.solve.solve import COSTS, descend, failure_of, note_result
 from datasets.dataset import Split
+from datasets.mesh import Mesh
 from datasets.photographs import Photography
 from datasets.truth import Truth
+from datasets.views import check_elevation
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.fields.coloured import OccupancyOf
 
@@ -103,8 +105,7 @@ class OneImage:
             raise ValueError(
                 f"task.given must be 0 to {self.images.views - 1}, not {self.given}: it is an image's number"
             )
-        if not -90 < self.elevation[0] <= self.elevation[1] < 90:
-            raise ValueError(f"task.elevation must rise within -90 to 90 degrees, not {list(self.elevation)}")
+        check_elevation("task.elevation", self.elevation)
         if self.image_path is not None and self.method != NETWORK:
             raise ValueError(f"task.image_path needs task.method=network, not {self.method}: a picture has no truth")
         if self.mask_path is not None and self.image_path is None:
@@ -170,11 +171,7 @@ class OneImage:
         with run.off_clock():
             before = self._judged(model.at(mean), images, subject, inputs)
             record.metrics_start = before.metrics
-        clock = time.perf_counter()
-        with torch.no_grad():
-            shape = model.at(model(images.image(self.given)[None].to(inputs.device))[0])
-            surface_of(shape, inputs)
-        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        shape, _ = _inferred(run, model, images.image(self.given))
         with run.off_clock():
             note_result(run, self._judged(shape, images, subject, inputs))
             if inputs.evaluation.picture is not None:
@@ -209,11 +206,7 @@ class OneImage:
         mask = None if self.mask_path is None else Path(self.mask_path)
         picture, doubts = read_picture(path, mask, self.image_pixels, trained["filled"])
         record.notes = [*record.notes, *doubts]
-        clock = time.perf_counter()
-        with torch.no_grad():
-            shape = model.at(model(picture[None].to(inputs.device))[0])
-            mesh = surface_of(shape, inputs)
-        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        shape, mesh = _inferred(run, model, picture)
         with run.off_clock():
             if mesh is None:
                 note_result(run, Evaluation({FITTED: 0.0}, None, (RunStatus.EMPTY, "the field has no surface")))
@@ -284,6 +277,18 @@ class Inside:
     def __call__(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Negative inside."""
         return torch.from_numpy(self.truth.signed_distance(points.numpy()))
+
+
+@torch.no_grad()
+def _inferred(
+    run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]
+) -> tuple[OccupancyOf, Mesh | None]:
+    """The shape that an image shows, with its mesh, on the run's clock."""
+    clock = time.perf_counter()
+    shape = model.at(model(image[None].to(run.inputs.device))[0])
+    mesh = surface_of(shape, run.inputs)
+    run.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+    return shape, mesh
 
 
 def _title(run: RunContext) -> str:

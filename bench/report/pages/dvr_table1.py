@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import Row, by_shape, error, measured, median_of_known, run_key, setting
+from bench.report.data.records import Record, RunKey, by_shape, error, measured, median_of_known, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -69,15 +69,13 @@ def make(experiment: Experiment) -> Result:
     lines, cells = [], {}
     for name, records in experiment.families().items():
         part = replace(experiment, records=records)
-        errors = {
-            row: {run_key(record): error(record, "chamfer_l1") for record in found}
-            for row, found in part.rows().items()
-        }
+        errors = {row: errors_of(found) for row, found in part.rows().items()}
         mean = next((values for row, values in errors.items() if row.preset == MEAN), None)
         for line, (row, values) in zip(lines_of(part, NAMES), errors.items(), strict=True):
             cells[name, row] = bootstrap(by_shape(values), median, seed=0)
             trained = median_of_known(setting(record, "seconds", "training") for record in part.rows()[row])
-            more = {"interval": cells[name, row], "ratio": _over(values, mean, row), "training": trained}
+            ratio = None if mean is None or row.preset == MEAN else over(values, mean)
+            more = {"interval": cells[name, row], "ratio": ratio, "training": trained}
             lines.append({"family": name, **line, **more})
         published = PUBLISHED.get(name.partition("/")[0], {})
         lines += [
@@ -96,12 +94,17 @@ def make(experiment: Experiment) -> Result:
     )
 
 
-def _over(values: dict, mean: dict | None, row: Row) -> Interval | None:
-    """The ratio to the mean shape over the shapes that both have."""
-    both = sorted(set(values) & set(mean or {}), key=str)
-    if mean is None or not both or row.preset == MEAN:
+def errors_of(records: list[Record]) -> dict[RunKey, float]:
+    """The Chamfer-L1 of each run; infinite for a failed one."""
+    return {run_key(record): error(record, "chamfer_l1") for record in records}
+
+
+def over(errors: dict[RunKey, float], others: dict[RunKey, float]) -> Interval | None:
+    """The ratio of the errors to others over the runs that both have; None without any."""
+    both = sorted(set(errors) & set(others), key=str)
+    if not both:
         return None
-    return geometric_ratio(by_shape({key: values[key] for key in both}), by_shape({key: mean[key] for key in both}))
+    return geometric_ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
 
 
 @style.styled

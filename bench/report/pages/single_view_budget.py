@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, Record, Row, by_shape, error, grouped, run_key, setting
-from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
+from bench.report.data.records import SCALE, Record, Row, by_shape, grouped, setting
+from bench.report.data.statistics import Interval, bootstrap, median
+from bench.report.pages.dvr_table1 import errors_of, over
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.shapes import middle
@@ -68,29 +69,20 @@ def _budget(record: Record) -> Budget:
     return setting(task, "shapes"), setting(task, "views")
 
 
-def _errors(records: list[Record]) -> dict:
-    return {run_key(record): error(record, "chamfer_l1") for record in records}
-
-
 def _estimate(records: list[Record]) -> Interval:
-    return bootstrap(by_shape(_errors(records)), median, seed=0).times(SCALE)
+    return bootstrap(by_shape(errors_of(records)), median, seed=0).times(SCALE)
 
 
 def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, object]:
     found = budgets[budget]
     largest = max(budgets, key=lambda one: one[0] * one[1])
-    errors, least = _errors(found), _errors(budgets[largest])
-    both = sorted(set(errors) & set(least), key=str)
-    ratio = ""
-    if budget != largest and both:
-        parts = (by_shape({key: values[key] for key in both}) for values in (errors, least))
-        ratio = str(geometric_ratio(*parts))
+    ratio = None if budget == largest else over(errors_of(found), errors_of(budgets[largest]))
     return {
         "shapes": str(budget[0]),
         "views": str(budget[1]),
         "found": str(_estimate(found)),
         "iou": middle(found, "iou"),
-        "ratio": ratio,
+        "ratio": "" if ratio is None else str(ratio),
         "failed": f"{sum(record['status'] != 'ok' for record in found)} of {len(found)}",
     }
 
