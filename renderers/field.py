@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
 STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
 
 
@@ -76,6 +77,15 @@ class Coarse:
 def coarse_of(field: Field) -> Coarse | None:
     """The cheaper values that a field offers as `coarse`; None where it offers none."""
     return getattr(field, "coarse", None)
+
+
+# From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.
+Bounds = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def bounds_of(field: Field) -> Bounds | None:
+    """The bounds of its values on segments that a field offers as `bounds`, without a graph; None where it does not."""
+    return getattr(field, "bounds", None)
 
 
 @dataclass
@@ -161,6 +171,19 @@ class Meter(Wrapper):
         """The coarse values of the field, counted apart."""
         offered = coarse_of(self.inner)
         return offered and offered.noted(self._count_coarse)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The bounds that the field offers; each counts as the products of weights that it takes."""
+        offered = bounds_of(self.inner)
+        if offered is None:
+            return None
+
+        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+            self.counts.value += PRODUCTS * len(middle)
+            return offered(middle, half)
+
+        return bounds
 
     def _count_coarse(self, points: int) -> None:
         self.counts.coarse += points

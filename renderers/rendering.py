@@ -35,6 +35,26 @@ class Deferred:
 
 
 @dataclass(frozen=True)
+class Volume:
+    """What rays see where that is more than one hit: samples, and the weights with which their values are summed.
+
+    Args:
+        ray: of each sample, the place of its ray in one row.
+        distance: along the ray to the sample, in scene units.
+        weight: of the sample; those of a ray add up to its opacity, from 0 to 1. Differentiable.
+    """
+
+    ray: Int[Tensor, " samples"]
+    distance: Float[Tensor, " samples"]
+    weight: Float[Tensor, " samples"]
+
+    def summed(self, values: Float[Tensor, " samples *channels"], count: int) -> Float[Tensor, " count *channels"]:
+        """The weighted sums of the samples' values for each of `count` rays."""
+        weight = self.weight.view(-1, *[1] * (values.dim() - 1))
+        return values.new_zeros(count, *values.shape[1:]).index_add(0, self.ray, weight * values)
+
+
+@dataclass(frozen=True)
 class Rendering:
     """One answer per ray, all of the rays' leading shape, all finite.
 
@@ -46,6 +66,7 @@ class Rendering:
         closest: the field's value, with its sign, at the sample of least magnitude on the ray. Its magnitude less a
             threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable, but for rays that are deferred.
         deferred: where `closest` has no gradient yet, since most losses need it on few rays; None where it has.
+        volume: what the rays see, of a renderer for which that is more than their hits; else None.
     """
 
     distance: Float[Tensor, "*rays"]
@@ -54,6 +75,15 @@ class Rendering:
     residual: Float[Tensor, "*rays"]
     closest: Float[Tensor, "*rays"]
     deferred: Deferred | None = None
+    volume: Volume | None = None
+
+    @property
+    def opacity(self) -> Float[Tensor, "*rays"]:
+        """How much each ray sees of the shape, from 0 to 1: 1 on hits and 0 elsewhere, unless there is a volume."""
+        if self.volume is None:
+            return self.hit.to(self.distance.dtype)
+        ones = torch.ones_like(self.volume.weight)
+        return self.volume.summed(ones, self.status.numel()).view(self.status.shape)
 
     @property
     def hit(self) -> Bool[Tensor, "*rays"]:
@@ -156,6 +186,20 @@ class Spaced(Renderer, Protocol):
 
     def with_samples(self, samples: int) -> "Spaced":
         """The renderer with that many samples per ray, at every iteration."""
+        ...
+
+
+@runtime_checkable
+class Blurred(Renderer, Protocol):
+    """A renderer whose gradient of visibility is spread over a length."""
+
+    @property
+    def blur(self) -> float:
+        """That length, in scene units: of the fall of an opacity, or of a band about the outline."""
+        ...
+
+    def with_blur(self, blur: float) -> "Blurred":
+        """The renderer with another one, all else left, at every iteration."""
         ...
 
 

@@ -10,10 +10,11 @@ from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error
 from renderers.boundary import rendered
+from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.field import Field, Kind, Meter
 from renderers.fields.coloured import Coloured
-from renderers.rendering import Observed, Renderer
+from renderers.rendering import Observed, Renderer, Volume
 from renderers.silhouette import SilhouetteLoss
 
 ANYWHERE = 512  # points of the cube at which a distance's gradient is measured
@@ -25,7 +26,8 @@ class Losses:
     """Weights of the terms; 0 leaves a term out. Sums over rays are divided by the number of all rays.
 
     Args:
-        colour: of the l1 norm of colours, over hits on the foreground (DVR, Eq. 12).
+        colour: of the l1 norm of colours, over hits on the foreground (DVR, Eq. 12); where a renderer sees a volume, of
+            the sums along all rays on the foreground.
         colour_gradient: of the error of their differences to the right and below, of the upper left pixel in patches of
             2 x 2, an l2 norm for each channel (DVR's official code; the paper has no equation for it).
         depth: of the error of given depths over rays that hit (DVR, Eq. 13).
@@ -69,13 +71,16 @@ class Losses:
         normals = torch.nn.functional.normalize(slopes, dim=-1)
         terms: Terms = {}
         if self.colour or self.colour_gradient:
-            colours = shape.colours(points, slopes, pixels.rays.directions[inside])
-            difference = torch.zeros_like(pixels.colours)
-            difference[inside] = colours - pixels.colours[inside]
+            compared = inside if rendering.volume is None else _foreground(pixels)
+            if rendering.volume is None:
+                colours = shape.colours(points, slopes, pixels.rays.directions[inside])
+            else:
+                colours = _summed_colours(shape, metered, pixels.rays, rendering.volume)[compared]
+            difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
             if self.colour:
                 terms["colour"] = self.colour * difference.abs().sum() / rays
             if self.colour_gradient:
-                terms["colour_gradient"] = self.colour_gradient * _between_neighbours(difference, inside) / rays
+                terms["colour_gradient"] = self.colour_gradient * _between_neighbours(difference, compared) / rays
         if self.depth and pixels.distance is not None:
             known = rendering.hit & pixels.distance.isfinite()
             found, given = (
@@ -112,6 +117,22 @@ def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"
     """The field's gradients at points, with a graph towards its parameters and the points."""
     points = points if points.requires_grad else points.detach().requires_grad_(True)
     return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+
+
+def _foreground(pixels: Pixels) -> Bool[Tensor, " n"]:
+    """The pixels whose colours are those of the shape: without a mask all."""
+    return (
+        torch.ones(pixels.rays.shape, dtype=torch.bool).to(pixels.colours.device)
+        if pixels.mask is None
+        else pixels.mask
+    )
+
+
+def _summed_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:
+    """The colours that rays see in a volume in front of black: the weighted sums of its samples'."""
+    some = rays[volume.ray]
+    points = some.at(volume.distance)
+    return volume.summed(shape.colours(points, slopes_at(field, points), some.directions), len(rays.origins))
 
 
 def _between_neighbours(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -1,6 +1,6 @@
 """Compares a renderer's gradients with central differences in float64, by angle of incidence."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, radians
 
 import torch
@@ -13,6 +13,7 @@ from bench.evaluate.finite_differences import (
     colour_differences,
     differences,
     image_differences,
+    subrays,
 )
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.reconstruct.losses import slopes_at
@@ -20,11 +21,11 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.problem import check_field_gradient, check_kind
 from renderers.boundary import check_gradients, rendered
-from renderers.camera import Camera
+from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Meter, steepest
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Renderer
+from renderers.rendering import Blurred, Renderer, Rendering
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
 OTHER_SURFACE = 0.01  # scene units: a hit further from the true one is on another surface, and is not evaluated
@@ -47,9 +48,12 @@ DEFINITIONS = {
     "length of the true gradient: median and 99th percentile over pixels",
     "texture_cosine, texture_pooled_cosine, texture_pooled_scale, texture_scale, texture_median_error, "
     "texture_p99_error": "the same towards the weights of the paint",
-    "image_cosine, image_scale": "pooled cosine and scale of the gradient of the image of distances, with the far side "
-    "of the unit sphere as background, for the code, against differences of a supersampled image, in which visibility "
-    "changes",
+    "image_cosine, image_scale, image_error": "pooled cosine, scale and relative error of the gradient of the image of "
+    "distances, with the far side of the unit sphere as background, for the code, against differences of a "
+    "supersampled image, in which visibility changes; a pixel is the mean over task.supersampling^2 rays",
+    "image_spread": "standard deviation of that gradient between the rays of a pixel, over the length of the true one: "
+    "of one ray per pixel, it is the noise",
+    "values_per_ray": "field values for it",
 }
 
 
@@ -64,6 +68,7 @@ class Gradients:
         outline_directions: number of directions of the code for these.
         outline_step: length of the step of the code for these.
         supersampling: rays per side of a pixel for these.
+        blurs: in scene units, at which a renderer that has a blur is compared there beside its own.
     """
 
     pixels: int
@@ -72,10 +77,13 @@ class Gradients:
     outline_directions: int
     outline_step: float
     supersampling: int
+    blurs: tuple[float, ...]
 
     def __post_init__(self) -> None:
         for name in ("pixels", "directions", "outline", "outline_directions", "supersampling"):
             check_at_least(f"task.{name}", getattr(self, name), 1, "conf/task/gradients.yaml holds values that work")
+        for blur in self.blurs:
+            check_positive("task.blurs", blur, "[0.001, 0.01, 0.1]")
         check_positive("task.outline_step", self.outline_step, "conf/task/gradients.yaml holds one that works")
 
     def execute(self, run: RunContext) -> None:
@@ -103,8 +111,7 @@ class Gradients:
             numbers = self._evaluate(subject, drawn, reference.distance.flatten()[drawn], directions)
             metrics |= {f"{band}.{name}": value for name, value in numbers.items()}
         outline = _draw(_outline(reference.hit), self.outline, generator)
-        numbers = self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
-        metrics |= {f"silhouette.{name}": value for name, value in numbers.items()}
+        metrics |= self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         run.progress("comparing gradients", len(BANDS) + 1, len(BANDS) + 2)
         seen = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
         numbers = self._evaluate_colours(subject, seen, reference.distance.flatten()[seen], directions, generator)
@@ -162,9 +169,9 @@ class Gradients:
     def _evaluate_outline(
         self, subject: "Subject", pixels: Int[Tensor, " m"], directions: Float[Tensor, "code_length directions"]
     ) -> dict[str, float]:
-        """The metrics across the silhouette."""
+        """The metrics across the silhouette, at the renderer's own blur, and at those of `blurs` if it has one."""
         if not pixels.numel():
-            return {"pixels": 0}
+            return {"silhouette.pixels": 0}
         lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
         truth = image_differences(
             lambda shift: subject.decoder.at(subject.code + shift),
@@ -175,11 +182,15 @@ class Gradients:
             supersampling=self.supersampling,
             lipschitz=lipschitz,
         )
-        by_code, _, _, hit = subject.gradients(pixels)
-        image = (by_code @ directions) * hit[:, None]  # the background does not move
-        numbers: dict[str, float] = {"pixels": len(pixels)}
-        numbers["image_cosine"] = torch.cosine_similarity(image.flatten(), truth.flatten(), dim=0).item()
-        numbers["image_scale"] = ((image * truth).sum() / truth.square().sum()).item()
+        rays = subrays(subject.camera, pixels, self.supersampling)
+        numbers = {
+            "silhouette.pixels": float(len(pixels)),
+            **_visibility(subject, rays, directions, truth, "silhouette"),
+        }
+        if isinstance(subject.renderer, Blurred):
+            for blur in self.blurs:
+                blurred = replace(subject, renderer=subject.renderer.with_blur(blur))
+                numbers |= _visibility(blurred, rays, directions, truth, f"silhouette_{blur:.0e}")
         return numbers
 
 
@@ -216,6 +227,21 @@ class Subject:
                     table[row] = gradient
         return by_code, by_camera, rendering.distance.detach(), rendering.hit
 
+    def image_gradients(
+        self, rays: Rays, directions: Float[Tensor, "code_length directions"]
+    ) -> Float[Tensor, "rays directions"]:
+        """The derivatives, along directions of the code, of the distance that each ray sees.
+
+        The gradient towards the directions' coordinates is linear in the weights of the rays, so that its derivatives
+        towards these are the derivatives of all rays at once.
+        """
+        shift = torch.zeros(directions.shape[1], dtype=torch.float64, requires_grad=True)
+        rendering = rendered(self.renderer, Meter(self.decoder.at(self.code + directions @ shift), self.counts), rays)
+        weights = torch.ones(rays.shape, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(_seen(rendering, rays), shift, weights, create_graph=True)
+        columns = [torch.autograd.grad(part, weights, retain_graph=True)[0] for part in gradient]
+        return torch.stack(columns, dim=-1)
+
     def colour_gradients(
         self, pixels: Int[Tensor, " m"], paint: Paint
     ) -> tuple[
@@ -250,6 +276,35 @@ class Subject:
                         if gradient is not None:
                             table[row, channel] = gradient
         return *tables, rendering.distance.detach(), rendering.hit
+
+
+def _visibility(
+    subject: Subject,
+    rays: Rays,
+    directions: Float[Tensor, "code_length directions"],
+    truth: Float[Tensor, "pixels directions"],
+    name: str,
+) -> dict[str, float]:
+    """The metrics of the image of distances, of which each pixel is the mean over a row of `rays`."""
+    counted = replace(subject, counts=Counts())  # apart: differences of differences are not evaluations of a method
+    found = counted.image_gradients(rays.flat(), directions).view(*rays.shape, -1)
+    mean, scale = found.mean(dim=1), truth.square().sum()
+    return {
+        f"{name}.image_cosine": torch.cosine_similarity(mean.flatten(), truth.flatten(), dim=0).item(),
+        f"{name}.image_scale": ((mean * truth).sum() / scale).item(),
+        f"{name}.image_error": ((mean - truth).square().sum() / scale).sqrt().item(),
+        f"{name}.image_spread": ((found - mean[:, None]).square().mean(dim=1).sum() / scale).sqrt().item(),
+        f"{name}.values_per_ray": counted.counts.value / found[..., 0].numel(),
+    }
+
+
+def _seen(rendering: Rendering, rays: Rays) -> Float[Tensor, "*rays"]:
+    """The distance that each ray sees: that of the shape, and behind it that to the far side of the unit sphere."""
+    leave = sphere_span(rays)[1]
+    if rendering.volume is None:
+        return torch.where(rendering.hit, rendering.distance, leave)
+    beside = rendering.volume.distance - leave.flatten()[rendering.volume.ray]
+    return leave + rendering.volume.summed(beside, leave.numel()).view(leave.shape)
 
 
 def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str) -> dict[str, float]:

@@ -19,7 +19,7 @@ from bench.config import CONF, build
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.rendering import Renderer, Rendering, Status, closest_values
+from renderers.rendering import Blurred, Renderer, Rendering, Status, closest_values
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
 PARTS = ("distance", "status", "points", "residual", "closest")
@@ -38,9 +38,11 @@ def renderer(request, compose_config) -> Renderer:
 def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:
     """How far a hit may lie from the truth: where the field is below epsilon the surface is epsilon / cosine away.
 
-    Twice that, since fields that are bounds may be lower than the distance (see `stated`).
+    Twice that, since fields that are bounds may be lower than the distance (see `stated`). A renderer without an
+    epsilon that blurs the surface says over which length.
     """
-    return 2 * getattr(renderer, "epsilon", 1e-4) / cosine + (2e-6 if dtype is torch.float32 else 1e-9)
+    blur = 2 * renderer.blur if isinstance(renderer, Blurred) else 1e-4
+    return 2 * getattr(renderer, "epsilon", blur) / cosine + (2e-6 if dtype is torch.float32 else 1e-9)
 
 
 def stated(shape: Shape, kind: Kind) -> Shape:

@@ -20,7 +20,10 @@ from renderers.field import Counts, Kind
 from renderers.rendering import Capabilities, Renderer, Rendering
 from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 
-SETTINGS = Gradients(pixels=12, directions=4, outline=10, outline_directions=2, outline_step=2e-3, supersampling=4)
+BLURS = (0.003, 0.03)
+SETTINGS = Gradients(
+    pixels=12, directions=4, outline=10, outline_directions=2, outline_step=2e-3, supersampling=4, blurs=BLURS
+)
 PRIOR = ball_prior()
 SIZE = 24
 ALPHA = 1.5
@@ -86,11 +89,43 @@ def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
     numbers = {}
     for name, renderer in (("idr", EXACT["idr"]), ("dist", load("renderer", "dist", epsilon=1e-9, steps=600))):
         subject = Subject(renderer, prior.decoder, prior.codes[0], camera, Counts())
-        numbers[name] = SETTINGS._evaluate_outline(subject, torch.arange(5, 40), torch.eye(3).double())
+        found = SETTINGS._evaluate_outline(subject, torch.arange(5, 40), torch.eye(3).double())
+        numbers[name] = {key.removeprefix("silhouette."): value for key, value in found.items()}
     assert numbers["idr"]["image_cosine"] == pytest.approx(1, abs=1e-6)
     assert numbers["idr"]["image_scale"] == pytest.approx(1, abs=1e-3)
+    assert numbers["idr"]["image_error"] < 1e-3
     assert numbers["dist"]["image_cosine"] == pytest.approx(1, abs=1e-4)
     assert numbers["dist"]["image_scale"] == pytest.approx(ALPHA * cos(radians(50)), rel=0.03)
+
+
+def outline_numbers(renderer: Renderer, supersampling: int) -> dict[str, float]:
+    """The metrics at the outline of a ball."""
+    settings = replace(SETTINGS, supersampling=supersampling, outline_step=0.05)
+    twin = in_float64(PRIOR)
+    decoder, code = twin.decoder.requires_grad_(False), twin.codes[0]
+    subject = Subject(renderer, decoder, code, camera_of(16, field_of_view=45.0).double(), Counts())
+    rays = subject.camera.rays()
+    hit = renderer.render(subject.decoder.at(subject.code), rays).hit
+    directions = torch.eye(len(code)).double()[:, :2]
+    return settings._evaluate_outline(subject, _outline(hit), directions)
+
+
+def test_a_band_carries_the_gradient_of_the_image_at_the_outline_and_hits_do_not():
+    """With many rays per pixel; the narrower band has less bias and more noise in each ray."""
+    band = outline_numbers(load("renderer", "relaxed_boundary", band=0.03), 24)
+    assert band["silhouette_3e-02.image_cosine"] == band["silhouette.image_cosine"] > 0.95
+    assert 0.8 < band["silhouette.image_scale"] < 1.2
+    assert band["silhouette_3e-03.image_spread"] > 2 * band["silhouette_3e-02.image_spread"]
+    hits = outline_numbers(EXACT["idr"], 24)
+    assert hits["silhouette.image_cosine"] < 0.9
+    assert hits["silhouette.image_error"] > 2 * band["silhouette.image_error"]
+    assert "silhouette_3e-02.image_cosine" not in hits
+
+
+def test_an_opacity_carries_it_too():
+    numbers = outline_numbers(load("renderer", "neus_budget"), 8)
+    assert numbers["silhouette_3e-02.image_cosine"] > 0.9
+    assert numbers["silhouette.values_per_ray"] > 30
 
 
 def test_every_number_has_a_definition_and_every_definition_a_number(exact):

@@ -1,0 +1,117 @@
+"""UNISURF: occupancy as the opacity of samples that draw together about the surface (Oechsle et al., ICCV 2021)."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from renderers.bracket import Bracket, first_crossing, refine
+from renderers.camera import Rays
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Field, Kind, occupancy_logits
+from renderers.rendering import Capabilities, Rendering
+from renderers.volumes.integrate import Samples, evenly, mask_loss, render_volume, scheduled
+
+
+@dataclass(frozen=True)
+class UNISURF:
+    """DVR's search for the surface, then occupancies as opacities within an interval about it.
+
+    Source: UNISURF (Oechsle et al. 2021, arXiv 2104.10078), Eq. 5 (weights), Sec. 3.3 and Eq. 9 (the interval).
+    Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
+        into view or leaves it has a part, as wide as the occupancy's fall.
+    Needs: a distance or a bound inside the sphere, of which the occupancy is a sigmoid. The paper's occupancy network
+        learns how steep it is; a level set here has no length, and is refused.
+    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty.
+
+    Args:
+        search_samples: equally spaced, among which the first change from free to occupied is searched.
+        search_steps: of the secant method, for each that is found.
+        samples: within the interval about a surface; on rays without one, equally spaced.
+        free_samples: from where a ray enters the sphere to the interval.
+        interval: half its length, in scene units.
+        first_interval: at the first iteration of an optimisation.
+        occupancy_width: scene units over which a distance turns from occupied to free.
+        first_occupancy_width: at the first iteration.
+        sharpening: iterations in which the first ones become the others, by equal factors.
+        mask_weight: of the mask loss.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    search_samples: int
+    search_steps: int
+    samples: int
+    free_samples: int
+    interval: float
+    first_interval: float
+    occupancy_width: float
+    first_occupancy_width: float
+    sharpening: int
+    mask_weight: float
+    sphere_radius: float
+
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
+    )
+
+    def __post_init__(self) -> None:
+        check_at_least("search_samples", self.search_samples, 2, "the paper uses 256")
+        check_at_least("search_steps", self.search_steps, 0, "the paper uses 8")
+        check_at_least("samples", self.samples, 2, "the paper uses 64")
+        check_at_least("free_samples", self.free_samples, 1, "the paper uses 32")
+        for name in ("interval", "first_interval", "occupancy_width", "first_occupancy_width", "sphere_radius"):
+            check_positive(name, getattr(self, name), "conf/renderer/unisurf.yaml has values that work")
+        check_at_least("sharpening", self.sharpening, 0, "60 suit 100 iterations")
+        check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
+
+    @property
+    def blur(self) -> float:
+        """The occupancy's width, in scene units."""
+        return self.occupancy_width
+
+    def with_blur(self, blur: float) -> "UNISURF":
+        """See `Blurred`; the interval keeps its proportion to the width."""
+        interval = self.interval * blur / self.occupancy_width
+        return replace(self, occupancy_width=blur, interval=interval, sharpening=0)
+
+    def at_iteration(self, iteration: int) -> "UNISURF":
+        """The renderer of an iteration, on the way from the first interval and width to the last."""
+        names = ("interval", "occupancy_width")
+        now = {
+            name: scheduled(getattr(self, f"first_{name}"), getattr(self, name), self.sharpening, iteration)
+            for name in names
+        }
+        return replace(self, **now)
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """Searches the surface, samples about it, then sums with a graph."""
+
+        def passing(value: Tensor, distance: Tensor) -> Tensor:
+            return logsigmoid(-occupancy_logits(field, value, width=self.occupancy_width))
+
+        return render_volume(field, rays, self._search, passing, radius=self.sphere_radius)
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The cross entropy of the opacity, as in NeuS; the paper has no masks."""
+        return self.mask_weight * mask_loss(rendering, mask)
+
+    def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
+        """Equally spaced samples in front of the surface and in the interval; on the whole ray where there is none."""
+        coarse = Samples.of(field, rays, evenly(entry, leave, self.search_samples))
+        found, bracket = first_crossing(coarse.distance, coarse.value)
+        hit = found.nonzero().squeeze(-1)
+        root = _roots(field, rays[hit], bracket, self.search_steps)
+        near = torch.maximum(root - self.interval, entry[hit])
+        far = torch.minimum(root + self.interval, leave[hit])
+        distance = evenly(entry, leave, self.free_samples + self.samples)
+        about = [evenly(entry[hit], near, self.free_samples + 1)[:, :-1], evenly(near, far, self.samples)]
+        return Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
+
+
+def _roots(field: Field, rays: Rays, bracket: Bracket, steps: int) -> Float[Tensor, " n"]:
+    return refine(field, rays, bracket, method="secant", steps=steps)[0]

@@ -1,0 +1,171 @@
+"""VolSDF: density from the distance, and samples that bound the error of the opacity (Yariv et al., NeurIPS 2021)."""
+
+from dataclasses import dataclass, replace
+from math import log
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from renderers.camera import Rays
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Field, Kind
+from renderers.rendering import Capabilities, Rendering
+from renderers.volumes.integrate import Samples, by_importance, evenly, mask_loss, render_volume, scheduled, weights
+
+HALVINGS = 10  # of the interval in which the least width is searched, as in the paper
+MOST_LOG = 14.0  # of the error's exponential: larger ones are all the same
+
+
+@dataclass(frozen=True)
+class VolSDF:
+    """Density from the Laplace distribution's cumulative function of the distance.
+
+    Source: VolSDF (Yariv et al. 2021, arXiv 2106.12052), Eqs. 2, 3 (density), Theorem 1 and Eq. 14 (bound on the error
+        of the opacity), Algorithm 1 (samples).
+    Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
+        into view or leaves it has a part, as wide as the density's fall.
+    Needs: a distance inside the sphere; Theorem 1 holds for no other.
+    Deviates from the paper: the width follows a schedule, and is not learnt; samples lie at the middles of equal
+        shares, and are not drawn; rays whose bound holds are not sampled again; the background is empty.
+
+    Args:
+        samples: equally spaced at first, and as many more with each round, where the bound is greatest.
+        rounds: at most.
+        error: epsilon, most that the opacity may be off at the samples.
+        fine_samples: by the weights of the opacity that was found.
+        extra_samples: equally spaced, beside these.
+        width: beta, in scene units; the density deep inside is its inverse.
+        first_width: at the first iteration of an optimisation.
+        sharpening: iterations in which the one becomes the other, by equal factors.
+        mask_weight: of the mask loss.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    samples: int
+    rounds: int
+    error: float
+    fine_samples: int
+    extra_samples: int
+    width: float
+    first_width: float
+    sharpening: int
+    mask_weight: float
+    sphere_radius: float
+
+    capabilities: ClassVar[Capabilities] = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
+
+    def __post_init__(self) -> None:
+        check_at_least("samples", self.samples, 2, "the paper uses 128")
+        check_at_least("rounds", self.rounds, 0, "the paper uses 5")
+        check_positive("error", self.error, "the paper uses 0.1")
+        check_at_least("fine_samples", self.fine_samples, 1, "the paper uses 64")
+        check_at_least("extra_samples", self.extra_samples, 2, "the official code uses 32")
+        check_positive("width", self.width, "0.001 blurs the surface over .004 of the unit sphere")
+        check_positive("first_width", self.first_width, "the paper begins at 0.1")
+        check_at_least("sharpening", self.sharpening, 0, "60 suit 100 iterations")
+        check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    @property
+    def blur(self) -> float:
+        """The width, in scene units."""
+        return self.width
+
+    def with_blur(self, blur: float) -> "VolSDF":
+        """See `Blurred`."""
+        return replace(self, width=blur, sharpening=0)
+
+    def at_iteration(self, iteration: int) -> "VolSDF":
+        """The renderer of an iteration, on the way from `first_width` to `width`."""
+        return replace(self, width=scheduled(self.first_width, self.width, self.sharpening, iteration))
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """Samples until the opacity's error is bounded, then sums with a graph."""
+        return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The cross entropy of the opacity, as in NeuS; the paper has no masks."""
+        return self.mask_weight * mask_loss(rendering, mask)
+
+    def bounded(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Samples, Float[Tensor, "n 1"]]:
+        """Algorithm 1 up to its last step: samples, and the width of each ray for which they bound the error."""
+        found = Samples.of(field, rays, evenly(entry, leave, self.samples))
+        square = _spacing(found.distance).square().sum(dim=1, keepdim=True)
+        width = (square / (4 * log(1 + self.error))).sqrt().clamp_min(self.width)  # Lemma 2, of any spacing
+        width = self._least_width(found, width)
+        for _ in range(self.rounds):
+            going_on = (width > self.width).squeeze(1).nonzero().squeeze(-1)
+            if going_on.numel() == 0:
+                break
+            more, value = (table[:, : self.samples].clone() for table in (found.distance, found.value))
+            some = Samples(found.distance[going_on], found.value[going_on])
+            more[going_on] = by_importance(some.distance, _errors(some, width[going_on]), self.samples)
+            value[going_on] = Samples.of(field, rays[going_on], more[going_on]).value
+            found = found.joined(Samples(more, value))  # of the other rays samples twice, which changes nothing
+            some = Samples(found.distance[going_on], found.value[going_on])
+            width = width.index_put((going_on,), self._least_width(some, width[going_on]))
+        return found, width
+
+    def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
+        """Algorithm 1: samples by the weights at the least width whose error is bounded, and equally spaced ones."""
+        found, width = self.bounded(field, rays, entry, leave)
+        fine = by_importance(found.distance, weights(_passing(found.value, found.distance, width)), self.fine_samples)
+        return Samples.of(field, rays, torch.cat([fine, evenly(entry, leave, self.extra_samples)], 1).sort(dim=1)[0])
+
+    def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
+        return _passing(value, distance, torch.full_like(value[:, :1], self.width))
+
+    def _bound(self, found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
+        """Eq. 14: the bound on the error of the opacity."""
+        return _errors(found, width).amax(dim=1)
+
+    def _least_width(self, found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n 1"]:
+        """The least width from `self.width` to `width` whose error is bounded, by halving; `width` where none is."""
+        low, high = torch.full_like(width, self.width), width
+        reached = self._bound(found, low)[:, None] <= self.error
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            holds = self._bound(found, middle)[:, None] <= self.error
+            low, high = torch.where(holds, low, middle), torch.where(holds, middle, high)
+        return torch.where(reached, self.width, high)
+
+
+def density(value: Float[Tensor, "n samples"], width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
+    """Eqs. 2, 3: the share of a Laplace distribution that lies below minus the value, over its width."""
+    tail = torch.exp(-value.abs() / width) / 2
+    return torch.where(value > 0, tail, 1 - tail) / width
+
+
+def _spacing(distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n intervals"]:
+    return distance[:, 1:] - distance[:, :-1]
+
+
+def _passing(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
+    """The logarithm of the share of light that passes each interval, by the density at its beginning."""
+    return -density(value[:, :-1], width) * _spacing(distance)
+
+
+def _errors(found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
+    """Theorem 1: the bounds on the error of the opacity in each interval."""
+    spacing = _spacing(found.distance)
+    passed = (-density(found.value[:, :-1], width) * spacing).cumsum(dim=1)
+    before = torch.nn.functional.pad(passed, (1, 0))[:, :-1]
+    error = (spacing.square() * torch.exp(-_clearance(found) / width)).cumsum(dim=1) / (4 * width.square())
+    return before.exp() * torch.expm1(error.clamp_max(MOST_LOG))
+
+
+def _clearance(found: Samples) -> Float[Tensor, "n intervals"]:
+    """d*: how far each interval is from the surface at least, by the empty spheres about its ends (Eq. 12)."""
+    side = _spacing(found.distance)
+    first, second = found.value[:, :-1].abs(), found.value[:, 1:].abs()
+    half = (side + first + second) / 2
+    area = (half * (half - side) * (half - first) * (half - second)).clamp_min(0).sqrt()
+    least = 2 * area / side.clamp_min(torch.finfo(side.dtype).tiny)
+    least = torch.where(first.square() >= side.square() + second.square(), second, least)
+    least = torch.where(second.square() >= side.square() + first.square(), first, least)
+    crosses = (found.value[:, :-1] > 0) != (found.value[:, 1:] > 0)
+    return torch.where(crosses | (first + second <= side), 0.0, least)

@@ -1,0 +1,122 @@
+"""Bounds of a network on segments, and that ray casting by them misses nothing."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from bench.config import load
+from renderers.camera import Rays
+from renderers.field import Counts, Kind, Meter, bounds_of, steepest
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.reference import trace
+from renderers.rendering import Status
+from tests.renderers.analytic_cases import vector
+
+RENDERER = load("renderer", "range_analysis")
+
+
+def network(seed: int, *, layers: int = 4, width: int = 24, skip: int = 2, scale: float = 1.5) -> BoundDecoder:
+    """A random network, about as steep as a distance and far from one, in float64."""
+    torch.manual_seed(seed)
+    decoder = Decoder(layers=layers, width=width, code_length=3, skip=skip, narrow=False).double().requires_grad_(False)
+    for layer in decoder.hidden:
+        layer.weight.mul_(scale * 1.5)
+    field = decoder.at(torch.randn(3).double())
+    weight, bias = field.last
+    values = field(normalize(torch.randn(2000, 3).double(), dim=-1))
+    spread = values.std()
+    return replace(field, last=(weight / spread, (bias - values.median()) / spread + 0.4))
+
+
+def segments(count: int, length: float) -> tuple[torch.Tensor, torch.Tensor]:
+    middle = torch.rand(count, 3, dtype=torch.float64) * 2 - 1
+    return middle, length / 2 * normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+
+
+@pytest.mark.parametrize("length", [1.0, 0.1, 0.01])
+@pytest.mark.parametrize("seed", range(4))
+def test_all_values_of_a_segment_lie_within_its_bounds(seed, length):
+    field = network(seed)
+    middle, half = segments(200, length)
+    low, high = field.bounds(middle, half)
+    along = torch.linspace(-1, 1, 101, dtype=torch.float64)
+    values = field(middle[:, None] + along[:, None] * half[:, None])
+    assert (values >= low[:, None]).all()
+    assert (values <= high[:, None]).all()
+
+
+def test_bounds_of_a_short_segment_are_those_of_its_line():
+    """Where no ReLU changes the network is linear, and the bounds are its ends'."""
+    field = network(0)
+    middle, half = segments(200, 1e-9)
+    low, high = field.bounds(middle, half)
+    ends = torch.stack([field(middle - half), field(middle + half)])
+    torch.testing.assert_close(low, ends.amin(0), rtol=0, atol=1e-10)
+    torch.testing.assert_close(high, ends.amax(0), rtol=0, atol=1e-10)
+
+
+def test_bounds_hold_in_float32_too():
+    exact = network(1)
+    field = BoundDecoder(
+        tuple((w.float(), b.float()) for w, b in exact.hidden), tuple(part.float() for part in exact.last), exact.skip
+    )
+    middle, half = (part.float() for part in segments(300, 0.05))
+    low, high = field.bounds(middle, half)
+    values = field(middle[:, None] + torch.linspace(-1, 1, 41)[:, None] * half[:, None])
+    assert (values >= low[:, None]).all()
+    assert (values <= high[:, None]).all()
+
+
+def around(count: int) -> Rays:
+    generator = torch.Generator().manual_seed(3)
+    origins = 2 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    targets = 0.5 * torch.randn(count, 3, dtype=torch.float64, generator=generator)
+    return Rays(origins, normalize(targets - origins, dim=-1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_first_hit_of_a_network_is_missed(seed):
+    """Its values are no lengths, so that sphere tracing loses hits; the certificate loses none."""
+    field, rays = network(seed), around(400)
+    truth = trace(field, rays, lipschitz=steepest(field, radius=1.0, margin=3.0), least_step=1e-4, radius=1.0)
+    found = RENDERER.render(field, rays)
+    hits = truth.status == Status.HIT
+    assert hits.sum() > 30
+    assert (found.status[hits] == Status.HIT).all()
+    assert (found.distance - truth.distance)[hits].abs().max() < 1e-6
+    assert not (found.hit & ~hits & (truth.status != Status.STARTED_INSIDE)).any()
+    marched = load("renderer", "idr").render(field, rays)
+    assert ((marched.distance - truth.distance).abs()[hits] > 0.01).sum() + (~marched.hit[hits]).sum() > 0
+
+
+def test_a_thin_plate_is_found():
+    rays = Rays(vector((0.01, 0.02, -2)).expand(5, 3), normalize(vector((0.02, 0.03, 1)).expand(5, 3), dim=-1))
+    for thickness in (0.1, 0.01, 0.002):
+        rendering = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
+        assert rendering.hit.all()
+
+
+def test_a_field_that_breaks_its_promise_loses_its_certificate():
+    """A distance times 40 with nothing stated: the promise of a distance is taken, and its hits are passed."""
+    steep = Shape(lambda p: 40 * box((0.5, 0.5, 0.005))(p), Kind.DISTANCE, None)
+    ray = Rays(vector((0.01, 0.02, -2))[None], normalize(vector((0.02, 0.03, 1))[None], dim=-1))
+    assert not RENDERER.render(steep, ray).hit.any()
+    assert RENDERER.render(replace(steep, lipschitz=40.0), ray).hit.all()
+
+
+def test_bounds_are_counted_by_their_products():
+    field, counts = network(0), Counts()
+    meter = Meter(field, counts)
+    assert bounds_of(meter) is not None
+    bounds_of(meter)(*segments(10, 0.1))
+    assert counts.value == 30
+    assert bounds_of(Meter(sphere(0.5))) is None
+
+
+def test_too_few_segments_are_out_of_steps():
+    rendering = replace(RENDERER, most_segments=3).render(network(0), around(50))
+    assert (rendering.status == Status.OUT_OF_STEPS).any()
+    assert rendering.distance.isfinite().all()

@@ -1,0 +1,226 @@
+"""Renderers that see a volume or a band: the claim of each one's paper, in numbers, and what their users report."""
+
+from dataclasses import replace
+from math import pi
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import l1_loss
+
+from bench.config import load
+from renderers.camera import Rays, sphere_span
+from renderers.field import Counts, Meter
+from renderers.fields.analytic import Shape, box, plane, sphere
+from renderers.rendering import Blurred, Scheduled, Status, Volume, at_iteration
+from renderers.volumes.integrate import Samples, by_importance, evenly, weights
+from renderers.volumes.volsdf import _passing
+from tests.renderers.analytic_cases import CASES, Case, vector
+
+NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
+BAND = load("renderer", "relaxed_boundary")
+VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda one: type(one).__name__)
+BLURRED = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda one: type(one).__name__)
+PLANES = [case for case in CASES if case.name.startswith("plane")]
+
+
+def parallel(side: int, half: float = 0.8) -> Rays:
+    """A square grid of rays along z, in float64."""
+    centres = half * ((torch.arange(side, dtype=torch.float64) + 0.5) / side * 2 - 1)
+    x, y = torch.meshgrid(centres, centres, indexing="xy")
+    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
+    return Rays(origins, vector((0, 0, 1)).expand_as(origins))
+
+
+def error(renderer: Blurred, case: Case, blur: float) -> float:
+    """How far a hit lies behind the surface, in blurs."""
+    rendering = renderer.with_blur(blur).render(case.field(), case.rays())
+    assert rendering.status.item() == Status.HIT
+    return (rendering.distance.item() - case.distance) / blur
+
+
+@pytest.mark.parametrize("case", PLANES, ids=lambda case: case.name)
+def test_neus_is_unbiased_and_volsdf_is_not(case):
+    """NeuS, Sec. 3.1: the weight of a plane is greatest at the surface; here also its mean lies there."""
+    fine = replace(NEUS, samples=4000, rounds=0)  # equally spaced, so that weights are as densities
+    assert abs(error(fine, case, 0.01)) < 0.05
+    weight = fine.with_blur(0.01).render(case.field(), case.rays()).volume
+    assert weight.distance[weight.weight.argmax()].item() == pytest.approx(case.distance, abs=0.01)
+    off = error(replace(VOLSDF, fine_samples=512), case, 0.01)
+    if case.cosine == 1:
+        assert 0.2 < off < 1  # behind the surface
+    if case.cosine < 0.5:
+        assert -2 / case.cosine < off < -0.2  # in front of it
+
+
+@pytest.mark.parametrize("width", [0.05, 0.01, 0.002])
+@pytest.mark.parametrize("error_bound", [0.1, 0.01])
+def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
+    """VolSDF, Theorem 1 and Algorithm 1, against 40,000 samples of the opacity along each ray."""
+    renderer = replace(VOLSDF, error=error_bound, rounds=8).with_blur(width)
+    rays = parallel(12).flat()
+    entry, leave, meets = sphere_span(rays)
+    rays, entry, leave = rays[meets], entry[meets], leave[meets]
+    for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
+        found, reached = renderer.bounded(field, rays, entry, leave)
+        dense = Samples.of(field, rays, evenly(entry, leave, 40_000))
+        truth = 1 - _passing(dense.value, dense.distance, reached).cumsum(dim=1).exp()
+        opacity = 1 - _passing(found.value, found.distance, reached).cumsum(dim=1).exp()
+        place = torch.searchsorted(dense.distance, found.distance[:, 1:].contiguous()).clamp_max(39_999) - 1
+        off = (opacity - truth.gather(1, place.clamp_min(0))).abs()
+        assert off.max() <= error_bound
+        assert (reached == width).double().mean() > (0.9 if error_bound == 0.1 else 0.5)  # others are sampled for more
+
+
+def area_rates(renderer, radius: float, side: int = 400) -> tuple[float, float, float]:
+    """The area that is seen of a sphere, its derivative towards the radius, and the noise of a ray's."""
+    leaf = torch.tensor(radius, dtype=torch.float64, requires_grad=True)
+    rays = parallel(side)
+    opacity = renderer.render(sphere(leaf), rays).opacity.flatten()
+    weights = torch.ones_like(opacity).requires_grad_(True)
+    (rate,) = torch.autograd.grad(opacity, leaf, weights, create_graph=True)
+    (each,) = torch.autograd.grad(rate, weights)
+    cell = (1.6 / side) ** 2
+    return cell * opacity.sum().item(), cell * rate.item(), each.std().item()
+
+
+@pytest.mark.parametrize("blur", [0.1, 0.03, 0.01])
+def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_width(blur):
+    """A circle's area grows by its circumference; the mean over a band outside of it is that of a radius half a band
+    larger (Wang et al. 2024, Sec. 4), and the noise grows as the band gets thinner."""
+    area, rate, noise = area_rates(BAND.with_blur(blur), 0.5)
+    assert area == pytest.approx(pi * 0.25, rel=0.01)
+    assert rate == pytest.approx(2 * pi * (0.5 + blur / 2), rel=0.05)
+    assert noise > area_rates(BAND.with_blur(2 * blur), 0.5)[2]
+
+
+def test_without_a_band_the_silhouette_has_no_gradient():
+    leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    rendering = load("renderer", "idr").render(sphere(leaf), parallel(40))
+    assert not rendering.opacity.requires_grad
+
+
+@VOLUMES
+def test_opacity_carries_the_gradient_of_the_silhouette(renderer):
+    _, rate, _ = area_rates(renderer.with_blur(0.01), 0.5, side=160)
+    assert rate == pytest.approx(2 * pi * 0.5, rel=0.12)
+
+
+def test_density_outside_of_a_surface_makes_its_silhouette_larger_and_neus_does_not():
+    """By how much, in blurs: light is lost along the whole of a ray that passes close by."""
+    margins = {
+        type(renderer).__name__: (area_rates(renderer.with_blur(0.01), 0.5, side=160)[0] - pi * 0.25) / (pi * 0.01)
+        for renderer in (NEUS, VOLSDF, UNISURF)
+    }
+    assert abs(margins["NeuS"]) < 0.7
+    assert 2 < margins["VolSDF"] < 4
+    assert 2 < margins["UNISURF"] < 4
+
+
+def test_what_is_seen_behind_gives_way_to_what_comes_into_view():
+    """A ray close by a sphere in front of a wall: the sphere's weight grows by as much as the wall's falls."""
+    leaf = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    field = Shape(lambda p: torch.minimum(sphere(leaf)(p), plane((0.0, 0.0, -1.0), -0.6)(p)), sphere(0.3).kind, 1.0)
+    ray = Rays(vector((0.304, 0, -2))[None], vector((0, 0, 1))[None])
+    rendering = BAND.render(field, ray)
+    assert rendering.hit.item()
+    assert rendering.distance.item() == pytest.approx(2.6, abs=1e-3)
+    assert rendering.volume is not None
+    for weight, rate in zip(rendering.volume.weight, (1, -1), strict=True):
+        (found,) = torch.autograd.grad(weight, leaf, retain_graph=True)
+        assert found.item() == pytest.approx(rate / BAND.band, rel=1e-6)
+    (opacity,) = torch.autograd.grad(rendering.opacity.sum(), leaf)
+    assert opacity.item() == pytest.approx(0, abs=1e-9)
+
+
+@BLURRED
+def test_a_narrower_blur_brings_the_image_closer_to_the_hits(renderer):
+    rays, errors = parallel(30), []
+    truth = load("renderer", "idr").render(sphere(0.5), rays)
+    for blur in (0.1, 0.02, 0.004):
+        rendering = renderer.with_blur(blur).render(sphere(0.5), rays)
+        assert rendering.opacity.shape == rays.shape
+        assert ((rendering.opacity >= 0) & (rendering.opacity <= 1 + 1e-9)).all()
+        errors.append(l1_loss(rendering.opacity, truth.hit.double()).item())
+    assert errors[-1] < 0.02
+    assert errors == sorted(errors, reverse=True)
+
+
+@VOLUMES
+def test_a_wide_blur_puts_weight_before_the_surface(renderer):
+    """What users of these methods report as floaters: light that stays in front of the surface."""
+    ray, field = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None]), sphere(0.5)
+    shares = []
+    for blur in (0.1, 0.01):
+        volume = renderer.with_blur(blur).render(field, ray).volume
+        early = volume.distance < 1.5 - 0.05
+        shares.append((volume.weight * early).sum().item())
+    assert shares[0] > 0.1
+    assert shares[1] < 0.05
+
+
+@BLURRED
+def test_a_sharpening_ends_at_the_setting(renderer):
+    if not isinstance(renderer, Scheduled):
+        pytest.skip("its band stays")
+    blurs = [at_iteration(renderer, iteration).blur for iteration in (0, 20, 60, 1000)]
+    assert blurs == sorted(blurs, reverse=True)
+    assert blurs[0] > 10 * blurs[-1]
+    assert blurs[-1] == blurs[-2] == renderer.blur
+    assert renderer.with_blur(0.02).blur == pytest.approx(0.02)
+    assert at_iteration(renderer.with_blur(0.02), 0).blur == pytest.approx(0.02)
+
+
+@VOLUMES
+def test_most_values_need_no_graph(renderer):
+    """Samples without a part in what a ray sees have none in the gradient: few of the values are differentiated."""
+    counts, leaf = Counts(), torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    rendering = renderer.render(Meter(sphere(leaf), counts), parallel(20))
+    rendering.volume.weight.sum().backward()
+    assert 0 < counts.gradient < 0.2 * counts.value
+
+
+@VOLUMES
+def test_leaving_out_faint_samples_changes_no_gradient(renderer, monkeypatch):
+    leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    found = []
+    for faint in (1e-5, 1e-12):
+        monkeypatch.setattr("renderers.volumes.integrate.FAINT", faint)
+        rendering = renderer.with_blur(0.01).render(sphere(leaf), parallel(20))
+        loss = rendering.opacity.sum() + rendering.distance[rendering.hit].sum()
+        found.append(torch.autograd.grad(loss, leaf)[0])
+    torch.testing.assert_close(found[0], found[1], rtol=2e-3, atol=0)
+
+
+def test_weights_are_the_light_that_stays():
+    passing = vector((0.5, 1.0, 0.25)).log()[None]
+    torch.testing.assert_close(weights(passing), vector((0.5, 0.0, 0.375))[None])
+
+
+def test_importance_draws_where_it_lies():
+    distance = vector((0, 1, 2, 4))[None]
+    drawn = by_importance(distance, vector((0, 1, 0))[None], 4)
+    torch.testing.assert_close(drawn, vector((1.125, 1.375, 1.625, 1.875))[None], rtol=0, atol=1e-4)
+    even = by_importance(distance, torch.zeros(1, 3).double(), 4)
+    torch.testing.assert_close(even, vector((0.5, 1.5, 2.5, 3.5))[None])
+
+
+def test_a_volume_sums_any_values():
+    volume = Volume(torch.tensor([2, 0, 2]), vector((1, 2, 3)), vector((0.5, 1, 0.25)))
+    torch.testing.assert_close(volume.summed(vector((2, 3, 4)), 4), vector((3, 0, 2, 0)))
+    channels: Tensor = vector((1, 0, 0, 1, 1, 1)).view(3, 2)
+    torch.testing.assert_close(volume.summed(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
+
+
+@pytest.mark.parametrize(
+    ("renderer", "setting"),
+    [
+        (NEUS, "samples"), (NEUS, "sharpness"), (NEUS, "round_samples"),
+        (VOLSDF, "width"), (VOLSDF, "error"), (VOLSDF, "fine_samples"),
+        (UNISURF, "interval"), (UNISURF, "occupancy_width"), (BAND, "band"), (BAND, "steps"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_that_cannot_be_are_refused(renderer, setting):
+    with pytest.raises(ValueError, match=setting):
+        replace(renderer, **{setting: 0})
