@@ -39,9 +39,9 @@ def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.floa
     """How far a hit may lie from the truth: where the field is below epsilon the surface is epsilon / cosine away.
 
     Twice that, since fields that are bounds may be lower than the distance (see `stated`). A renderer without an
-    epsilon that blurs the surface says over which length.
+    epsilon that blurs the surface says over which length, and one that replaces it how far off that may be.
     """
-    blur = 2 * renderer.blur if isinstance(renderer, Blurred) else 1e-4
+    blur = 2 * renderer.blur if isinstance(renderer, Blurred) else getattr(renderer, "accuracy", 1e-4)
     return 2 * getattr(renderer, "epsilon", blur) / cosine + (2e-6 if dtype is torch.float32 else 1e-9)
 
 

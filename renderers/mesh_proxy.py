@@ -1,0 +1,176 @@
+"""A mesh in place of the field: marching cubes, exact ray casting, and gradients through the mesh's vertices."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import open3d
+import torch
+from jaxtyping import Bool, Float, Int
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from renderers.camera import Rays, sphere_span
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Field, Kind, carries_gradient
+from renderers.gradients import fixed_samples
+from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.silhouette import CrossEntropy
+
+OUTSIDE = 1.0  # value that stands for one that is not finite, of a grid point
+LEAST_COSINE = 1e-3  # between a ray and the normal of the triangle that it hits; flatter ones are divided by this
+
+
+@dataclass(frozen=True)
+class MeshProxy:
+    """Marching cubes in each rendering; a ray's hit is where it crosses a triangle.
+
+    Source: MeshSDF (Remelli et al. 2020, arXiv 2006.03997), Theorem 1: a vertex moves by -n / |grad f| times the change
+        of the field there; marching cubes (Lewiner et al. 2003) of scikit-image, ray casting of Open3D.
+    Differentiable in: field parameters, through the vertices of the triangles that are hit; rays, on these triangles'
+        planes. What comes into view or leaves it has no part in the gradient of `distance`, only in that of the mask
+        loss (IDR's).
+    Needs: any level set. What is thinner than the grid's spacing may be missed, and edges are cut off by as much.
+    Deviates from the paper: the grid is anew in each rendering and not refined; triangles are ray cast, not rasterised.
+
+    Args:
+        grid: samples on each side of the cube about the sphere.
+        ray_samples: along a ray without a hit, of the grid's values, to find its closest place.
+        least_slope: least length of the field's gradient at a vertex, in field units per scene unit.
+        mask_sharpness, mask_weight: of the mask loss; see `silhouette.CrossEntropy`.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    grid: int
+    ray_samples: int
+    least_slope: float
+    mask_sharpness: float
+    mask_weight: float
+    sphere_radius: float
+
+    capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
+
+    def __post_init__(self) -> None:
+        check_at_least("grid", self.grid, 4, "96 has cells of .02 scene units")
+        check_at_least("ray_samples", self.ray_samples, 2, "64 are a sample a cell and a half")
+        check_positive("least_slope", self.least_slope, "1e-2 is far flatter than a distance")
+        check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
+        check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    @property
+    def accuracy(self) -> float:
+        """Scene units within which a hit lies, over the cosine of its incidence: the grid's spacing."""
+        return 2 * self.sphere_radius / (self.grid - 1)
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """Makes the mesh without a graph, casts the rays, then attaches the gradient of the triangles."""
+        flat = rays.flat()
+        entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
+        queried = meets.nonzero().squeeze(-1)
+        with torch.no_grad():
+            values = self._values(field, flat.origins)
+            first = torch.zeros_like(entry).index_put((queried,), field(flat[queried].at(entry[queried])))
+            inside = meets & (first < 0)
+            mesh = _Mesh.of(values, self.sphere_radius)
+            found, triangle = mesh.cast(flat, entry)
+            hit = (meets & ~inside & (triangle >= 0) & (found < leave)).nonzero().squeeze(-1)
+            least_at = self._closest(values, flat, entry, leave)
+        distance = entry.index_put((hit,), self._crossed(field, flat[hit], mesh, triangle[hit]))
+        least_at = least_at.index_put((hit,), distance[hit].detach())
+        with torch.no_grad():
+            least = field(flat[queried].at(least_at[queried]))
+        least = fixed_samples(field, flat[queried], least_at[queried], least)
+        status = torch.full_like(meets, Status.MISS, dtype=torch.int8)
+        status[inside], status[hit] = Status.STARTED_INSIDE, Status.HIT
+        return assemble(
+            rays,
+            self.sphere_radius,
+            distance=torch.where(status == Status.MISS, leave, distance),
+            status=status,
+            residual=torch.zeros_like(entry).index_put((queried,), least.detach()),
+            closest=(queried, least),
+        )
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `silhouette.CrossEntropy`."""
+        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
+
+    def _values(self, field: Field, like: Tensor) -> Float[Tensor, "side side side"]:
+        """The field on the grid, by x, y, z."""
+        axis = torch.linspace(-self.sphere_radius, self.sphere_radius, self.grid, dtype=like.dtype, device=like.device)
+        points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        values = torch.cat([field(plane.view(-1, 3)) for plane in points])
+        return torch.where(values.isfinite(), values, OUTSIDE).view(points.shape[:-1])
+
+    def _closest(self, values: Tensor, rays: Rays, entry: Tensor, leave: Tensor) -> Float[Tensor, " n"]:
+        """Where on each ray the grid's values are least in magnitude."""
+        shares = torch.linspace(0, 1, self.ray_samples, dtype=entry.dtype, device=entry.device)
+        distance = entry[:, None] + shares * (leave - entry)[:, None]
+        points = rays.at_each(distance).view(1, -1, 1, 1, 3).flip(-1) / self.sphere_radius  # grid_sample takes z first
+        sampled = torch.nn.functional.grid_sample(values[None, None], points, align_corners=True, padding_mode="border")
+        place = sampled.view(distance.shape).abs().argmin(dim=1, keepdim=True)
+        return distance.gather(1, place).squeeze(1)
+
+    def _crossed(self, field: Field, rays: Rays, mesh: "_Mesh", triangle: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The distances at which rays cross the planes of triangles, whose vertices move with the field."""
+        used, corner = mesh.triangles[triangle].unique(return_inverse=True)
+        vertices = self._moving(field, mesh.vertices[used])
+        first, second, third = vertices[corner].unbind(dim=1)
+        normal = torch.linalg.cross(second - first, third - first)
+        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True).clamp_min(
+            torch.finfo(normal.dtype).tiny
+        )
+        along = (normal * rays.directions).sum(-1)
+        flat = along.abs() < LEAST_COSINE
+        along = torch.where(flat, torch.where(along < 0, -LEAST_COSINE, LEAST_COSINE), along)
+        return ((first - rays.origins) * normal).sum(-1) / along
+
+    def _moving(self, field: Field, vertices: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Vertices with the derivative of Theorem 1 of MeshSDF."""
+        if not (torch.is_grad_enabled() and carries_gradient(field, vertices)):
+            return vertices
+        with torch.enable_grad():
+            leaf = vertices.detach().requires_grad_(True)
+            value = field(leaf)
+            (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=True)
+        gradient = gradient.nan_to_num(0.0)
+        square = gradient.square().sum(-1, keepdim=True).clamp_min(self.least_slope**2)
+        return vertices - (value - value.detach())[:, None] * gradient / square
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    vertices: Float[Tensor, "vertices 3"]
+    triangles: Int[Tensor, "triangles 3"]
+
+    @staticmethod
+    def of(values: Float[Tensor, "side side side"], radius: float) -> "_Mesh":
+        """The zero set of values on a grid; without triangles where no sign changes."""
+        if not float(values.min()) < 0 < float(values.max()):
+            return _Mesh(values.new_zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64, device=values.device))
+        spacing = 2 * radius / (len(values) - 1)
+        vertices, triangles, _, _ = marching_cubes(values.cpu().numpy(), 0.0, spacing=(spacing,) * 3)
+        return _Mesh(
+            torch.from_numpy(vertices.copy()).to(values) - radius,
+            torch.from_numpy(triangles.astype(np.int64)).to(values.device),
+        )
+
+    def cast(self, rays: Rays, start: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
+        """The distance of each ray's first crossing from `start` on, infinite without, and its triangle, or -1."""
+        nothing = torch.full_like(start, torch.inf), torch.full_like(start, -1, dtype=torch.int64)
+        if not len(self.triangles) or not len(start):
+            return nothing
+        scene = open3d.t.geometry.RaycastingScene()
+        scene.add_triangles(
+            open3d.core.Tensor(self.vertices.cpu().float().numpy()),
+            open3d.core.Tensor(self.triangles.cpu().numpy().astype(np.uint32)),
+        )
+        both = torch.cat([rays.at(start), rays.directions], dim=-1).detach().cpu().float().numpy()
+        answer = scene.cast_rays(open3d.core.Tensor(np.ascontiguousarray(both)))
+        distance = start + torch.from_numpy(answer["t_hit"].numpy()).to(start)
+        number = torch.from_numpy(answer["primitive_ids"].numpy().astype(np.int64)).to(start.device)
+        hit = distance.isfinite()
+        return torch.where(hit, distance, nothing[0]), torch.where(hit, number, nothing[1])

@@ -1,0 +1,74 @@
+"""A mesh in place of the field: how far its hits and gradients are from the field's own, and what it loses."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from bench.config import load
+from renderers.camera import Rays
+from renderers.field import Counts, Kind, Meter
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.rendering import Status
+from tests.renderers.analytic_cases import vector
+
+RENDERER = load("renderer", "mesh_proxy", grid=48)
+
+
+def aimed(count: int) -> Rays:
+    """Rays at points well within a sphere of radius 0.5."""
+    generator = torch.Generator().manual_seed(1)
+    origins = 2 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    targets = 0.3 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    return Rays(origins, normalize(targets - origins, dim=-1))
+
+
+@pytest.mark.parametrize("steep", [1.0, 5.0])
+def test_its_gradients_are_those_of_the_field_up_to_the_grid(steep):
+    """Also of a field that is no distance: the gradient of a vertex is divided by the field's slope."""
+    leaf, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(200)
+    origins = rays.origins.requires_grad_(True)
+    field = Shape(lambda p: steep * sphere(leaf)(p), Kind.LEVEL, None)
+    found, exact = (
+        one.render(field, Rays(origins, rays.directions))
+        for one in (RENDERER, load("renderer", "dvr", n_ray_samples=400, doublings=[]))
+    )
+    assert found.hit.all()
+    assert (found.distance - exact.distance).abs().max() < 0.2 * RENDERER.accuracy
+    for wanted in (leaf, origins):
+        one, other = (torch.autograd.grad(r.distance.sum(), wanted, retain_graph=True)[0] for r in (found, exact))
+        assert torch.cosine_similarity(one.flatten(), other.flatten(), dim=0) > 0.999
+        assert float(one.norm() / other.norm()) == pytest.approx(1, abs=0.01)
+
+
+def test_a_finer_grid_is_closer():
+    rays, errors = aimed(100), []
+    truth = load("renderer", "idr").render(sphere(0.5), rays).distance
+    for grid in (12, 24, 48, 96):
+        errors.append((replace(RENDERER, grid=grid).render(sphere(0.5), rays).distance - truth).abs().max().item())
+    for coarse, fine in pairwise(errors):
+        assert fine < 0.4 * coarse  # the error of a chord falls with the square of its length
+
+
+def test_what_is_thinner_than_the_grid_is_lost():
+    ray = Rays(vector((0.01, 0.02, -2))[None], normalize(vector((0.02, 0.03, 1))[None], dim=-1))
+    thin = box((0.5, 0.5, 0.005))
+    assert replace(RENDERER, grid=401).render(thin, ray).hit.item()
+    assert not RENDERER.render(thin, ray).hit.item()
+
+
+def test_the_cost_is_that_of_the_grid_whatever_the_rays():
+    for count in (1, 100):
+        counts = Counts()
+        RENDERER.render(Meter(sphere(0.5), counts), aimed(count))
+        assert 48**3 < counts.value < 48**3 + 1000
+
+
+@pytest.mark.parametrize("value", [1.0, -1.0, float("nan")])
+def test_a_field_without_a_surface_has_no_mesh(value):
+    field = Shape(lambda p: value + 0 * p[..., 0], Kind.LEVEL, None)
+    rendering = RENDERER.render(field, aimed(5))
+    assert (rendering.status == (Status.STARTED_INSIDE if value < 0 else Status.MISS)).all()
+    assert rendering.distance.isfinite().all()
