@@ -165,11 +165,11 @@ class _Mesh:
             return nothing
         scene = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(
-            open3d.core.Tensor(self.vertices.cpu().float().numpy()),
-            open3d.core.Tensor(self.triangles.cpu().numpy().astype(np.uint32)),
+            open3d.core.Tensor.from_numpy(self.vertices.cpu().float().numpy()),
+            open3d.core.Tensor.from_numpy(self.triangles.cpu().numpy().astype(np.uint32)),
         )
         both = torch.cat([rays.at(start), rays.directions], dim=-1).detach().cpu().float().numpy()
-        answer = scene.cast_rays(open3d.core.Tensor(np.ascontiguousarray(both)))
+        answer = scene.cast_rays(open3d.core.Tensor.from_numpy(np.ascontiguousarray(both)))
         distance = start + torch.from_numpy(answer["t_hit"].numpy()).to(start)
         number = torch.from_numpy(answer["primitive_ids"].numpy().astype(np.int64)).to(start.device)
         hit = distance.isfinite()
