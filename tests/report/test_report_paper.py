@@ -12,7 +12,7 @@ from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment, choose
-from bench.report.pages import fig4, fig5, fig7, gradients, table1
+from bench.report.pages import fig4, fig5, fig7, gradients, gradients_visibility, table1
 from bench.report.write import pictures
 from bench.report.write import result as tables
 from bench.report.write.html import write_index
@@ -320,6 +320,37 @@ def test_gradients_have_a_row_for_each_renderer_and_band(judged):
     assert "A pooled number compares the gradients of all pixels of a band at once" in text
     assert rows.loc[("dist", "grazing"), "code_pooled_cosine"] == 0.97
     assert r"\begin{tabular}" in (judged / "paper" / "gradients.tex").read_text()
+
+
+def seen(blur: str, error: float) -> dict[str, float]:
+    """The metrics at the outline, at a blur."""
+    numbers = {"image_cosine": 0.9, "image_scale": 1.1, "image_error": error, "image_spread": 2.0}
+    return {f"silhouette_{blur}.{name}": value for name, value in (numbers | {"values_per_ray": 30.0}).items()}
+
+
+def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
+    blurred = seen("1e-03", 0.3) | seen("3e-02", 0.2)
+    own = {key.replace("_1e-03", ""): value for key, value in seen("1e-03", 0.9).items()}
+    write_run(tmp_path, "gradients", None, metrics=bands() | own, renderer="idr")
+    write_run(tmp_path, "gradients", None, metrics=bands() | own | blurred, renderer="neus")
+    write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
+    main([f"results_dir={tmp_path}"])
+    rows = pd.read_csv(tmp_path / "paper" / "gradients_visibility.csv").set_index("row")
+    assert rows.loc["neus", "blur"].tolist() == [0.001, 0.03]
+    assert rows.loc["neus", "image_error"].tolist() == [0.3, 0.2]
+    assert rows.loc["idr", "image_error"] == 0.9 and np.isnan(rows.loc["idr", "blur"])
+    assert rows.loc["naive", "status"] == "oom"
+    figure = gradients_visibility.draw(
+        rows.reset_index().assign(
+            name=lambda r: r["row"],
+            preset=lambda r: r["row"],
+            blur=lambda r: r["blur"].map("{:g}".format).replace("nan", ""),
+        )
+    )
+    by_blur, _, by_cost = figure.axes
+    drawn_lines = [list(line.get_ydata()) for line in by_blur.lines if len(line.get_ydata())]
+    assert sorted(drawn_lines) == [[0.3, 0.2], [0.9, 0.9]]
+    assert {line.get_label() for line in by_cost.lines} >= {"neus"}
 
 
 def drawn(axis, label: str) -> list[float]:
