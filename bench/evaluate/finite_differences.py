@@ -152,7 +152,7 @@ def image_differences(
     *,
     camera: Camera,
     pixels: Int[Tensor, " m"],
-    step: float,
+    steps: Float[Tensor, " directions"],
     supersampling: int,
     lipschitz: float,
 ) -> Float[Tensor, "m directions"]:
@@ -166,19 +166,53 @@ def image_differences(
         directions: of the code, as unit columns.
         camera: in float64.
         pixels: indices into the flattened image.
-        step: of the difference, large enough that the outline moves by a fraction of a pixel.
-        supersampling: S of S x S rays per pixel.
+        steps: of the differences, see `outline_steps`.
+        supersampling: S of S x S rays per pixel; the fewer, the larger the noise of a small step.
         lipschitz: bound on the gradient of the field, for the tracer.
     """
     rays = subrays(camera, pixels, supersampling)
     columns = []
-    for direction in directions.T:
+    for direction, step in zip(directions.T, steps.tolist(), strict=True):
         ahead, behind = (
             trace(field_at(sign * step * direction), rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0).distance
             for sign in (1, -1)
         )
         columns.append((ahead - behind).mean(dim=1) / (2 * step))
     return torch.stack(columns, dim=1)
+
+
+def outline_steps(
+    field_at: Callable[[Tensor], Field],
+    directions: Float[Tensor, "code_length directions"],
+    *,
+    camera: Camera,
+    pixels: Int[Tensor, " m"],
+    shift: float,
+    lipschitz: float,
+) -> Float[Tensor, " directions"]:
+    """The step along each direction of the code that moves the surface of most of some pixels by `shift` pixels.
+
+    Args:
+        field_at, directions, camera, pixels, lipschitz: see `image_differences`.
+        shift: in pixels; for nine pixels in ten the surface moves by less.
+
+    Raises:
+        ValueError: where no ray through the middle of a pixel hits.
+    """
+    rays = camera.rays().flat()[pixels]
+    hits = trace(field_at(torch.zeros_like(directions[:, 0])), rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0)
+    if not bool(hits.hit.any()):
+        raise ValueError("no pixel of the outline hits at its middle: draw more by task.outline")
+    points, distance = hits.points[hits.hit], hits.distance[hits.hit]
+    slopes = torch.linalg.vector_norm(autograd_gradients(field_at(torch.zeros_like(directions[:, 0])), points), dim=-1)
+    footprints = distance / camera.intrinsics[0, 0]
+    found = []
+    for direction in directions.T:
+        with torch.no_grad():
+            ahead, behind = (field_at(sign * STEP * direction)(points) for sign in (1, -1))
+        moved = (ahead - behind).abs() / (2 * STEP) / slopes / footprints
+        found.append(shift / moved.quantile(0.9).clamp_min(1e-12))
+    return torch.stack(found)
 
 
 def subrays(camera: Camera, pixels: Int[Tensor, " m"], count: int) -> Rays:

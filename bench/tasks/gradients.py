@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from math import cos, radians
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,6 +14,7 @@ from bench.evaluate.finite_differences import (
     colour_differences,
     differences,
     image_differences,
+    outline_steps,
     subrays,
 )
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
@@ -23,7 +25,7 @@ from bench.solve.problem import check_field_gradient, check_kind
 from renderers.boundary import check_gradients, rendered
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Counts, Meter, steepest
+from renderers.field import Counts, Field, Meter, steepest
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Blurred, Renderer, Rendering
 
@@ -66,7 +68,7 @@ class Gradients:
         directions: number of random orthogonal directions of the code.
         outline: number of pixels drawn next to the outline.
         outline_directions: number of directions of the code for these.
-        outline_step: length of the step of the code for these.
+        outline_shift: pixels by which a step of the code moves most of these, to either side.
         supersampling: rays per side of a pixel for these.
         blurs: in scene units, at which a renderer that has a blur is compared there beside its own.
     """
@@ -75,7 +77,7 @@ class Gradients:
     directions: int
     outline: int
     outline_directions: int
-    outline_step: float
+    outline_shift: float
     supersampling: int
     blurs: tuple[float, ...]
 
@@ -84,7 +86,7 @@ class Gradients:
             check_at_least(f"task.{name}", getattr(self, name), 1, "conf/task/gradients.yaml holds values that work")
         for blur in self.blurs:
             check_positive("task.blurs", blur, "[0.001, 0.01, 0.1]")
-        check_positive("task.outline_step", self.outline_step, "conf/task/gradients.yaml holds one that works")
+        check_positive("task.outline_shift", self.outline_shift, "0.1 moves it within a pixel")
 
     def execute(self, run: RunContext) -> None:
         """Compares the gradients, and fills the record."""
@@ -173,15 +175,13 @@ class Gradients:
         if not pixels.numel():
             return {"silhouette.pixels": 0}
         lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
-        truth = image_differences(
-            lambda shift: subject.decoder.at(subject.code + shift),
-            directions,
-            camera=subject.camera,
-            pixels=pixels,
-            step=self.outline_step,
-            supersampling=self.supersampling,
-            lipschitz=lipschitz,
-        )
+
+        def field_at(shift: Tensor) -> Field:
+            return subject.decoder.at(subject.code + shift)
+
+        seen: Any = {"camera": subject.camera, "pixels": pixels, "lipschitz": lipschitz}
+        steps = outline_steps(field_at, directions, shift=self.outline_shift, **seen)
+        truth = image_differences(field_at, directions, steps=steps, supersampling=self.supersampling, **seen)
         rays = subrays(subject.camera, pixels, self.supersampling)
         numbers = {
             "silhouette.pixels": float(len(pixels)),

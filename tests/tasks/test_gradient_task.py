@@ -22,7 +22,7 @@ from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 
 BLURS = (0.003, 0.03)
 SETTINGS = Gradients(
-    pixels=12, directions=4, outline=10, outline_directions=2, outline_step=2e-3, supersampling=4, blurs=BLURS
+    pixels=12, directions=4, outline=10, outline_directions=2, outline_shift=0.1, supersampling=4, blurs=BLURS
 )
 PRIOR = ball_prior()
 SIZE = 24
@@ -100,7 +100,7 @@ def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
 
 def outline_numbers(renderer: Renderer, supersampling: int) -> dict[str, float]:
     """The metrics at the outline of a ball."""
-    settings = replace(SETTINGS, supersampling=supersampling, outline_step=0.05)
+    settings = replace(SETTINGS, supersampling=supersampling)
     twin = in_float64(PRIOR)
     decoder, code = twin.decoder.requires_grad_(False), twin.codes[0]
     subject = Subject(renderer, decoder, code, camera_of(16, field_of_view=45.0).double(), Counts())
@@ -297,5 +297,5 @@ def test_counts_that_cannot_be_are_refused(name):
 
 
 def test_a_step_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match=r"task\.outline_step must be positive, not -0\.1"):
-        replace(SETTINGS, outline_step=-0.1)
+    with pytest.raises(ValueError, match=r"task\.outline_shift must be positive, not -0\.1"):
+        replace(SETTINGS, outline_shift=-0.1)
