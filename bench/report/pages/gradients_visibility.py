@@ -76,10 +76,12 @@ def draw(data: pd.DataFrame) -> Figure:
 
 def _dress(axis: Axes, across: str, up: str) -> None:
     axis.set(xlabel=across, ylabel=up)
-    if any(len(line.get_marker()) and line.get_marker() != "None" and len(line.get_xdata()) for line in axis.lines):
-        axis.set(xscale="log", yscale="log")
-    else:
+    drawn = [line for line in axis.lines if line.get_marker() != "None" and len(line.get_xdata())]
+    if not drawn:
         chart.say(axis, "no numbers", va="baseline", color="#777777")
+        return
+    style.log_axis(axis, "x", [x for line in drawn for x in line.get_xdata()])
+    style.log_axis(axis, "y", [y for line in axis.lines for y in line.get_ydata()])
 
 
 def _known(rows: pd.DataFrame, *names: str) -> list[list[float]]:
