@@ -33,7 +33,7 @@ class DIST:
 
     Args:
         steps: most marching steps per ray.
-        epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step: see
+        epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step, relaxation: see
             `march.Stepping`.
         slope_samples: points at which the steepest gradient is estimated before the march (`field.steepest`); values
             are then divided by it; 0 trusts the field.
@@ -53,6 +53,7 @@ class DIST:
     careful_split: bool
     step_back: bool
     least_step: float
+    relaxation: float
     slope_samples: int
     n_gradient_samples: int
     sphere_radius: float
@@ -70,6 +71,10 @@ class DIST:
         check_at_least("n_gradient_samples", self.n_gradient_samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
         check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        if not 0 <= self.relaxation <= 1:
+            raise ValueError(f"relaxation must lie between 0 (none) and 1, not {self.relaxation:g}: 0.3 works")
+        if self.relaxation and not self.step_back:
+            raise ValueError("relaxation needs step_back=true: its steps may pass a surface")
         check_at_least("least_step", self.least_step, 0, "0 switches it off")
         check_at_least("slope_samples", self.slope_samples, 0, "0 switches it off; 4096 cost as much as 64 x 64 pixels")
         for name in ("extra_step_cap", "step_clamp"):
@@ -104,6 +109,7 @@ class DIST:
             careful_split=self.careful_split,
             step_back=self.step_back,
             least_step=self.least_step,
+            relaxation=self.relaxation,
             slope=self._slope(field, rays),
         )
         if self.coarse_to_fine and rays.image:

@@ -19,6 +19,8 @@ from renderers.rendering import Status
 PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
 PYRAMID_STEPS = 3  # steps at each of these levels
 TOUCHING = 1.0001  # times the radii of two empty spheres: at normal incidence they just touch
+STEEPEST_FALL = -1.0  # slope of a distance along a ray towards a plane: the step is then the value
+FASTEST_RISE = 0.5  # slope above which a step grows no more: it is four times the value
 CAREFUL = 2.0  # careful_split: the closest sample is not the closest point, so "closer" allows for twice the distance
 
 
@@ -40,6 +42,10 @@ class Stepping:
         least_step: forward steps are at least this long, in scene units, but for one that follows a step back from
             behind the surface, else a ray would never converge there; 0 for none.
         slope: bound on the length of the field's gradient, by which values are divided before a step is made of them.
+        relaxation: weight of the last slope of the values along the ray in the running one, m: a step is then
+            2 / (1 - m) times the value, in place of alpha, so that on a plane the empty spheres touch; 0 for none. It
+            needs `step_back` (Bálint and Valasek 2018, "Accelerating Sphere Tracing"; Bán and Valasek 2023, "Automatic
+            Step Size Relaxation in Sphere Tracing").
     """
 
     epsilon: float
@@ -51,6 +57,7 @@ class Stepping:
     step_back: bool = False
     least_step: float = 0.0
     slope: float = 1.0
+    relaxation: float = 0.0
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """The signed step along the ray for a field value."""
@@ -79,6 +86,7 @@ class Front:
     sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
     safe: Float[Tensor, " n"]  # the step that the last value allowed, and the step taken
     gone: Float[Tensor, " n"]
+    rise: Float[Tensor, " n"]  # the running slope of the values along the ray; see `Stepping.relaxation`
 
     @staticmethod
     def on_sphere(rays: Rays, *, radius: float, samples: int) -> "Front":
@@ -98,6 +106,7 @@ class Front:
             sample_value=torch.full_like(entry, torch.inf)[:, None].repeat(1, samples),
             safe=torch.zeros_like(entry),
             gone=torch.zeros_like(entry),
+            rise=torch.full_like(entry, STEEPEST_FALL),
         )
 
     def split(
@@ -198,7 +207,7 @@ def _advance(front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"
     _keep_least(front, queried, torch.where(finite, value, torch.inf), distance)
 
     # The last query moves the ray by the value itself, without alpha (DIST, Eq. 1).
-    length = stepping.length(value)
+    length = _relaxed(front, queried, value, stepping) if stepping.relaxation else stepping.length(value)
     onward = (value > 0) & (front.value[queried] >= 0)
     length = torch.where(onward, length.clamp_min(stepping.least_step), length)
     step = torch.where(converged, value, torch.where(inside, 0.0, length))
@@ -235,6 +244,19 @@ def _taken_back(
     front.safe[queried] = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
     front.gone[queried] = back
     return back, apart
+
+
+def _relaxed(
+    front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], stepping: Stepping
+) -> Float[Tensor, " m"]:
+    """Steps to where the empty sphere of a plane that falls as the values do would touch this one; keeps the slope."""
+    gone, reach = front.gone[queried], value / stepping.slope
+    onward = (gone > 0) & front.safe[queried].isfinite()  # after a step back nothing is known of the slope
+    last = (reach - front.safe[queried]) / torch.where(onward, gone, 1.0)
+    running = torch.lerp(front.rise[queried], last.clamp(STEEPEST_FALL, -STEEPEST_FALL), stepping.relaxation)
+    rise = torch.where(onward, running, STEEPEST_FALL)
+    front.rise[queried] = rise
+    return torch.where(value > 0, 2 * reach / (1 - rise.clamp_max(FASTEST_RISE)), reach)
 
 
 def _keep_least(

@@ -36,7 +36,7 @@ SINGLE = {"completion_paper", "fitted"}  # of one run, and without a table or fi
 # The table or figure of an experiment, where it has another name: one that joins several experiments.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
-COMPARING = {"table1": 19, "fig4": 7, "fig5": 8, "stability": 19, "gradients": 12, "speed_accuracy": 28}  # renderers
+COMPARING = {"table1": 21, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 12, "speed_accuracy": 30}  # renderers
 COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
@@ -192,7 +192,8 @@ def test_every_sweep_is_of_more_than_one_cell_and_repeats_none():
 PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2) and nothing of ours
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=True,
     careful_split=False,
-    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=False,
+    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0,
+    silhouette_signed=False,
     silhouette_average="all",
 )  # fmt: skip
 FIRST = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
@@ -314,7 +315,8 @@ def test_the_paper_experiment_has_the_papers_settings(compose_config):
     assert renderer == DIST(
         steps=100, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=None, active_only=True,
         coarse_to_fine=True, careful_split=False,
-    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=3, sphere_radius=1.0, silhouette_signed=False,
+    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=3, sphere_radius=1.0,
+    silhouette_signed=False,
         silhouette_average="all",
     )  # fmt: skip
 

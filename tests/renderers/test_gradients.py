@@ -19,7 +19,8 @@ NAIVE = load("renderer", "naive", steps=300, epsilon=1e-11, silhouette_average="
 DIST_PLAIN = DIST(
     steps=300, epsilon=1e-11, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=False,
     careful_split=True,
-    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=True,
+    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0,
+    silhouette_signed=True,
     silhouette_average="all",
 )  # fmt: skip
 by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -13,7 +13,8 @@ from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import Status
-from tests.renderers.analytic_cases import beam, vector
+from tests.renderers.analytic_cases import beam, sphere_hits, vector
+from tests.tiny import camera_of
 
 PLAIN = Stepping(epsilon=5e-5, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, careful_split=False)
 AGGRESSIVE = replace(PLAIN, alpha=1.5)
@@ -22,8 +23,8 @@ NAIVE = load("renderer", "naive", steps=50, epsilon=5e-5, silhouette_average="al
 FINE = DIST(
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=0.01, step_clamp=None, active_only=True, coarse_to_fine=False,
     careful_split=True,
-    step_back=False, least_step=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0, silhouette_signed=True,
-    silhouette_average="all",
+    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0,
+    silhouette_signed=True, silhouette_average="all",
 )  # fmt: skip
 COARSE = replace(FINE, coarse_to_fine=True)
 
@@ -431,3 +432,37 @@ def test_values_are_divided_by_the_slope_before_a_step_is_made_of_them():
     assert front.status.item() == Status.HIT
     assert front.distance.item() == pytest.approx(1.5, abs=1e-4)
     assert marched(steep, rays, PLAIN).status.item() != Status.HIT
+
+
+def test_relaxed_steps_are_fewer_and_find_the_same():
+    """Also next to an outline, where most steps are spent."""
+    rays, counts = camera_of(48).double().rays(), {}
+    truth, hit = sphere_hits(rays, 0.6)
+    for name in ("dist_dynamic", "dist_keinert", "dist_auto_relaxed"):
+        meter = Meter(sphere(0.6))
+        found = load("renderer", name, steps=400).render(meter, rays)
+        assert torch.equal(found.hit, hit), name
+        assert (found.distance - truth)[hit].abs().median() < 1e-4
+        counts[name] = meter.counts.value
+    assert counts["dist_keinert"] < counts["dist_dynamic"]
+    assert counts["dist_auto_relaxed"] < 0.9 * counts["dist_dynamic"]
+
+
+def test_a_relaxed_step_towards_a_plane_touches_its_next_empty_sphere():
+    """On a plane at 60 degrees the slope is -1/2: the steps become 4/3 of the value."""
+    field, ray = plane((0.0, 1.0, 0.0), -0.5), Rays(vector((-1.4, 0.3, 0))[None], vector((3**0.5 / 2, -0.5, 0))[None])
+    front = Front.on_sphere(ray, radius=2.0, samples=1)
+    front.distance[:] = 0.0
+    stepping = replace(PLAIN, step_back=True, relaxation=1.0)
+    for steps in (1, 2):
+        before = front.distance.clone()
+        value = field(ray.at(before))
+        march(field, ray, front, stepping, 1)
+        assert (front.distance - before).item() == pytest.approx(value.item() * (1.0 if steps == 1 else 4 / 3))
+
+
+def test_relaxation_without_stepping_back_is_refused():
+    with pytest.raises(ValueError, match="relaxation needs step_back=true"):
+        load("renderer", "dist", relaxation=0.3)
+    with pytest.raises(ValueError, match="relaxation must lie between 0"):
+        load("renderer", "dist", relaxation=1.3, step_back=True)
