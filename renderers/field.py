@@ -88,6 +88,19 @@ def bounds_of(field: Field) -> Bounds | None:
     return getattr(field, "bounds", None)
 
 
+def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
+    """The same; `note` is told of as many values as cost as much, before they are evaluated."""
+    offered = bounds_of(field)
+    if offered is None:
+        return None
+
+    def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+        note(PRODUCTS * len(middle))
+        return offered(middle, half)
+
+    return bounds
+
+
 @dataclass
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
@@ -175,15 +188,10 @@ class Meter(Wrapper):
     @property
     def bounds(self) -> Bounds | None:
         """The bounds that the field offers; each counts as the products of weights that it takes."""
-        offered = bounds_of(self.inner)
-        if offered is None:
-            return None
+        return noted_bounds(self.inner, self._count_value)
 
-        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-            self.counts.value += PRODUCTS * len(middle)
-            return offered(middle, half)
-
-        return bounds
+    def _count_value(self, points: int) -> None:
+        self.counts.value += points
 
     def _count_coarse(self, points: int) -> None:
         self.counts.coarse += points

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from renderers.bracket import BLOCK
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind, carries_gradient
-from renderers.gradients import fixed_samples
 from renderers.rendering import Capabilities, Rendering, Status, assemble
 from renderers.silhouette import CrossEntropy
 
@@ -75,12 +75,10 @@ class MeshProxy:
             mesh = _Mesh.of(values, self.sphere_radius)
             found, triangle = mesh.cast(flat, entry)
             hit = (meets & ~inside & (triangle >= 0) & (found < leave)).nonzero().squeeze(-1)
-            least_at = self._closest(values, flat, entry, leave)
-        distance = entry.index_put((hit,), self._crossed(field, flat[hit], mesh, triangle[hit]))
+            least_at = entry.index_put((queried,), self._closest(values, flat[queried], entry[queried], leave[queried]))
+        distance = entry.index_put((hit,), self._crossed(field, flat[hit], mesh, triangle[hit], found[hit]))
         least_at = least_at.index_put((hit,), distance[hit].detach())
-        with torch.no_grad():
-            least = field(flat[queried].at(least_at[queried]))
-        least = fixed_samples(field, flat[queried], least_at[queried], least)
+        least = field(flat[queried].at(least_at[queried]))
         status = torch.full_like(meets, Status.MISS, dtype=torch.int8)
         status[inside], status[hit] = Status.STARTED_INSIDE, Status.HIT
         return assemble(
@@ -107,6 +105,11 @@ class MeshProxy:
 
     def _closest(self, values: Tensor, rays: Rays, entry: Tensor, leave: Tensor) -> Float[Tensor, " n"]:
         """Where on each ray the grid's values are least in magnitude."""
+        places = torch.arange(len(entry), device=entry.device)
+        blocks = places.split(BLOCK // self.ray_samples)
+        return torch.cat([self._closest_of(values, rays[some], entry[some], leave[some]) for some in blocks])
+
+    def _closest_of(self, values: Tensor, rays: Rays, entry: Tensor, leave: Tensor) -> Float[Tensor, " n"]:
         shares = torch.linspace(0, 1, self.ray_samples, dtype=entry.dtype, device=entry.device)
         distance = entry[:, None] + shares * (leave - entry)[:, None]
         points = rays.at_each(distance).view(1, -1, 1, 1, 3).flip(-1) / self.sphere_radius  # grid_sample takes z first
@@ -114,8 +117,10 @@ class MeshProxy:
         place = sampled.view(distance.shape).abs().argmin(dim=1, keepdim=True)
         return distance.gather(1, place).squeeze(1)
 
-    def _crossed(self, field: Field, rays: Rays, mesh: "_Mesh", triangle: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """The distances at which rays cross the planes of triangles, whose vertices move with the field."""
+    def _crossed(
+        self, field: Field, rays: Rays, mesh: "_Mesh", triangle: Int[Tensor, " n"], distance: Float[Tensor, " n"]
+    ) -> Float[Tensor, " n"]:
+        """The distances at which rays cross triangles, with the derivative of the planes, which move with the field."""
         used, corner = mesh.triangles[triangle].unique(return_inverse=True)
         vertices = self._moving(field, mesh.vertices[used])
         first, second, third = vertices[corner].unbind(dim=1)
@@ -126,7 +131,8 @@ class MeshProxy:
         along = (normal * rays.directions).sum(-1)
         flat = along.abs() < LEAST_COSINE
         along = torch.where(flat, torch.where(along < 0, -LEAST_COSINE, LEAST_COSINE), along)
-        return ((first - rays.origins) * normal).sum(-1) / along
+        change = ((first - rays.at(distance)) * normal).sum(-1)
+        return distance + (change - change.detach()) / along
 
     def _moving(self, field: Field, vertices: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Vertices with the derivative of Theorem 1 of MeshSDF."""

@@ -27,9 +27,10 @@ class RangeAnalysis:
         arithmetic through the network.
     Differentiable in: field parameters and rays, by the implicit rule of DVR, Eq. 8, exactly. What comes into view or
         leaves it has no part in the gradient of `distance`, only in that of the mask loss (IDR's).
-    Needs: a field that offers bounds, as decoders do, whatever their values mean; or a distance or a bound, whose own
-        promise is taken: its stated Lipschitz bound, or 1. No surface that is longer on a ray than `least_segment` is
-        then missed.
+    Needs: a distance or a bound. Where it offers bounds, as decoders do, these decide, and values need be no lengths;
+        else its own promise is taken: its stated Lipschitz bound, or 1. Where the bounds hold and segments do not run
+        out, no surface that is longer on a ray than `least_segment` is missed. Those of a deep, wide network are
+        loose: rays are then cut to the least segments everywhere.
     Deviates from the paper: segments double after an empty one, in place of 1.5 times; a segment of the least length
         that is not certified is a hit only where the sign changes.
 
@@ -54,7 +55,7 @@ class RangeAnalysis:
 
     def __post_init__(self) -> None:
         check_positive("least_segment", self.least_segment, "1e-3 finds all that a pixel shows")
-        check_at_least("most_segments", self.most_segments, 1, "500 suffice but along a surface")
+        check_at_least("most_segments", self.most_segments, 1, "2500 cross the unit sphere by segments of 1e-3")
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
         check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
         check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
@@ -135,8 +136,8 @@ class _Cast:
         index = meets.nonzero().squeeze(-1)
         value = torch.ones_like(entry).index_put((index,), field(rays[index].at(entry[index])))
         status = torch.where(meets, Status.OUT_OF_STEPS, Status.MISS).to(torch.int8)
-        status[meets & (value < 0)] = Status.STARTED_INSIDE
-        least = torch.where(meets, value, torch.inf)
+        status[meets & (value <= 0)] = Status.STARTED_INSIDE
+        least = torch.where(meets & value.isfinite(), value, torch.inf)
         length = leave - entry
         return _Cast(status, entry.clone(), value, leave, length, leave.clone(), value.clone(), least, entry.clone())
 
@@ -152,7 +153,7 @@ class _Cast:
 
 
 def _promised(field: Field) -> Bounds:
-    """Bounds from what a distance or a bound promises: its Lipschitz bound, or 1."""
+    """Bounds from what a distance promises: its Lipschitz bound, or 1; of a bound, whether they are positive."""
     steepest = 1.0 if field.lipschitz is None else field.lipschitz
 
     def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,8 +28,9 @@ class RelaxedBoundary:
     Differentiable in: field parameters and rays: hits by the implicit rule, exactly, up to `epsilon`; what comes into
         view or leaves it by the band, with a bias that falls with its width and a variance that grows as it does.
     Needs: a distance or a bound inside the sphere; the band is as wide as the field says.
-    Deviates from the paper: the least value is that of the marched samples; the mask loss is IDR's, since a mask of one
-        ray per pixel says nothing to rays inside of the outline.
+    Deviates from the paper: the least value is that of the marched samples, and of several surfaces within the band the
+        first one counts; the mask loss is IDR's, since a mask of one ray per pixel says nothing to rays inside of the
+        outline.
 
     Args:
         steps: most marching steps per ray.
@@ -89,12 +90,12 @@ class RelaxedBoundary:
             residual=front.value,
             closest=(queried, value),
         )
-        near = ((least < self.band) & (front.status != Status.STARTED_INSIDE)).nonzero().squeeze(-1)
+        near = (least.isfinite() & (front.status != Status.STARTED_INSIDE)).nonzero().squeeze(-1)
         here = fixed_samples(field, flat[near], passed[near], least[near])
         coming = (here.detach() - here) / self.band
         behind = torch.ones_like(distance).index_put((near,), 1 - coming)[hit]
         volume = Volume(torch.cat([near, hit]), torch.cat([passed[near], distance[hit]]), torch.cat([coming, behind]))
-        return Rendering(**{**vars(rendering), "volume": volume})
+        return replace(rendering, volume=volume)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
@@ -103,7 +104,7 @@ class RelaxedBoundary:
         return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
 
     def _march(self, field: Field, rays: Rays) -> tuple[Front, Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """The front; the distance at which each ray passed a surface closest, and the value there: infinite without."""
+        """The front; where each ray first passed a surface within the band, and the value there: infinite without."""
         front = Front.on_sphere(rays, radius=self.sphere_radius, samples=1)
         stepping = Stepping(self.epsilon, 1.0, None, None, active_only=True, careful_split=False)
         passed, least = front.distance.clone(), torch.full_like(front.distance, torch.inf)
@@ -115,8 +116,8 @@ class RelaxedBoundary:
             asked, before = front.active.clone(), front.distance.clone()
             march(field, rays, front, stepping, 1)
             rises = asked & (front.value > value)
-            lowest = rises & falling & (value > 0) & (value < least)
+            lowest = rises & falling & (value > 0) & (value < self.band) & least.isinf()  # the first one hides others
             passed, least = torch.where(lowest, at, passed), torch.where(lowest, value, least)
-            falling = torch.where(asked, front.value < value, falling)
+            falling = torch.where(asked, value.isfinite() & (front.value < value), falling)
             at, value = torch.where(asked, before, at), torch.where(asked, front.value, value)
         return front, passed, least

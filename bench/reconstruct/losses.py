@@ -71,7 +71,9 @@ class Losses:
         normals = torch.nn.functional.normalize(slopes, dim=-1)
         terms: Terms = {}
         if self.colour or self.colour_gradient:
-            compared = inside if rendering.volume is None else _foreground(pixels)
+            if rendering.volume is not None and pixels.mask is None:
+                raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
+            compared = inside if rendering.volume is None or pixels.mask is None else pixels.mask
             if rendering.volume is None:
                 colours = shape.colours(points, slopes, pixels.rays.directions[inside])
             else:
@@ -117,15 +119,6 @@ def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"
     """The field's gradients at points, with a graph towards its parameters and the points."""
     points = points if points.requires_grad else points.detach().requires_grad_(True)
     return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
-
-
-def _foreground(pixels: Pixels) -> Bool[Tensor, " n"]:
-    """The pixels whose colours are those of the shape: without a mask all."""
-    return (
-        torch.ones(pixels.rays.shape, dtype=torch.bool).to(pixels.colours.device)
-        if pixels.mask is None
-        else pixels.mask
-    )
 
 
 def _summed_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:

@@ -86,6 +86,8 @@ class Gradients:
             check_at_least(f"task.{name}", getattr(self, name), 1, "conf/task/gradients.yaml holds values that work")
         for blur in self.blurs:
             check_positive("task.blurs", blur, "[0.001, 0.01, 0.1]")
+            if float(f"{blur:.0e}") != blur:
+                raise ValueError(f"task.blurs must have one digit each, not {blur:g}: it is part of a metric's name")
         check_positive("task.outline_shift", self.outline_shift, "0.1 moves it within a pixel")
 
     def execute(self, run: RunContext) -> None:

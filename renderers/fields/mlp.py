@@ -102,18 +102,11 @@ class BoundDecoder:
         with torch.no_grad():
             return coarse_values(self.hidden, self.last, self.skip, self)
 
-    @torch.no_grad()
     def bounds(
         self, middle: Float[Tensor, "n 3"], half: Float[Tensor, "n 3"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Bounds of the values on segments, for one code; see `affine.segment_bounds`."""
-        size = CHUNK // 4
-        parts = [
-            segment_bounds(self.hidden, self.last, self.skip, *some)
-            for some in zip(middle.split(size), half.split(size), strict=True)
-        ]
-        low, high = (torch.cat(part) for part in zip(*parts, strict=True))
-        return low, high
+        return segment_bounds(self.hidden, self.last, self.skip, middle, half)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The values; for a batch of codes [*shapes, code_length], of points [*shapes, n, 3]."""

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
-from renderers.field import Field, Wrapper
+from renderers.field import Bounds, Field, Wrapper, bounds_of
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,24 @@ class Moved(Wrapper):
     similarity: Float[Tensor, "7"]
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        scale = self.similarity[6].exp()
-        motion = rigid(self.similarity[:6])
-        local = (points - motion[:3, 3]) @ motion[:3, :3] / scale
-        return scale * self.inner(local)
+        scale, motion = self._parts
+        return scale * self.inner((points - motion[:3, 3]) @ motion[:3, :3] / scale)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The bounds that the field offers, moved as it is."""
+        offered = bounds_of(self.inner)
+        if offered is None:
+            return None
+        scale, motion = (part.detach() for part in self._parts)
+
+        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+            turned = motion[:3, :3] / scale
+            low, high = offered((middle - motion[:3, 3]) @ turned, half @ turned)
+            return scale * low, scale * high
+
+        return bounds
+
+    @property
+    def _parts(self) -> tuple[Tensor, Tensor]:
+        return self.similarity[6].exp(), rigid(self.similarity[:6])

@@ -1,7 +1,7 @@
 """Volume rendering along rays: weights from the share of light that passes, and the rendering that they give."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 
 import torch
@@ -16,6 +16,8 @@ from renderers.rendering import Deferred, Rendering, Status, Volume, assemble
 
 FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
 SEEN = 0.5  # opacity above which a ray has hit
+GAP = 1e-3  # weight of a sample at most, that stands between two surfaces on a ray
+LEAST_IMPORTANCE = 1e-12  # of a whole ray, spread evenly: where nothing is important all of it is
 LEAST_OPACITY = 1e-3  # in the mask loss, which has no gradient beyond it; as in the official code of NeuS
 
 
@@ -74,7 +76,7 @@ def by_importance(
         importance: of each interval, at least 0; where all are 0 the density is even.
     """
     lengths = distance[:, 1:] - distance[:, :-1]
-    least = FAINT * importance.sum(dim=1, keepdim=True) + torch.finfo(importance.dtype).tiny
+    least = FAINT * importance.sum(dim=1, keepdim=True) + LEAST_IMPORTANCE
     density = importance + least * lengths / lengths.sum(dim=1, keepdim=True)
     total = torch.nn.functional.pad(density.cumsum(dim=1), (1, 0))
     total = total / total[:, -1:]
@@ -90,8 +92,9 @@ def by_importance(
 def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *, radius: float) -> Rendering:
     """The rendering of a volume: samples are searched without a graph, then summed with one.
 
-    `distance` of a hit is the mean of its samples' distances by weight, whose gradient is that of the weights.
-    `residual` is the field's value there, between those of the samples beside it.
+    `distance` of a hit is a mean of its samples' distances by weight, whose gradient is that of the weights: over the
+    samples with a part around the middle of the ray's light, so that a surface that it passes and one behind that are
+    not averaged. `residual` is the field's value there, between those of the samples beside it.
 
     Args:
         rays: of any leading shape.
@@ -124,7 +127,7 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     left_out = torch.zeros_like(meets).index_put((queried,), ~hit)
     deferred = Deferred(leave.index_put((queried,), whole.least_distance).view(rays.shape), left_out.view(rays.shape))
     volume = Volume(whole.ray, whole.distance, whole.weight)
-    return Rendering(**{**vars(rendering), "deferred": deferred, "volume": volume})
+    return replace(rendering, deferred=deferred, volume=volume)
 
 
 def mask_loss(rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
@@ -169,7 +172,8 @@ class _Part:
         if found.shape[1] < distance.shape[1]:
             distance = (distance[:, 1:] + distance[:, :-1]) / 2
         opacity = found.sum(dim=1)
-        mean = (found * distance).sum(dim=1) / opacity.clamp_min(FAINT)
+        main = found * _around_middle(found.detach())
+        mean = (main * distance).sum(dim=1) / main.sum(dim=1).clamp_min(FAINT)
         row, column = (found.detach() > FAINT).nonzero(as_tuple=True)
         return _Part(
             opacity,
@@ -200,6 +204,14 @@ def _with_graph(field: Field, rays: Rays, samples: Samples, passing: Passing) ->
     return samples.value.index_put((row, column), values)
 
 
+def _around_middle(weight: Float[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
+    """The samples with a part that are next to one another about the one at which half of the light has stayed."""
+    passed = weight.cumsum(dim=1)
+    middle = (passed < passed[:, -1:] / 2).sum(dim=1, keepdim=True).clamp_max(weight.shape[1] - 1)
+    group = (weight <= GAP).cumsum(dim=1)
+    return group == group.gather(1, middle)
+
+
 def _finite(values: Tensor) -> Tensor:
     return torch.where(values.isfinite(), values, 1.0)
 
@@ -221,5 +233,5 @@ def _between(samples: Samples, distance: Float[Tensor, " n"]) -> Float[Tensor, "
 
 
 def _blocks(queried: Int[Tensor, " n"]) -> tuple[Tensor, ...]:
-    """The rays in blocks whose samples bound memory; one block, even of no rays."""
+    """The rays in blocks, whose samples bound the memory of a search; one block, even of no rays."""
     return queried.split(max(BLOCK // 256, 1))

@@ -113,7 +113,9 @@ class VolSDF:
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Algorithm 1: samples by the weights at the least width whose error is bounded, and equally spaced ones."""
         found, width = self.bounded(field, rays, entry, leave)
-        fine = by_importance(found.distance, weights(_passing(found.value, found.distance, width)), self.fine_samples)
+        fine = by_importance(
+            found.distance, weights(_passing(found.value, found.distance, width))[:, :-1], self.fine_samples
+        )
         return Samples.of(field, rays, torch.cat([fine, evenly(entry, leave, self.extra_samples)], 1).sort(dim=1)[0])
 
     def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
@@ -144,9 +146,9 @@ def _spacing(distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n intervals
     return distance[:, 1:] - distance[:, :-1]
 
 
-def _passing(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
-    """The logarithm of the share of light that passes each interval, by the density at its beginning."""
-    return -density(value[:, :-1], width) * _spacing(distance)
+def _passing(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
+    """The logarithm of the share of light that passes each sample: by its density up to the next; all, the last one."""
+    return torch.nn.functional.pad(-density(value[:, :-1], width) * _spacing(distance), (0, 1))
 
 
 def _errors(found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:

@@ -59,6 +59,15 @@ def test_what_is_thinner_than_the_grid_is_lost():
     assert not RENDERER.render(thin, ray).hit.item()
 
 
+@pytest.mark.parametrize("slope", [1e-2, 5e-4])
+def test_a_grazing_hit_stays_where_it_is(slope):
+    """Only its derivative is limited."""
+    ray = Rays(vector((-1.5, 0, 0.5 * slope + 1e-9))[None], normalize(vector((1, 0, -slope))[None], dim=-1))
+    rendering = RENDERER.render(Shape(lambda p: p[..., 2], Kind.DISTANCE, 1.0), ray)
+    assert rendering.hit.item()
+    assert rendering.points[0, 0].item() == pytest.approx(-1.0, abs=0.05)
+
+
 def test_the_cost_is_that_of_the_grid_whatever_the_rays():
     for count in (1, 100):
         counts = Counts()

@@ -7,10 +7,13 @@ import torch
 from torch.nn.functional import normalize
 
 from bench.config import load
+from bench.machine.limits import Limits
 from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter, bounds_of, steepest
+from renderers.fields.affine import segment_bounds
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.fields.moved import Moved
 from renderers.reference import trace
 from renderers.rendering import Status
 from tests.renderers.analytic_cases import vector
@@ -114,6 +117,37 @@ def test_bounds_are_counted_by_their_products():
     bounds_of(meter)(*segments(10, 0.1))
     assert counts.value == 30
     assert bounds_of(Meter(sphere(0.5))) is None
+
+
+def test_a_wrapped_network_is_cast_by_the_same_bounds():
+    """Else the certificate would be lost without a word: of counting, of limits, of a similarity."""
+    field, rays = network(2), around(200)
+    plain = RENDERER.render(field, rays)
+    still = Moved(field, torch.zeros(7).double())
+    limits = Limits(values=10**9, memory=64)
+    for wrapped in (Meter(field), limits.watch(field, torch.device("cpu")), still, Meter(still)):
+        torch.testing.assert_close(RENDERER.render(wrapped, rays).distance, plain.distance, rtol=0, atol=1e-9)
+    half = Moved(field, vector((0.1, -0.2, 0.3, 0.05, 0.1, -0.1, -0.7)))
+    middle, way = segments(200, 0.1)
+    low, high = half.bounds(middle, way)
+    values = half(middle[:, None] + torch.linspace(-1, 1, 51).double()[:, None] * way[:, None])
+    assert (values >= low[:, None]).all() and (values <= high[:, None]).all()
+
+
+def test_rounding_does_not_blur_the_bounds_of_a_deep_network_in_float32():
+    torch.manual_seed(0)
+    field = Decoder(layers=8, width=256, code_length=0, skip=4, narrow=False).requires_grad_(False).at(torch.zeros(0))
+    middle, half = (part.float() for part in segments(50, 1e-3))
+    low, high = field.bounds(middle, half)
+    exact = segment_bounds(field.hidden, field.last, field.skip, middle.double(), half.double())
+    assert ((high - low) - (exact[1] - exact[0])).abs().max() < 1e-4
+
+
+def test_a_ray_within_a_surface_has_finite_values():
+    flat = Shape(lambda p: p[..., 2], Kind.DISTANCE, 1.0)
+    rendering = RENDERER.render(flat, Rays(vector((-2, 0, 0))[None], vector((1, 0, 0))[None]))
+    assert rendering.status.item() == Status.STARTED_INSIDE
+    assert rendering.distance.isfinite().all()
 
 
 def test_too_few_segments_are_out_of_steps():
