@@ -27,8 +27,8 @@ NOTES = (
     "the error of one ray per pixel, and falls with the square root of their number.",
     "Blur: the length over which a renderer spreads the gradient of visibility: NeuS 1/s, VolSDF beta, UNISURF the "
     "width of the occupancy, the relaxed boundary its band. A renderer without one has one row.",
-    "The truth has an error of its own, since few of a pixel's rays change sides: of a disc, at the defaults, 0.07 of its "
-    "length, and a cosine of 0.997 with the exact one.",
+    "The truth has an error of its own, since few of a pixel's rays change sides: of a disc, at the defaults, 0.07 of "
+    "its length, and a cosine of 0.997 with the exact one.",
     "UNISURF's interval keeps its proportion to the blur. No schedule is at work.",
 )
 NUMBERS = ("image_cosine", "image_scale", "image_error", "image_spread", "values_per_ray")
