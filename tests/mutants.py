@@ -253,7 +253,7 @@ MUTANTS = (
     M("renderers/fields/analytic.py", "- 0.25 * width * overlap**2", "- 0.5 * width * overlap**2",
       "tests/renderers/test_fields.py"),
     M("renderers/fields/grid.py", "inside.square() + away", "away", "tests/renderers/test_grid.py"),
-    M("renderers/fields/moved.py", "return scale * self.inner(local)", "return self.inner(local)",
+    M("renderers/fields/moved.py", "return scale * self.inner((points", "return self.inner((points",
       "tests/renderers tests/tasks/test_pose.py"),
     M("renderers/fields/mlp.py", "return Flops(value, value if self._frozen else 2 * value)",
       "return Flops(value, value)", "tests/renderers"),

@@ -1,7 +1,7 @@
 """Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 
 import pytest
@@ -332,7 +332,8 @@ def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_
 
 @pytest.mark.parametrize("name", [name for group, name in GROUPS if group == "renderer"])
 def test_a_renderer_loads_as_a_library_with_its_arguments_changed(compose_config, name):
-    number = "n_ray_samples" if name.startswith("dvr") else "steps"
+    known = [field.name for field in fields(load("renderer", name))] if name != "custom" else ["steps"]
+    number = next(one for one in ("steps", "n_ray_samples", "samples", "grid", "most_segments") if one in known)
     given = {"_target_": "renderers.IDR", **IDR_ARGUMENTS} if name == "custom" else {number: 7}
     extra = NEEDS.get(name, [f"renderer.{number}=7"])
     found = load("renderer", name, **given)

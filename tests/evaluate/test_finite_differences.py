@@ -5,10 +5,11 @@ from math import sqrt
 import pytest
 import torch
 
-from bench.evaluate.finite_differences import _clear, differences, image_differences, subrays
+from bench.evaluate.finite_differences import _clear, differences, image_differences, outline_steps, subrays
 from renderers.camera import Camera, Rays
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
+from renderers.reference import trace
 from tests.tiny import camera_of, plane_decoder
 
 CODE_WEIGHTS = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
@@ -144,7 +145,7 @@ def test_the_differences_of_an_image_see_what_comes_into_view():
     middle = 2 * column  # between the second and the third column of the pixel beside the axis
     found = image_differences(
         lambda shift: edge(middle + shift[0]), directions,
-        camera=view, pixels=pixels, step=2 * column, supersampling=count, lipschitz=1.1,
+        camera=view, pixels=pixels, steps=torch.full((2,), 2 * column).double(), supersampling=count, lipschitz=1.1,
     )  # fmt: skip
     columns = subrays(view, pixels[1:2], count).directions[0].view(count, count, 3)
     swapped = columns[:, :4]  # the edge moves over them, from two before the middle to two behind it
@@ -162,10 +163,24 @@ def test_the_differences_of_an_image_are_those_of_the_surface_where_no_edge_move
     view, pixels = camera(), torch.tensor([0, 14])
     found = image_differences(
         lambda shift: plane((0, 0, 1)).at(CODE + shift), torch.eye(3).double(),
-        camera=view, pixels=pixels, step=1e-3, supersampling=3, lipschitz=1.2,
+        camera=view, pixels=pixels, steps=torch.full((3,), 1e-3).double(), supersampling=3, lipschitz=1.2,
     )  # fmt: skip
     slope = subrays(view, pixels, 3).directions[..., 2]
     assert torch.allclose(found, -CODE_WEIGHTS * (1 / slope).mean(dim=1, keepdim=True), rtol=1e-6)
+
+
+def test_the_steps_at_an_outline_move_the_surface_by_parts_of_a_pixel():
+    """A plane across the view moves by as much as the code's direction says; a steeper field by less."""
+    view, pixels = camera(), torch.tensor([0, 5, 14])
+    found = outline_steps(
+        lambda shift: plane((0, 0, 1)).at(CODE + shift), torch.eye(3).double(),
+        camera=view, pixels=pixels, shift=0.1, lipschitz=1.2,
+    )  # fmt: skip
+    rays = view.rays().flat()[pixels]
+    distance = trace(plane((0, 0, 1)).at(CODE), rays, lipschitz=1.2, least_step=1e-3, radius=1.0).distance
+    footprint = (view.intrinsics[0, 0] / distance).quantile(0.9)
+    expected = 0.1 / (CODE_WEIGHTS.abs() * footprint)
+    torch.testing.assert_close(found, expected.squeeze(), rtol=1e-4, atol=0)
 
 
 def test_rays_within_pixels_lie_on_a_regular_grid_about_the_pixels_own():

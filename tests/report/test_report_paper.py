@@ -529,7 +529,8 @@ def test_command_writes_all_files_and_the_page_shows_them(judged, capsys):
     write_run(judged, "table1", DYNAMIC, metrics=costs())
     main([f"results_dir={judged}"])
     assert capsys.readouterr().out.splitlines()[-1] == str(judged / "index.html")
-    suffixes = {"table1": {".csv", ".md", ".tex"}, "gradients": {".csv", ".md", ".tex", ".png", ".pdf"}}
+    drawn_too = {".csv", ".md", ".tex", ".png", ".pdf"}
+    suffixes = {"table1": {".csv", ".md", ".tex"}, "gradients": drawn_too, "gradients_visibility": drawn_too}
     written = {path.name for path in (judged / "paper").iterdir()}
     assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
     page = Page(judged / "index.html")

@@ -63,7 +63,10 @@ def assert_one_line(err: str, *words: str) -> None:
     [
         ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
         ("renderer=dits", ("unknown renderer 'dits'", "did you mean dist")),
-        ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, idr, naive, newton, and variants")),
+        (
+            "renderer=zzz",
+            ("unknown renderer 'zzz'", "custom, dist, dvr, idr, mesh_proxy, naive, neus", "and variants"),
+        ),
         ("dataset=soffa", ("unknown dataset 'soffa'", "did you mean sofa")),
         ("scale=smok", ("unknown scale 'smok'", "did you mean smoke")),
         ("+experiment=completion_papper", ("unknown experiment", "did you mean completion_paper")),
