@@ -69,9 +69,9 @@ def draw(data: pd.DataFrame) -> Figure:
             for axis, metric in ((by_blur, "image_error"), (noise, "image_spread")):
                 for value in rows[metric].dropna():
                     axis.axhline(value, color=style.look(preset).colour, ls=style.look(preset).line, lw=0.8)
-    _dress(by_blur, "blur (scene units)", "relative error of a pixel's gradient")
+    _dress(by_blur, "blur (scene units)", "relative error of the gradient")
     _dress(noise, "blur (scene units)", "noise of one ray (relative)")
-    _dress(by_cost, "field values per ray", "relative error of a pixel's gradient")
+    _dress(by_cost, "field values per ray", "relative error of the gradient")
     style.legend_below(figure, by_cost, columns=4)
     return figure
 
