@@ -199,12 +199,12 @@ def outline_steps(
     Raises:
         ValueError: where no ray through the middle of a pixel hits.
     """
-    rays = camera.rays().flat()[pixels]
-    hits = trace(field_at(torch.zeros_like(directions[:, 0])), rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0)
+    rays, still = camera.rays().flat()[pixels], field_at(torch.zeros_like(directions[:, 0]))
+    hits = trace(still, rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0)
     if not bool(hits.hit.any()):
         raise ValueError("no pixel of the outline hits at its middle: draw more by task.outline")
     points, distance = hits.points[hits.hit], hits.distance[hits.hit]
-    slopes = torch.linalg.vector_norm(autograd_gradients(field_at(torch.zeros_like(directions[:, 0])), points), dim=-1)
+    slopes = torch.linalg.vector_norm(autograd_gradients(still, points), dim=-1)
     footprints = distance / camera.intrinsics[0, 0]
     found = []
     for direction in directions.T:

@@ -71,12 +71,12 @@ class Losses:
         normals = torch.nn.functional.normalize(slopes, dim=-1)
         terms: Terms = {}
         if self.colour or self.colour_gradient:
-            if rendering.volume is not None and pixels.mask is None:
-                raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
-            compared = inside if rendering.volume is None or pixels.mask is None else pixels.mask
             if rendering.volume is None:
-                colours = shape.colours(points, slopes, pixels.rays.directions[inside])
+                compared, colours = inside, shape.colours(points, slopes, pixels.rays.directions[inside])
+            elif pixels.mask is None:
+                raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
             else:
+                compared = pixels.mask
                 colours = _summed_colours(shape, metered, pixels.rays, rendering.volume)[compared]
             difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
             if self.colour:

@@ -67,7 +67,7 @@ class NeuS:
         check_positive("round_sharpness", self.round_sharpness, "the official code begins at 64")
         check_positive("sharpness", self.sharpness, "1000 blurs the surface over .004 of the unit sphere")
         check_positive("first_sharpness", self.first_sharpness, "the official code begins at 20")
-        check_at_least("sharpening", self.sharpening, 0, "60 suit 100 iterations")
+        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
         check_at_least("mask_weight", self.mask_weight, 0, "the paper uses 0.1")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import Bracket, first_crossing, refine
+from renderers.bracket import first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind, occupancy_logits
@@ -64,7 +64,7 @@ class UNISURF:
         check_at_least("free_samples", self.free_samples, 1, "the paper uses 32")
         for name in ("interval", "first_interval", "occupancy_width", "first_occupancy_width", "sphere_radius"):
             check_positive(name, getattr(self, name), "conf/renderer/unisurf.yaml has values that work")
-        check_at_least("sharpening", self.sharpening, 0, "60 suit 100 iterations")
+        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
         check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
 
     @property
@@ -105,13 +105,9 @@ class UNISURF:
         coarse = Samples.of(field, rays, evenly(entry, leave, self.search_samples))
         found, bracket = first_crossing(coarse.distance, coarse.value)
         hit = found.nonzero().squeeze(-1)
-        root = _roots(field, rays[hit], bracket, self.search_steps)
+        root, _ = refine(field, rays[hit], bracket, method="secant", steps=self.search_steps)
         near = torch.maximum(root - self.interval, entry[hit])
         far = torch.minimum(root + self.interval, leave[hit])
         distance = evenly(entry, leave, self.free_samples + self.samples)
         about = [evenly(entry[hit], near, self.free_samples + 1)[:, :-1], evenly(near, far, self.samples)]
         return Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
-
-
-def _roots(field: Field, rays: Rays, bracket: Bracket, steps: int) -> Float[Tensor, " n"]:
-    return refine(field, rays, bracket, method="secant", steps=steps)[0]

@@ -64,7 +64,7 @@ class VolSDF:
         check_at_least("extra_samples", self.extra_samples, 2, "the official code uses 32")
         check_positive("width", self.width, "0.001 blurs the surface over .004 of the unit sphere")
         check_positive("first_width", self.first_width, "the paper begins at 0.1")
-        check_at_least("sharpening", self.sharpening, 0, "60 suit 100 iterations")
+        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
         check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
