@@ -60,6 +60,7 @@ _DIST, _DVR, _IDR, _NAIVE = Look("#0072b2", "s"), Look("#d1495b", "^"), Look("#6
 _LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<", "-.")
 _PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
 _OFFICIAL_DIST = Look("#2f9e9e", "<", "-.")
+_MESH = Look("#8a8a8a", "d", "-.")
 # By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
 KNOWN = {
     "naive": _NAIVE,
@@ -91,7 +92,7 @@ KNOWN = {
     "unisurf": Look("#7a4a00", "X", "-."),
     "relaxed_boundary": Look("#66a61e", "*"),
     "range_analysis": Look("#2f6f8f", "8", "--"),
-    "mesh_proxy": Look("#8a8a8a", "d", "-."),
+    "mesh_proxy": _MESH,
     "deepsdf": Look("#009e73", "P", "-."),
     "dist_mask": _DIST,
     "dist_depth": _LIGHT_DIST,
@@ -107,6 +108,7 @@ KNOWN = {
     "multiview_dvr": _DVR,
     "multiview_idr": _IDR,
     "multiview_naive": _NAIVE_OF_METHODS,
+    "multiview_mesh": _MESH,
     "rgb_newton": Look("#1b9e77", "h", (0, (1, 1))),
     "rgbd_newton": Look("#0b5e45", "H"),
     "rgb_dist": _DIST,

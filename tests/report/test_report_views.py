@@ -10,7 +10,7 @@ from bench.records.read import read_records
 from bench.report.data import oracle
 from bench.report.data.experiments import choose
 from bench.report.data.records import ONE_WAY
-from bench.report.pages import fig6, fig10, table3
+from bench.report.pages import fig6, fig10, fig12, table3
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
@@ -134,9 +134,25 @@ def test_figure_10_varies_one_condition_at_a_time(tmp_path):
     found(tmp_path, "fig10", "DIST", 9.0, focal=0.5, start_scale=2.0)  # both: in neither panel
     result = made(tmp_path, fig10)
     medians = dict(zip(result.table["Condition"], result.table["Median"], strict=True))
-    focal, noise = fig10.PANELS.values()
+    focal, noise = (one.label for one in fig10.CONDITIONS)
     assert medians == {f"{focal}: 0.5": "3.00", f"{focal}: 1": "1.00", f"{noise}: 1": "1.00", f"{noise}: 2": "5.00"}
     assert len(result.data) == 4
+
+
+def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_path):
+    placed = {"shift": 0.0, "degrees": 0.0, "scale": 1.0}
+    for index, chamfer in enumerate((0.5, 0.99, 1.01, None)):
+        found(tmp_path, "fig12", "DIST", chamfer, index=index, **placed | {"degrees": 20.0})
+    found(tmp_path, "fig12", "DIST", 0.2, **placed)
+    found(tmp_path, "fig12", "DIST", 0.2, **placed | {"degrees": 20.0, "shift": 0.1})  # two: in no panel
+    result = made(tmp_path, fig12)
+    table = result.table.set_index("Condition")
+    assert table.loc["rotation (degrees): 20", "Success"] == "2 of 4 (n = 4)"  # a failed run is no success
+    assert table.loc["rotation (degrees): 20", "Median"] == "1.00"
+    neutral = ["shift (scene units): 0", "rotation (degrees): 0", "size / true size: 1"]
+    assert table.loc[neutral, "Success"].tolist() == ["1 of 1 (n = 1)"] * 3
+    assert len(table) == 4
+    assert all(1.0 in line.get_ydata() for axis in result.figure.axes for line in axis.lines[-1:])
 
 
 def test_poses_found_are_counted_at_each_angle(tmp_path):
