@@ -61,6 +61,7 @@ _LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<"
 _PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
 _OFFICIAL_DIST = Look("#2f9e9e", "<", "-.")
 _MESH = Look("#8a8a8a", "d", "-.")
+_NEWTON, _NEUS_BUDGET = Look("#1b9e77", "h", (0, (1, 1))), Look("#f59cc6", ">", "--")
 # By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
 KNOWN = {
     "naive": _NAIVE,
@@ -85,9 +86,9 @@ KNOWN = {
     "dvr_64_early_stop": _DVR,
     "dvr_official_slope": Look("#e7a1ab", "^", "--"),
     "idr": _IDR,
-    "newton": Look("#1b9e77", "h", (0, (1, 1))),
+    "newton": _NEWTON,
     "neus": Look("#e7298a", ">"),
-    "neus_budget": Look("#f59cc6", ">", "--"),
+    "neus_budget": _NEUS_BUDGET,
     "volsdf": Look("#e69f00", "P"),
     "unisurf": Look("#7a4a00", "X", "-."),
     "relaxed_boundary": Look("#66a61e", "*"),
@@ -109,7 +110,7 @@ KNOWN = {
     "multiview_idr": _IDR,
     "multiview_naive": _NAIVE_OF_METHODS,
     "multiview_mesh": _MESH,
-    "rgb_newton": Look("#1b9e77", "h", (0, (1, 1))),
+    "rgb_newton": _NEWTON,
     "rgbd_newton": Look("#0b5e45", "H"),
     "rgb_dist": _DIST,
     "rgb_idr": _IDR,
@@ -128,6 +129,11 @@ KNOWN = {
     "pose_dist_starts": _DIST,
     "pose_dvr": _DVR,
     "pose_idr": _IDR,
+    "single_view_by_newton": _NEWTON,
+    "single_view_by_idr": _IDR,
+    "single_view_by_dist": _DIST,
+    "single_view_by_dvr": _DVR,
+    "single_view_by_neus": _NEUS_BUDGET,
     "pose_icp_point": Look("#8fbc5a", "v", "--"),
     "pose_icp_plane": Look("#e69f00", "d", "--"),
     "pose_icp_plane_starts": Look("#b36b00", "P", "-."),

@@ -30,7 +30,7 @@ from renderers.rendering import Renderer
 SHIPPED = Path(__file__).resolve().parents[2] / "datasets" / "networks"
 VERSION = 1  # raise it when training changes, so that no network of the old training is used
 Values = Callable[[Float[torch.Tensor, "n 3"]], Float[torch.Tensor, " n"]]  # negative inside
-TOLD = {"dataset", "settings", "seconds", "mean_code", "filled", "validation"}  # of a record
+TOLD = {"dataset", "settings", "seconds", "evaluations", "mean_code", "filled", "validation"}  # of a record
 VALIDATION = 8  # shapes on which a new network is evaluated, from their first images
 
 

@@ -41,7 +41,10 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
     "before: of the mean code of all training images",
 }
-TRAINING = {"seconds.training": "of the network, once for all shapes; not part of the run's time"}
+TRAINING = {
+    "seconds.training": "of the network, once for all shapes; not part of the run's time",
+    "evaluations.training": "field values that the renderer asked for in the training of the network; not of the run",
+}
 SHIPPED_ROW = "+method=single_view"  # the settings of the networks that are shipped
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
 COLOURS = ("psnr", "ssim")  # scores of colours
@@ -193,6 +196,7 @@ class OneImage:
         model, trained = recipe.load(path)
         run.record.notes = [*run.record.notes, told(trained)]
         run.record.seconds |= {"training": trained["seconds"]["training"]}
+        run.record.evaluations |= {"training": trained["evaluations"]["value"]}
         if not self.knows_colours:
             for weights in model.decoder.texture_head.parameters():
                 weights.zero_()  # grey, in place of the colours that the training began with

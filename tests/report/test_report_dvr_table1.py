@@ -5,18 +5,24 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import dvr_table1, single_view_budget, single_view_figures
+from bench.report.pages import dvr_table1, single_view_budget, single_view_figures, single_view_renderers
 from tests.report.test_report_paper import write_run
 from tests.report.test_report_shapes import images, titles
 
-ROWS = {"RGB": "single_view", "Mean shape": "single_view_mean"}
+ROWS = {
+    "RGB": "single_view",
+    "Mean shape": "single_view_mean",
+    "Nearest image": "single_view_nearest",
+    "Newton": "single_view_by_newton",
+    "IDR": "single_view_by_idr",
+}
 
 
-def made(results, row, chamfer, *, dataset="car", index=0, status="ok", seconds=None):
+def made(results, row, chamfer, *, dataset="car", index=0, status="ok", seconds=None, experiment="dvr_table1", **more):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
-        results, "dvr_table1", row, task="single_view", dataset=dataset, method=ROWS[row], renderer="newton",
-        status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {},
+        results, experiment, row, task="single_view", dataset=dataset, method=ROWS[row], renderer="newton",
+        status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {}, **more,
         settings={"dataset": {"name": dataset}, "index": index},
     )  # fmt: skip
 
@@ -39,6 +45,30 @@ def test_a_line_has_medians_and_the_ratio_to_the_mean_shape_over_the_same_shapes
     assert found["sofa", "RGB"]["Chamfer-L1"] == "25.0" and found["sofa", "RGB"]["Over the mean shape"] == ""
     assert found["car", "published: DVR, RGB"]["Published"] == "0.196"
     assert found["sofa", "published: DVR, depth"]["Published"] == "0.221"
+
+
+def test_a_line_has_the_ratio_to_the_nearest_image(tmp_path):
+    for index, (one, nearest) in enumerate(((0.1, 0.4), (0.2, 0.2), (0.3, 0.6))):
+        made(tmp_path, "RGB", one, index=index)
+        made(tmp_path, "Nearest image", nearest, index=index)
+    found = lines(tmp_path)
+    assert found["car", "RGB"]["Over the nearest image"] == "0.500 (n = 3)"
+    assert found["car", "Nearest image"]["Over the nearest image"] == ""
+
+
+def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_path):
+    teaches = {"experiment": "single_view_renderers"}
+    for index in range(3):
+        cost = {"evaluations": {"training": 2e6}, "seconds": {"forward": 1.0, "backward": 0.0, "training": 90.0}}
+        made(tmp_path, "Newton", 0.2, index=index, **teaches, **cost)
+        made(tmp_path, "IDR", 0.3, index=index, **teaches, status="ok" if index else "empty")
+        made(tmp_path, "Nearest image", 0.1, index=index, **teaches)
+    experiment = choose(read_records(tmp_path)[0], single_view_renderers.READS[0], tmp_path)
+    table = single_view_renderers.make(experiment).table.set_index("Renderer")
+    assert table.loc["Newton", ["Trained in", "Field values"]].tolist() == ["90.0 s", "2.00M"]
+    assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
+    assert table["Over Newton"].tolist() == ["", "∞ (n = 3)", "0.500 (n = 3)"]
+    assert table.loc["IDR", "Failed"] == "1 of 3"
 
 
 def test_a_line_has_the_seconds_of_the_training_and_of_the_inference(tmp_path):

@@ -1,6 +1,8 @@
 """Table 1 of DVR: shape from one image, by what the training may know, measured and published."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -30,7 +32,7 @@ READS = (
     Selection("dvr_table1", ("single_view",), ("dataset", "task", "supervision", "silhouette"), setup=("machine",)),
 )
 NAMES = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
-MEAN = "single_view_mean"  # the row that others are compared with
+COMPARED = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # rows
 # DVR (Niemeyer et al. 2020), Table 1: Chamfer-L1, in tenths of the largest edge of a shape's bounding box.
 PUBLISHED = {
     "car": {"DVR, RGB": 0.196, "DVR, depth": 0.179, "ONet (3D)": 0.181},
@@ -48,15 +50,19 @@ NOTES = (
     "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat in that.",
     "“Trained in”: once for the family, beside another training. “Inference”: the network with its mesh, the search of "
     "the code without, or the search among training shapes.",
-    "“Over the mean shape”: the ratio of geometric means of Chamfer-L1 over the same shapes; below 1 is better.",
+    "“Over ...”: the ratio of geometric means of Chamfer-L1 to that row over the same shapes; below 1 is better.",
     "“Published” is DVR, Table 1: ShapeNet, Chamfer-L1 in tenths of the largest edge of a shape's bounding box, which "
     "cannot be compared directly with the measured rows.",
+)
+INTERVAL = shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else "")
+RATIOS = tuple(
+    shown(heading, lambda line, key=key: str(line[key]) if line.get(key) else "") for key, heading in COMPARED.items()
 )
 COLUMNS = (
     *(text("family", "Family"), text("method", "Training"), Column("iou", "IoU")),
     Column("chamfer_l1", "Chamfer-L1", show=thousandfold),
-    shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
-    shown("Over the mean shape", lambda line: str(line["ratio"]) if line.get("ratio") else ""),
+    INTERVAL,
+    *RATIOS,
     *(Column("normal_consistency", "Normals"), Column("mask_iou", "Mask IoU"), Column("psnr", "PSNR")),
     *(Column("training", "Trained in", show=format.seconds), Column("seconds", "Inference", show=format.seconds)),
     *(text("failed", "Failed"), text("published", "Published")),
@@ -66,17 +72,9 @@ RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LO
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per family and row."""
-    lines, cells = [], {}
+    lines: list[dict[str, Any]] = []
     for name, records in experiment.families().items():
-        part = replace(experiment, records=records)
-        errors = {row: errors_of(found) for row, found in part.rows().items()}
-        mean = next((values for row, values in errors.items() if row.preset == MEAN), None)
-        for line, (row, values) in zip(lines_of(part, NAMES), errors.items(), strict=True):
-            cells[name, row] = bootstrap(by_shape(values), median, seed=0)
-            trained = median_of_known(setting(record, "seconds", "training") for record in part.rows()[row])
-            ratio = None if mean is None or row.preset == MEAN else over(values, mean)
-            more = {"interval": cells[name, row], "ratio": ratio, "training": trained}
-            lines.append({"family": name, **line, **more})
+        lines += compared_lines(name, replace(experiment, records=records), COMPARED)
         published = PUBLISHED.get(name.partition("/")[0], {})
         lines += [
             {"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published.items()
@@ -86,12 +84,31 @@ def make(experiment: Experiment) -> Result:
         "Shape from one image.",
         "Medians over shapes, by what the training of the network may know.",
         interval="95 % bootstrap intervals over shapes",
-        estimates=cells.values(),
+        estimates=[line["interval"] for line in lines if "interval" in line],
         remarks=NOTES,
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
         figure=draw(experiment),
     )
+
+
+def compared_lines(family: str, experiment: Experiment, presets: Iterable[str]) -> list[dict[str, Any]]:
+    """A line per row of one family, with its ratios to other rows, which are named by their presets."""
+    errors = {row: errors_of(found) for row, found in experiment.rows().items()}
+    lines = []
+    for line, (row, values) in zip(lines_of(experiment, NAMES), errors.items(), strict=True):
+        records, others = (
+            experiment.rows()[row],
+            [other for other in errors if other.preset in presets and other != row],
+        )
+        line |= {"interval": bootstrap(by_shape(values), median, seed=0)}
+        line |= {"training": _of_training(records, "seconds"), "training_values": _of_training(records, "evaluations")}
+        lines.append({"family": family, **line, **{one.preset: over(values, errors[one]) for one in others}})
+    return lines
+
+
+def _of_training(records: list[Record], cost: str) -> float | None:
+    return median_of_known(setting(record, cost, "training") for record in records)
 
 
 def errors_of(records: list[Record]) -> dict[RunKey, float]:

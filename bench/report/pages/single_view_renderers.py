@@ -1,0 +1,50 @@
+"""Shape from one image, by the renderer whose gradients taught the network: the same training, another renderer."""
+
+from dataclasses import replace
+from typing import Any
+
+from bench.records import format
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.pages.dvr_table1 import COMPARED, INTERVAL, RATIOS, RUNS, compared_lines, draw
+from bench.report.write.result import Result
+from bench.report.write.table import Column, shown, text, thousandfold, to_data, to_table
+
+PLACE = 44
+READS = (Selection("single_view_renderers", ("single_view",), ("dataset", "task", "supervision"), setup=("machine",)),)
+FIRST = "single_view_by_newton"  # the row that the other renderers are compared with
+NOTES = (
+    "The same network, shapes, images, rays, number of steps and losses, IDR's cross entropy of the mask included; no "
+    "step learns from the visual hull. All are judged by the same shapes, which no training has seen.",
+    "“Over ...”: the ratio of geometric means of Chamfer-L1 to that row over the same shapes; below 1 is better. A "
+    "failed run counts as infinite.",
+    "“Trained in” and “field values”: of the training, once for the family, beside another training.",
+)
+COLUMNS = (
+    *(text("family", "Family"), text("method", "Renderer"), Column("iou", "IoU")),
+    Column("chamfer_l1", "Chamfer-L1", show=thousandfold),
+    INTERVAL,
+    shown("Over Newton", lambda line: str(line[FIRST]) if line.get(FIRST) else ""),
+    *RATIOS,
+    *(Column("normal_consistency", "Normals"), Column("psnr", "PSNR")),
+    Column("training", "Trained in", show=format.seconds),
+    Column("training_values", "Field values", show=format.count),
+    text("failed", "Failed"),
+)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family and row."""
+    lines: list[dict[str, Any]] = []
+    for name, records in experiment.families().items():
+        lines += compared_lines(name, replace(experiment, records=records), (FIRST, *COMPARED))
+    return Result(
+        experiment,
+        "Shape from one image, by the renderer of the training.",
+        "Chamfer-L1 in scene units, times 1000; medians over shapes.",
+        interval="95 % bootstrap intervals over shapes",
+        estimates=[line["interval"] for line in lines],
+        remarks=NOTES,
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, lines),
+        figure=draw(experiment),
+    )
