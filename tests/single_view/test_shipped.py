@@ -15,6 +15,7 @@ from datasets.dataset import Split
 from tests.tiny import CPU, silent
 
 NETWORKS = sorted(SHIPPED.glob("*.safetensors"))
+LEAST_IOU = {"car": 0.6, "sofa": 0.6, "plane": 0.5, "table": 0.4}  # planes and tables are thin
 
 
 @pytest.fixture(params=NETWORKS, ids=[path.stem.split("-")[1] for path in NETWORKS])
@@ -32,7 +33,7 @@ def shipped(request, tmp_path):
 
 
 def test_families_have_one():
-    assert {path.stem.split("-")[1] for path in NETWORKS} >= {"car", "sofa"}
+    assert {path.stem.split("-")[1] for path in NETWORKS} == set(LEAST_IOU)
     assert {path.stem for path in SHIPPED.glob("*.json")} == {path.stem for path in NETWORKS}
 
 
@@ -46,7 +47,7 @@ def test_it_is_that_of_the_default_configuration_and_knows_unseen_shapes(shipped
     unseen = [recipe.imaging.of_shape(recipe.dataset, Split.VALIDATION, index) for index in range(4)]
     found = [overlap(model.at(model(one.image(0)[None])[0]), one, CPU) for one in unseen]
     mean = [overlap(model.at(torch.tensor(record["mean_code"])), one, CPU) for one in unseen]
-    assert np.mean(found) > max(np.mean(mean), 0.6)
+    assert np.mean(found) > max(np.mean(mean), LEAST_IOU[recipe.dataset.name])
 
 
 def test_its_record_tells_the_training_and_no_machine_path(shipped):
