@@ -20,6 +20,7 @@ LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT = 0.4  # of the light; the rest comes from one side
 GREY = 0.5
 HIGHEST = 60.0  # degrees
+ARC = 45.0  # degrees
 UNIFORM = 1e-3  # least difference between the quartiles of a surface's colours: below it nothing can be matched
 
 
@@ -29,8 +30,9 @@ class Photography:
 
     Args:
         views: number of cameras.
-        places: "circle": evenly spaced about the vertical axis, the first is the scene's camera. "sphere": all around
-            at its distance, evenly spaced between `HIGHEST` degrees below and above.
+        places: "circle": evenly spaced about the vertical axis, the first is the scene's camera. "arc": the same
+            within `ARC` degrees to its left and right, from one side of the shape. "sphere": all around at its
+            distance, evenly spaced between `HIGHEST` degrees below and above.
         texture: one of `datasets.textures.TEXTURES`.
         texture_size: of its largest parts, in scene units; see `datasets.textures.make_texture`.
         shading: "unlit": the texture's colours; "lambertian": under a fixed light.
@@ -52,7 +54,7 @@ class Photography:
 
     def __post_init__(self) -> None:
         check_at_least("views", self.views, 2, "views are compared with their neighbours: 24 work")
-        check_choice("places", self.places, ("circle", "sphere"))
+        check_choice("places", self.places, tuple(PLACES))
         check_choice("texture", self.texture, TEXTURES)
         check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
         check_choice("shading", self.shading, ("unlit", "lambertian"))
@@ -68,7 +70,7 @@ class Photography:
         Raises:
             ValueError: where a camera sees nothing of it, or all colours of its surface are alike.
         """
-        return self.take_from(truth, (around if self.places == "sphere" else circle)(first, self.views), seed=seed)
+        return self.take_from(truth, PLACES[self.places](first, self.views), seed=seed)
 
     def take_from(self, truth: Truth, cameras: Sequence[Camera], *, seed: int) -> list[Shot]:
         """The photographs of a mesh from given cameras; see `take`."""
@@ -117,6 +119,12 @@ def circle(first: Camera, count: int) -> list[Camera]:
     return [turned(first, 2 * np.pi * index / count) for index in range(count)]
 
 
+def arc(first: Camera, count: int) -> list[Camera]:
+    """Cameras evenly spaced on a part of that circle, the first camera in the middle."""
+    angles = np.radians(np.linspace(-ARC, ARC, count))
+    return [turned(first, float(angle)) for angle in angles]
+
+
 def around(first: Camera, count: int) -> list[Camera]:
     """Cameras that look at the origin from evenly spaced places (a spiral of the golden angle)."""
     heights = np.sin(np.radians(HIGHEST)) * (1 - (2 * np.arange(count) + 1) / count)
@@ -133,3 +141,6 @@ def turned(camera: Camera, angle: float) -> Camera:
     turn = torch.eye(4, dtype=camera.world_to_camera.dtype)
     turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = c, s, -s, c
     return Camera(camera.intrinsics, camera.world_to_camera @ turn, camera.height, camera.width)
+
+
+PLACES = {"circle": circle, "arc": arc, "sphere": around}  # of cameras

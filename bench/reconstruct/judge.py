@@ -25,6 +25,7 @@ from bench.evaluate.evaluate import (
 )
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter
+from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness_scores
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -53,18 +54,22 @@ COLOURED_DEFINITIONS = {
         " and not hidden by the surface itself."
         for name in SURFACE
     },
+    **ROUGHNESS,
     **{name: text + OF_MESH for name, text in IMAGES.items()},
     **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGES.items()},
+    **WEIGHT,
 }
 
 
 def judge(field: Coloured, subject: Subject, inputs: RunInputs) -> Evaluation:
     """Compares a field with the held-out photographs, and with the true surface where there is one."""
     mesh = surface_of(field, inputs)
-    metrics = surface_scores(mesh, subject, inputs) | mesh_scores(field, mesh, subject.held_out, inputs.device)
+    views = mesh_views(mesh, subject.held_out)
+    metrics = surface_scores(mesh, subject, inputs) | field_scores(field, views, subject.held_out, inputs.device)
+    metrics |= early_weight(field, views, inputs)
     own = [render_view(field, shot.camera, inputs) for shot in subject.held_out]
-    seen = [coloured_image(field, view, inputs.device) for view in own]
-    metrics |= {OWN + name: value for name, value in image_scores(own, seen, subject.held_out).items()}
+    scores = field_scores(field, own, subject.held_out, inputs.device)
+    metrics |= {OWN + name: value for name, value in scores.items()}
     if mesh is None:
         return Evaluation(metrics, None, (RunStatus.EMPTY, "the field has no surface in the unit sphere"))
     return Evaluation(metrics, replace(mesh, colours=vertex_colours(field, mesh, inputs.device)))
@@ -90,18 +95,27 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
     whole = surface_metrics(None if found is None else Surface(*found), Surface(*true), threshold=threshold)
     visible = subject.seen(subject.truth, true[0])
-    part = None
+    part = judged = None
     if mesh is not None and found is not None:
         there = subject.seen(mesh, found[0])
-        part = Surface(found[0][there], found[1][there])
+        part, judged = Surface(found[0][there], found[1][there]), (Surface(*found), there)
     seen = surface_metrics(part, Surface(true[0][visible], true[1][visible]), threshold=threshold)
-    return whole | {SEEN + name: value for name, value in seen.items()}
+    rough = roughness_scores(judged, (Surface(*true), visible))
+    return whole | {SEEN + name: value for name, value in seen.items()} | rough
 
 
-def mesh_scores(field: Coloured, mesh: Mesh | None, shots: Sequence[Shot], device: torch.device) -> dict[str, float]:
-    """The metrics of `IMAGES`, with first hits of a mesh and the field's colours at them."""
-    scene = None if mesh is None else Truth(mesh, closed=False)
-    views = [unseen(shot.camera) if scene is None else see(scene, shot.camera) for shot in shots]
+def mesh_views(mesh: Mesh | None, shots: Sequence[Shot]) -> list[View]:
+    """What the cameras of photographs see of a mesh, by exact first hits."""
+    if mesh is None:
+        return [unseen(shot.camera) for shot in shots]
+    scene = Truth(mesh, closed=False)
+    return [see(scene, shot.camera) for shot in shots]
+
+
+def field_scores(
+    field: Coloured, views: Sequence[View], shots: Sequence[Shot], device: torch.device
+) -> dict[str, float]:
+    """The metrics of `IMAGES` of a field's colours where views meet a surface."""
     return image_scores(views, [coloured_image(field, view, device) for view in views], shots)
 
 

@@ -21,8 +21,9 @@ from bench.reconstruct.surfaces import painter
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.photographs import turned
-from datasets.scene import View
+from datasets.scene import View, see
 from datasets.shot import Shot
+from datasets.truth import Truth
 from renderers.camera import Camera
 from renderers.fields.coloured import Coloured
 
@@ -92,7 +93,13 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
     arrays = {"photograph": shot.colours, "colours": image, "normals": picture_normals(view), "hit": view.mask}
     if len(subject.given) == 1:
         arrays["given"] = subject.given[0].colours
-    plain = {name: (array if name == "hit" else array.half()).numpy() for name, array in arrays.items()}
+    if subject.truth is not None:
+        behind = turned(view.camera, np.pi)
+        back, painted = seen(behind)
+        true = torch.from_numpy(normals_image(see(Truth(subject.truth), behind)))
+        arrays |= {"back_colours": painted, "back_normals": picture_normals(back), "back_hit": back.mask}
+        arrays |= {"back_truth": true[..., :3]}
+    plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
     np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 

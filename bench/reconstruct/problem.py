@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.evaluate.colours import colours_at
 from bench.evaluate.evaluate import Evaluation, surface_of
 from bench.pictures.filmstrip import Shown
-from bench.reconstruct.judge import judge, mesh_scores, surface_scores
+from bench.reconstruct.judge import field_scores, judge, mesh_views, surface_scores
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.models import Learnt
 from bench.reconstruct.pictures import draw_reconstruction
@@ -102,9 +102,9 @@ class ReconstructionProblem:
         """The `tracked` metrics of the current shape."""
         shape = self.field()
         mesh = surface_of(shape, inputs)
-        scores = surface_scores(mesh, self.subject, inputs) | mesh_scores(
-            shape, mesh, self.subject.held_out, inputs.device
-        )
+        views = mesh_views(mesh, self.subject.held_out)
+        scores = surface_scores(mesh, self.subject, inputs)
+        scores |= field_scores(shape, views, self.subject.held_out, inputs.device)
         return {name: scores[name] for name in self.tracked}
 
     def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:

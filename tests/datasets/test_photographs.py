@@ -97,13 +97,23 @@ def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
     assert len(sides) == min(count, 4) or count < 7
 
 
+def test_an_arc_is_of_one_side_with_the_first_camera_in_its_middle(ball):
+    shots = replace(PLAINLY, places="arc", views=5).take(ball, CAMERA, seed=0)
+    centres = torch.stack([shot.camera.center for shot in shots])
+    assert torch.allclose(centres[2], CAMERA.center) and torch.allclose(centres.norm(dim=1), CAMERA.center.norm())
+    flat = torch.nn.functional.normalize(centres[:, [0, 2]], dim=1)
+    angles = torch.rad2deg(torch.arccos((flat @ flat[2]).clamp(-1, 1)))
+    assert angles.tolist() == pytest.approx([45, 22.5, 0, 22.5, 45], abs=0.1)
+    assert (flat[0] @ flat[4]).item() == pytest.approx(0, abs=1e-5)
+
+
 def test_places_choose_between_a_circle_and_all_around(ball):
     circle, sphere = (replace(PLAINLY, places=places).take(ball, CAMERA, seed=0) for places in ("circle", "sphere"))
     assert len(circle) == len(sphere) == 8
     assert np.ptp([shot.camera.center[1].item() for shot in circle]) < 1e-4
     assert np.ptp([shot.camera.center[1].item() for shot in sphere]) > 3.0
     assert torch.equal(circle[0].camera.world_to_camera, CAMERA.world_to_camera)
-    with pytest.raises(ValueError, match="places must be one of circle, sphere"):
+    with pytest.raises(ValueError, match="places must be one of circle, arc, sphere"):
         replace(PLAINLY, places="cube")
 
 

@@ -11,6 +11,7 @@ import trimesh
 from bench.config import load
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, IMAGES, OWN, SEEN, SURFACE, image_scores, judge
 from bench.reconstruct.subject import Subject
+from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT
 from bench.records.record import RunStatus
 from datasets.mesh import Mesh
 from datasets.photographs import around
@@ -22,6 +23,7 @@ from tests.tiny import ball_prior, camera_of, run_of
 
 CENTRE = (0.1, -0.05, 0.15)
 MASK_IOU = ("mask_iou", "mask_iou_least")
+OF_HITS = set(COLOURED_DEFINITIONS) - set(WEIGHT)  # the metrics of a renderer that sees hits alone
 
 
 def painted(*, red: float = 0.0, radius: float = 0.6) -> Ball:
@@ -54,7 +56,7 @@ def without_masks(subject: Subject) -> Subject:
 
 def test_the_truth_scores_high(subject, inputs):
     found = judge(painted(), subject, inputs)
-    assert found.failure is None and set(found.metrics) == set(COLOURED_DEFINITIONS)
+    assert found.failure is None and set(found.metrics) == OF_HITS
     metrics = found.metrics
     assert metrics["own_psnr"] > 60 and metrics["own_ssim"] > 0.9999 and metrics["own_mask_iou"] == 1.0
     assert metrics["psnr"] > 25 and metrics["ssim"] > 0.95 and metrics["mask_iou_least"] > 0.94
@@ -87,7 +89,7 @@ def test_without_masks_psnr_is_over_what_lies_in_the_unit_sphere_and_there_is_no
     shares = [shot.mask.sum() / sphere_span(shot.camera.rays())[2].sum() for shot in subject.held_out]
     assert metrics["own_psnr"] == pytest.approx(np.mean([-10 * log10(0.2**2 * s / 3) for s in shares]), abs=0.01)
     assert not {*MASK_IOU, *(OWN + name for name in MASK_IOU)} & set(metrics)
-    assert set(metrics) == set(COLOURED_DEFINITIONS) - {*MASK_IOU, *(OWN + name for name in MASK_IOU)}
+    assert set(metrics) == OF_HITS - {*MASK_IOU, *(OWN + name for name in MASK_IOU)}
     exact = judge(painted(), without_masks(subject), inputs).metrics
     assert exact["own_psnr"] > 60
 
@@ -133,7 +135,8 @@ def test_no_surface_is_empty_and_scores_worst(subject, inputs):
     found = judge(painted(radius=-0.5), subject, inputs)
     assert found.mesh is None and found.failure is not None and found.failure[0] is RunStatus.EMPTY
     metrics = found.metrics
-    assert set(metrics) == set(COLOURED_DEFINITIONS)
+    assert set(metrics) == OF_HITS
+    assert all(metrics[name] == inf for name in ROUGHNESS)
     assert metrics["chamfer_l1"] == metrics["seen_chamfer_l1"] == inf and metrics["fscore"] == 0.0
     assert [metrics[prefix + name] for prefix in ("", OWN) for name in MASK_IOU] == [0.0] * 4
     assert 0 < metrics["psnr"] < 15 and metrics["psnr"] == pytest.approx(metrics["own_psnr"])
@@ -193,5 +196,5 @@ def test_means_and_the_least_are_over_photographs_of_any_size():
 
 def test_every_metric_is_defined():
     assert set(COLOURED_DEFINITIONS) == {
-        *SURFACE, *(SEEN + name for name in SURFACE), *IMAGES, *(OWN + name for name in IMAGES)
+        *SURFACE, *(SEEN + name for name in SURFACE), *IMAGES, *(OWN + name for name in IMAGES), *ROUGHNESS, *WEIGHT
     }  # fmt: skip

@@ -7,13 +7,13 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import dvr_figures, dvr_table2, photos
+from bench.report.pages import dvr_figures, dvr_table2, photos, unseen_back
 from bench.report.write.paper import write_paper
 from bench.report.write.shapes import MOST_COLUMNS, history, scene_of
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
-NEWTON, IDR, HULL, STEREO = "Newton, RGB", "IDR, RGB", "Visual hull", "Stereo, Poisson"
-METHODS = {NEWTON: "rgb_newton", IDR: "rgb_idr", HULL: "hull", STEREO: "stereo"}
+NEWTON, IDR, NEUS, HULL, STEREO = "Newton, RGB", "IDR, RGB", "NeuS, RGB", "Visual hull", "Stereo, Poisson"
+METHODS = {NEWTON: "rgb_newton", IDR: "rgb_idr", NEUS: "rgb_neus", HULL: "hull", STEREO: "stereo"}
 TASKS = {HULL: "hull", STEREO: "stereo"}
 LEVELS = (HULL, STEREO)  # rows without a loop
 FOLDER = "photographs/chair"
@@ -303,3 +303,21 @@ def test_all_three_pages_are_written(tmp_path):
             assert (tmp_path / "paper" / f"{name}{suffix}").stat().st_size > 100
     text = (tmp_path / "paper" / "dvr_table2.md").read_text(encoding="utf-8")
     assert "Shape and colour from photographs." in text and "published: DVR (RGB)" in text
+
+
+def test_the_side_that_no_photograph_shows_is_judged_and_drawn_from_behind(tmp_path):
+    rough = {"seen_roughness": 1.0, "unseen_roughness": 6.0}
+    for row, extra in ((NEWTON, {}), (NEUS, {"own_early_weight": 0.25})):
+        folder = made(tmp_path, row, scored(0.02) | rough | extra, experiment="unseen_back")
+        images(folder, (1.0, 0.0, 0.0))
+        with np.load(folder / "images.npz") as file:
+            arrays = dict(file)
+        behind = {f"back_{name}": array for name, array in arrays.items() if name != "photograph"}
+        behind["back_colours"] = np.full_like(arrays["colours"], 0.25)
+        np.savez(folder / "images.npz", **arrays, **behind, back_truth=np.full_like(arrays["colours"], 0.75))
+    result = unseen_back.make(chosen(tmp_path, unseen_back))
+    assert line_of(result, NEUS)[["unseen", "Early weight"]].tolist() == ["6.00", "25 %"]
+    assert line_of(result, NEWTON)["Early weight"] == "–"
+    assert titles(result.figure) == ["sofa 0, true normals", NEWTON, NEUS]
+    true, newton = (result.figure.axes[place].get_images()[0].get_array() for place in (0, 1))
+    assert (true == 0.75).all() and newton[3, 3].tolist() == [0.25] * 3  # of the view from behind

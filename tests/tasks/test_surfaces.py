@@ -32,7 +32,8 @@ STEREO = Stereo(
     **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), fusing=Fusing(5, 0.0)
 )
 TASKS = {"hull": HULL, "poisson": POISSON, "stereo": STEREO}
-ARRAYS = {"colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}  # at the size of pictures
+SEEN_AS = {"colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}  # at the size of pictures
+ARRAYS = SEEN_AS | {f"back_{name}": shape for name, shape in SEEN_AS.items()} | {"back_truth": (8, 8, 3)}
 WORST = {"hull": (0.055, 0.9, 19), "poisson": (0.035, 0.98, 27), "stereo": (0.06, 0.8, 16)}  # Chamfer-L1, IoU, PSNR
 SCORES = {name for name in COLOURED_DEFINITIONS if not name.startswith(OWN)}
 

@@ -135,6 +135,8 @@ def draw_pictures(
     scenes: Sequence[str],
     photographs: Mapping[str, str] = HELD_OUT,
     most: int = MOST_COLUMNS,
+    *,
+    side: str = "",
 ) -> tuple[Figure, list[str]]:
     """For each scene the photographs and each row's colours, normals below; a note for each missing one.
 
@@ -144,10 +146,11 @@ def draw_pictures(
         scenes: that are shown, see `scene_of`.
         photographs: arrays of images.npz that all rows share, and what they are.
         most: pictures side by side.
+        side: prefix of the arrays of another view, such as "back_".
     """
     blocks, notes = [], []
     for scene in scenes:
-        cells, missing = _cells(experiment, rows, scene, photographs)
+        cells, missing = _cells(experiment, rows, scene, photographs, side)
         blocks += [cells[start : start + most] for start in range(0, len(cells), most)]
         notes += missing
     columns = max(map(len, blocks), default=1)
@@ -163,9 +166,9 @@ def draw_pictures(
 
 
 def _cells(
-    experiment: Experiment, rows: Sequence[Row], scene: str, photographs: Mapping[str, str]
+    experiment: Experiment, rows: Sequence[Row], scene: str, photographs: Mapping[str, str], side: str
 ) -> tuple[list[Any], list[str]]:
-    cells, notes, shown, names = [], [], False, (*photographs, *ARRAYS)
+    cells, notes, shown, names = [], [], False, (*photographs, *(side + name for name in ARRAYS))
     for row in rows:
         record = next((r for r in experiment.records if scene_of(r) == scene and row_of(r) == row), None)
         found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), names)
@@ -174,7 +177,7 @@ def _cells(
         elif not shown:
             cells = [(f"{scene}, {what}", {"colours": found[name]}) for name, what in photographs.items()] + cells
             shown = True
-        cells.append((row.name, found))
+        cells.append((row.name, {name.removeprefix(side): array for name, array in found.items()}))
     masks = [images["hit"] for _, images in cells if "hit" in images]
     window = style.window(masks) if masks else (0.0, 0.0, 1.0)
     return [(title, {**images, "window": window} if images else {}) for title, images in cells], notes

@@ -1,0 +1,85 @@
+"""Failures that users of volume renderers report: weight before the surface, and bumps where no photograph looks."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from bench.evaluate.evaluate import OWN, Surface
+from bench.setup.inputs import RunInputs
+from datasets.scene import View
+from renderers.boundary import rendered
+from renderers.field import Field
+
+NEIGHBOURS = 0.05  # scene units: farthest apart that two points of the surface are compared
+EARLY = 0.05  # scene units in front of the surface, where no weight should be
+ROUGHNESS = {
+    f"{part}_roughness": "Mean angle between the normals of two points sampled on the surface at most 0.05 scene units "
+    f"apart, that {others} given photograph sees, less the same of the true surface, in degrees; normals count without "
+    "their sign. Above 0 the surface is bumpier than the true one, below it is smoother."
+    for part, others in (("seen", "some"), ("unseen", "no"))
+}
+WEIGHT = {
+    OWN + "early_weight": "Share of the weight of a ray that lies more than 0.05 scene units in front of the first hit "
+    "of the mesh, mean over the rays of held-out photographs that hit it; of renderers that sum along a ray (NeuS, "
+    "Sec. 3.1: an unbiased rendering has its greatest weight at the surface)."
+}
+
+
+def roughness_scores(
+    found: tuple[Surface, Bool[np.ndarray, " n"]] | None, true: tuple[Surface, Bool[np.ndarray, " m"]]
+) -> dict[str, float]:
+    """The metrics of `ROUGHNESS`; infinite without a surface.
+
+    Args:
+        found: the reconstructed surface, and which of its points are seen.
+        true: the same of the true surface.
+    """
+    scores = {}
+    for name, seen in zip(ROUGHNESS, (True, False), strict=True):
+        parts = [None if one is None else _part(one[0], one[1] == seen) for one in (found, true)]
+        here, there = (np.inf if part is None else roughness(part) for part in parts)
+        scores[name] = here - there
+    return scores
+
+
+def roughness(surface: Surface) -> float:
+    """The mean angle between the normals of points that are neighbours, in degrees; 0 where there are none."""
+    if len(surface.points) < 2:
+        return 0.0
+    first, second = cKDTree(surface.points).query_pairs(NEIGHBOURS, output_type="ndarray").T
+    if not len(first):
+        return 0.0
+    normals = surface.normals / np.linalg.norm(surface.normals, axis=1, keepdims=True).clip(1e-12)
+    cosine = np.abs((normals[first] * normals[second]).sum(axis=1)).clip(0, 1)
+    return float(np.degrees(np.arccos(cosine)).mean())
+
+
+@torch.no_grad()
+def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict[str, float]:
+    """The metric of `WEIGHT`; none of a renderer that sees hits alone, and none where no ray hits.
+
+    Args:
+        field: that is rendered.
+        views: of its mesh, by exact first hits.
+        inputs: with the renderer.
+    """
+    shares: list[Float[torch.Tensor, " rays"]] = []
+    for view in views:
+        if not bool(view.mask.any()):
+            continue
+        rays = view.camera.rays()[view.mask].to(inputs.device)
+        surface = view.camera.distance(view.depth)[view.mask].to(inputs.device)
+        volume = rendered(inputs.renderer, field, rays).volume
+        if volume is None:
+            return {}
+        early = (volume.distance < surface[volume.ray] - EARLY).to(surface)
+        both = volume.summed(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
+        shares.append((both[:, 0] / both[:, 1].clamp_min(1e-6)).cpu())
+    return {name: float(torch.cat(shares).mean()) for name in WEIGHT} if shares else {}
+
+
+def _part(surface: Surface, kept: Bool[np.ndarray, " n"]) -> Surface:
+    return Surface(surface.points[kept], surface.normals[kept])

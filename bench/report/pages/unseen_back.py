@@ -1,0 +1,59 @@
+"""Photographs from one side: what renderers make of the side that none of them shows, and where their weights lie."""
+
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import definitions, grouped
+from bench.report.write.result import Result
+from bench.report.write.shapes import COST, draw_pictures, lines_of, scene_of
+from bench.report.write.table import (
+    FAMILY,
+    IDENTITY,
+    LOOP,
+    Column,
+    metrics,
+    percent,
+    text,
+    thousandfold,
+    to_data,
+    to_table,
+)
+
+PLACE = 49
+READS = (Selection("unseen_back", ("reconstruction",), ("dataset", "task", "silhouette"), setup=("scenes", "machine")),)
+NAMES = ("seen_roughness", "unseen_roughness", "own_early_weight", "seen_chamfer_l1", "chamfer_l1", "mask_iou")
+DEFINED = {"seen_roughness": "Roughness", "unseen_roughness": "Roughness", "own_early_weight": "Early weight"}
+MOST_SCENES = 3
+NOTES = (
+    "Users of NeuS report weights in front of the surface and a bumpy back where no photograph looks. All photographs "
+    "are from within 45 degrees of one direction; pictures are from the opposite one.",
+    "All rows share one field (4 layers of 128, a distance). The loss of the mask is the renderer's own for NeuS, and "
+    "IDR's cross entropy for the others.",
+)
+COLUMNS = (
+    text("method", "Method"),
+    Column("seen_roughness", "Roughness, seen (degrees)"),
+    Column("unseen_roughness", "unseen"),
+    Column("own_early_weight", "Early weight", show=percent),
+    Column("seen_chamfer_l1", "Chamfer-L1, seen", show=thousandfold),
+    Column("chamfer_l1", "all", show=thousandfold),
+    Column("mask_iou", "Mask IoU"),
+    *COST,
+)
+RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES), *LOOP)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per row and pictures from behind."""
+    scenes = list(grouped(experiment.records, scene_of))
+    figure, missing = draw_pictures(
+        experiment, list(experiment.rows()), scenes[:MOST_SCENES], {"back_truth": "true normals"}, side="back_"
+    )
+    return Result(
+        experiment,
+        "Photographs from one side, and the back that none shows.",
+        f"Medians over {len(scenes)} scene{'s' if len(scenes) > 1 else ''}, distances in scene units, times 1000; in "
+        "the figure, colours above and normals below, from behind.",
+        remarks=(*NOTES, *definitions(experiment.records, DEFINED), *missing),
+        data=to_data(RUNS, experiment.records),
+        table=to_table(COLUMNS, lines_of(experiment, NAMES)),
+        figure=figure,
+    )
