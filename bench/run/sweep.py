@@ -21,6 +21,7 @@ from bench.records.folder import identify
 from bench.records.format import number, seconds
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
+from bench.targets import check_targets
 
 SHOWN = (  # metric, its name in the line of a cell, factor
     ("recommended_field", "recommended", 1.0),
@@ -86,11 +87,14 @@ def make_plan(config: DictConfig) -> Plan:
     """
     loader = GlobalHydra.instance().config_loader()
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
+    typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
     cells: list[PlannedCell] = []
     for cell in combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task]):
         composed = loader.load_sweep_config(config, cell)
         plain = _without_hydra(composed)
         check_names(plain)
+        by_hand = [override for override in cell if _key(override) in typed]
+        check_targets(plain, by_hand, composed.hydra.runtime.choices.get("renderer", ""))
         identity = identify(plain, composed.hydra.runtime)
         cells.append(
             PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
@@ -109,6 +113,10 @@ def combinations(texts: list[str]) -> list[list[str]]:
     """
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     return BasicSweeper.split_arguments(parser.parse_overrides(texts), None)[0]
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")
 
 
 def _without_hydra(config: DictConfig) -> DictConfig:

@@ -16,7 +16,10 @@ from bench.records.record import Record, row_name
 from bench.run import sweep
 from bench.run.command import command_line
 
-CLASS = "class Mine:\n    def __init__(self, size):\n        self.size = size\n"
+CLASS = (
+    "class Mine:\n    def __init__(self, size):\n        self.size = size\n    def render(self, field, rays): ...\n"
+    "    def silhouette_loss(self, field, rays, rendering, mask): ...\n"
+)
 YAMLS = {
     "mine": "_target_: {package}.Mine\nsize: 3\n",
     "mine_first": "defaults: [mine, _self_]\n_label_: Mine, first\n_rows_: {{table1: 0}}\nsize: 4\n",
