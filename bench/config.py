@@ -1,6 +1,8 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -180,6 +182,35 @@ def build(
     Raises:
         ValueError: for an unknown package, a class that may not be used, an unknown key or a value of the wrong type.
     """
+    if _made is None or "." in name:
+        return _build(node, name, packages, target, role)
+    key = (id(node), name, *packages)
+    if key not in _made:
+        try:
+            _made[key] = node, _build(node, name, packages, target, role), None
+        except ValueError as error:
+            _made[key] = node, None, error
+    _, made, error = _made[key]
+    if error is not None:
+        raise error
+    return made
+
+
+_made: dict[tuple[Any, ...], tuple[DictConfig, Any, ValueError | None]] | None = None  # within `built_once`
+
+
+@contextmanager
+def built_once() -> Iterator[None]:
+    """Within it, a node is built once, whatever asks for it again; for checks, since a run's objects are its own."""
+    global _made
+    _made = {}
+    try:
+        yield
+    finally:
+        _made = None
+
+
+def _build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str], target: str, role: type | None) -> Any:
     if OmegaConf.is_missing(node, "_target_"):
         raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
     if role is None and target:

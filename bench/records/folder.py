@@ -33,7 +33,7 @@ PASSIVE = (
         "bench/turntable",
         "bench/progress.py",
     ),
-    *("bench/run/sweep.py", "bench/run/summary.py"),
+    *("bench/run/check.py", "bench/run/sweep.py", "bench/run/summary.py"),
     *("bench/records/format.py", "bench/records/read.py"),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )

@@ -42,6 +42,11 @@ class Plan:
         """The folder of the plan; the same sweep has the same folder."""
         return self.results_dir / "sweeps" / self.name
 
+    def differing(self, cell: PlannedCell) -> list[str]:
+        """The overrides of a cell that not all cells have."""
+        common = set.intersection(*(set(one.overrides) for one in self.cells))
+        return [override for override in cell.overrides if override not in common]
+
     def write(self) -> None:
         """Writes `plan.json`."""
         check_links(self.results_dir)

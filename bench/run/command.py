@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, check_names, register
 from bench.hints import nearest, renamed
+from bench.run.check import check_apart
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.targets import check_targets
@@ -45,6 +46,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
             check_names(config)
             chosen = HydraConfig.get()
             check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
+            check_apart(config)
             job(config)
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it

@@ -14,8 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import Isolation, build, register
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
-from bench.records.folder import Claim, Identity, claimed, identify, release
+from bench.records.folder import Claim, Identity, claimed, identify, release, reusable
 from bench.records.record import Record, RunStatus, now, read_record
+from bench.run.check import refusals
 from bench.run.command import unwritten
 from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show
@@ -49,6 +50,8 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     register()  # again, since a launcher's worker has not read the command line
     _stay_in_place(config)
     single = OmegaConf.is_missing(HydraConfig.get().job, "num")
+    if single and config.isolation == Isolation.process:  # a sweep's cells were checked before the first one
+        _check(config)
     try:
         folder, record = run(config)
     except Interrupted as error:
@@ -66,6 +69,15 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     if single:
         show(folder, record, write_index(folder.parent.parent))
     return record.status
+
+
+def _check(config: DictConfig) -> None:
+    """Raises ValueError where a run that is not there yet would be refused, before it has a folder."""
+    identity = identify(config, HydraConfig.get().runtime)
+    if reusable(Path(config.results_dir) / "runs" / identity.name, identity, config.rerun) is None:
+        (reason,) = refusals([identity.config], config.isolation)
+        if reason:
+            raise ValueError(reason)
 
 
 def _stay_in_place(config: DictConfig) -> None:

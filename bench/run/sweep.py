@@ -14,13 +14,14 @@ from hydra.experimental.callback import Callback
 from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import check_names
+from bench.config import Isolation, Rerun, check_names
 from bench.progress import display
 from bench.records.files import digest
-from bench.records.folder import identify
+from bench.records.folder import identify, reusable
 from bench.records.format import number, seconds
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
+from bench.run.check import check_apart, check_plan, identity_of, warm_up
 from bench.targets import check_targets
 
 SHOWN = (  # metric, its name in the line of a cell, factor
@@ -68,7 +69,11 @@ class Planner(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Plans the sweep and starts to follow it."""
         try:
-            Sweep.start(make_plan(config))
+            if config.isolation == Isolation.process:
+                warm_up()
+            plan, launcher = make_plan(config), config.hydra.runtime.choices["hydra/launcher"]
+            check_plan(plan, launcher, lambda cell: is_reused(plan, cell))
+            Sweep.start(plan)
         except Exception as error:
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
@@ -95,6 +100,10 @@ def make_plan(config: DictConfig) -> Plan:
         check_names(plain)
         by_hand = [override for override in cell if _key(override) in typed]
         check_targets(plain, by_hand, composed.hydra.runtime.choices.get("renderer", ""))
+        try:
+            check_apart(plain)
+        except ValueError as error:
+            raise ValueError(f"cell {len(cells) + 1} ({' '.join(cell)}): {error}; nothing was run") from error
         identity = identify(plain, composed.hydra.runtime)
         cells.append(
             PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
@@ -104,6 +113,12 @@ def make_plan(config: DictConfig) -> Plan:
     first = cells[0].config
     name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
     return Plan(name, Path(first["results_dir"]), cells)
+
+
+def is_reused(plan: Plan, cell: PlannedCell) -> bool:
+    """Whether a cell's finished run is there already, and will be reused."""
+    folder = plan.results_dir / "runs" / cell.id
+    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
 
 
 def combinations(texts: list[str]) -> list[list[str]]:
@@ -137,8 +152,6 @@ def followed(plan: Plan) -> Iterator[None]:
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
         begun, anew = time.monotonic(), 0
 
-        common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
-
         def place() -> str:
             """What stands in front of a cell's line where there is no terminal; cells that are reused take no time."""
             if not shown.disable:
@@ -155,8 +168,7 @@ def followed(plan: Plan) -> Iterator[None]:
                     del pending[cell.id]
                     failed += record["status"] != "ok"
                     anew += not record["reused"]
-                    differing = " ".join(override for override in cell.overrides if override not in common)
-                    text = line(plan.results_dir / "runs" / cell.id, record, differing)
+                    text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
                     print(place() + text, flush=True)
             shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
 

@@ -166,15 +166,6 @@ def test_a_value_that_cannot_be_is_told_before_anything_slow(bench, tmp_path, no
     assert not list((tmp_path / "r" / "runs").glob("*"))
 
 
-def test_in_a_sweep_a_value_that_cannot_be_is_a_record(bench, tmp_path):
-    code, *_ = bench("-m", *TINY, "task.optimiser.iterations=1", "renderer.steps=0,50")
-    assert code == 1
-    records = [json.loads(path.read_text()) for path in (tmp_path / "r" / "runs").glob("*/record.json")]
-    assert sorted(record["status"] for record in records)[1:] == ["refused"]
-    (refused,) = [record for record in records if record["status"] == "refused"]
-    assert refused["reason"].startswith("steps must be at least 1, not 0")
-
-
 def test_more_points_than_pixels_are_told(bench):
     code, _, err = bench(*TINY, "task.points=5000")
     assert code == 2
@@ -357,7 +348,7 @@ def test_a_real_process_that_is_refused_ends_with_one_line_and_no_folder(tmp_pat
         done = running.ended()
     assert (done.code, done.out) == (2, "")
     assert_one_line(done.err, "error: ", "resolution must be at least 4, not -3")
-    assert not list((tmp_path / "runs").iterdir())
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])

@@ -27,6 +27,7 @@ class Renderer:
     def silhouette_loss(self, field, rays, rendering, mask): ...
 class Other:
     def __init__(self, *_, **__): Path({made!r}).touch()
+class Borrowed(Renderer): __module__ = "elsewhere.renderers"
 def call(*_, **__): Path({made!r}).touch()
 """
 
@@ -149,7 +150,11 @@ def test_a_package_that_the_user_names_is_used(compose_config, stranger, tmp_pat
     assert type(build(config.renderer, "renderer")).__name__ == "Renderer"
     assert type(load("renderer", "custom", _target_=f"{stranger}.Renderer")).__name__ == "Renderer"
     (tmp_path / "made").unlink()
-    for wrong, words in (("Other", "no Renderer: it lacks render, silhouette_loss"), ("call", "which is no class")):
+    for wrong, words in (
+        ("Borrowed", "a class of elsewhere: add its package"),
+        ("Other", "no Renderer: it lacks render, silhouette_loss"),
+        ("call", "which is no class"),
+    ):
         with pytest.raises(ValueError, match=words):
             find_class(f"{stranger}.{wrong}", "renderer", [stranger], None)
     assert not (tmp_path / "made").exists()
