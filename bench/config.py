@@ -111,6 +111,7 @@ class Config:
     time_limit: float | None = MISSING
     memory_limit: float | None = MISSING
     rerun: Rerun = MISSING
+    plan: bool = MISSING
     verbose: bool = MISSING
 
 

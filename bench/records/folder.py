@@ -33,8 +33,8 @@ PASSIVE = (
         "bench/turntable",
         "bench/progress.py",
     ),
-    *("bench/run/check.py", "bench/run/sweep.py", "bench/run/summary.py"),
-    *("bench/records/format.py", "bench/records/read.py"),
+    *("bench/run/check.py", "bench/run/plan.py", "bench/run/sweep.py", "bench/run/summary.py"),
+    *("bench/records/expected.py", "bench/records/format.py", "bench/records/read.py"),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
@@ -42,7 +42,7 @@ FILE_KEYS = ("path", "image_path", "mask_path")  # of files that a run reads
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"
-DECIDING = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun"}  # whether a run that failed would fail again
+DECIDING = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan"}  # whether a run that failed would fail again
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ a process that branches off from the server of processes, as runs do, or with is
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
@@ -21,7 +21,19 @@ from bench.run.process import BOOT, RunLimits, fork_server, raise_if_stopped, si
 
 Config = dict[str, Any]  # resolved, as plain data
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
-UNREAD = ("seed", "label", "experiment", "sizes", "draw", "results_dir", "verbose", "rerun", "isolation", "tracker")
+UNREAD = (
+    "seed",
+    "label",
+    "experiment",
+    "sizes",
+    "draw",
+    "results_dir",
+    "verbose",
+    "rerun",
+    "isolation",
+    "tracker",
+    "plan",
+)
 INTERVAL = 0.1  # seconds between two looks at whether the user stopped it
 
 
@@ -74,18 +86,18 @@ def refusals(configs: list[Config], isolation: Isolation | str) -> list[str]:
     return reasons + [""] * (len(configs) - len(reasons))
 
 
-def check_plan(plan: Plan, launcher: str, reused: Callable[[PlannedCell], bool]) -> None:
+def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """Checks all cells of a sweep, before it is written down.
 
     Args:
         plan: the sweep.
         launcher: the choice of `hydra/launcher`; another machine may have a GPU where this one has none.
-        reused: whether a cell's finished run is there already, so that it need not be checked.
+        reused: ids of the cells whose finished run is there already, so that they need not be checked.
 
     Raises:
         ValueError: where a cell cannot be, with the cell and what is wrong with it.
     """
-    cells = [cell for cell in plan.cells if not reused(cell)]
+    cells = [cell for cell in plan.cells if cell.id not in reused]
     away = {} if launcher in HERE else {"device": "cpu"}
     found = refusals([cell.config | away for cell in cells], plan.cells[0].config["isolation"])
     bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]

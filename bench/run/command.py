@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import CONF, check_names, register
 from bench.hints import nearest, renamed
 from bench.run.check import check_apart
+from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.targets import check_targets
@@ -95,6 +96,8 @@ def _call(program: Callable[[], None]) -> None:
     try:
         program()
         raise_if_stopped()  # also where a library swallowed it
+    except Shown:
+        return
     except (Refused, Exception) as error:
         if stopped := stopped_by(error):
             raise KeyboardInterrupt(stopped) from error

@@ -1,5 +1,6 @@
 """Plans a sweep before its first cell starts, and prints a line as each cell ends."""
 
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -16,12 +17,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import Isolation, Rerun, check_names
 from bench.progress import display
+from bench.records.expected import Remaining
 from bench.records.files import digest
 from bench.records.folder import identify, reusable
 from bench.records.format import number, seconds
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
 from bench.run.check import check_apart, check_plan, identity_of, warm_up
+from bench.run.plan import Shown, remaining, show_plan
 from bench.targets import check_targets
 
 SHOWN = (  # metric, its name in the line of a cell, factor
@@ -47,11 +50,11 @@ class Sweep:
     shown = ExitStack()
 
     @classmethod
-    def start(cls, plan: Plan) -> None:
+    def start(cls, plan: Plan, left: Remaining) -> None:
         """Writes and keeps the plan, and shows the sweep's progress from now on."""
         plan.write()
         cls.plan = plan
-        cls.shown.enter_context(followed(plan))
+        cls.shown.enter_context(followed(plan, left))
 
     @classmethod
     def end(cls) -> None:
@@ -72,8 +75,12 @@ class Planner(Callback):
             if config.isolation == Isolation.process:
                 warm_up()
             plan, launcher = make_plan(config), config.hydra.runtime.choices["hydra/launcher"]
-            check_plan(plan, launcher, lambda cell: is_reused(plan, cell))
-            Sweep.start(plan)
+            reused, workers = {cell.id for cell in plan.cells if is_reused(plan, cell)}, workers_of(config)
+            check_plan(plan, launcher, reused)
+            if config.plan:
+                show_plan(plan, reused, workers)
+                raise Shown
+            Sweep.start(plan, remaining(plan, reused, workers))
         except Exception as error:
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
@@ -121,6 +128,14 @@ def is_reused(plan: Plan, cell: PlannedCell) -> bool:
     return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
 
 
+def workers_of(config: DictConfig) -> int:
+    """How many cells the launcher runs at a time, as far as its settings say so."""
+    for key in ("n_jobs", "array_parallelism"):  # of joblib, and of submitit
+        if (count := OmegaConf.select(config, f"hydra.launcher.{key}")) is not None:
+            return max(int(count), 1) if count > 0 else os.cpu_count() or 1
+    return 1
+
+
 def combinations(texts: list[str]) -> list[list[str]]:
     """The overrides of each cell, from those of a sweep, such as `seed=0,1`, in the order in which Hydra runs them.
 
@@ -142,35 +157,36 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 @contextmanager
-def followed(plan: Plan) -> Iterator[None]:
+def followed(plan: Plan, left: Remaining) -> Iterator[None]:
     """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
 
     It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
     """
     with display() as shown:
-        progress = shown.add_task("sweep", total=len(plan.cells), said="")
+        progress = shown.add_task("sweep", total=len(plan.cells), said="", left=left.left(0.0))
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
-        begun, anew = time.monotonic(), 0
+        begun = time.monotonic()
 
-        def place() -> str:
-            """What stands in front of a cell's line where there is no terminal; cells that are reused take no time."""
+        def place(time_left: float | None) -> str:
+            """What stands in front of a cell's line where there is no terminal."""
             if not shown.disable:
                 return ""
             parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if anew and pending:
-                parts.append(f"{seconds((time.monotonic() - begun) / anew * len(pending))} left")
+            if time_left is not None and pending:
+                parts.append(f"{seconds(time_left)} left")
             return f"[{', '.join(parts)}] "
 
         def update() -> None:
-            nonlocal failed, anew
+            nonlocal failed
             for cell in list(pending.values()):
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    anew += not record["reused"]
+                    left.ended(cell.id)
                     text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
-                    print(place() + text, flush=True)
-            shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
+                    print(place(left.left(time.monotonic() - begun)) + text, flush=True)
+            ended = len(plan.cells) - len(pending)
+            shown.update(progress, completed=ended, said=f"{failed} failed", left=left.left(time.monotonic() - begun))
 
         def follow() -> None:
             while not stop.wait(max(INTERVAL, 1e-3 * len(pending))):
