@@ -1,18 +1,20 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
-from hydra.utils import get_class
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.hints import nearest, renamed
 from bench.rows import LABEL, ROWS, register_resolvers
+from bench.targets import LEAVE, find_class
 from datasets.dataset import Split
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -28,8 +30,7 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-RESERVED = ("_target_", "_package_", "_prior_", "_field_", LABEL, ROWS)  # of a node; its other keys are arguments
-OURS = ("renderers", "datasets", "bench")
+RESERVED = ("_target_", LEAVE, "_prior_", "_field_", LABEL, ROWS)  # of a node; its other keys are arguments
 
 
 class Device(StrEnum):
@@ -110,6 +111,7 @@ class Config:
     time_limit: float | None = MISSING
     memory_limit: float | None = MISSING
     rerun: Rerun = MISSING
+    plan: bool = MISSING
     verbose: bool = MISSING
 
 
@@ -161,27 +163,62 @@ def check_top_level(config: DictConfig) -> None:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
 
 
-def build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str] = (), target: str = "") -> Any:
+def build(
+    node: DictConfig,
+    name: str,
+    packages: tuple[str, ...] | list[str] = (),
+    target: str = "",
+    *,
+    role: type | None = None,
+) -> Any:
     """The object that a YAML node describes: its `_target_`, or `target`, with its other keys as arguments.
 
     Args:
-        node: the node. Its key `_package_` names one more package that its `_target_` may name.
-        name: what it is called in the configuration, for errors.
+        node: the node. Of the renderer, its key `_package_` names one more package that its `_target_` may name.
+        name: what it is called in the configuration, for errors, and for what its class must be; see `bench.targets`.
         packages: packages of the user's that a `_target_` may name, beside ours.
-        target: the class of a node that has no `_target_`.
+        target: the class of a node that has no `_target_`; that of one that has must be this class or extend it.
+        role: what the class must be, where the name does not say it.
 
     Raises:
-        ValueError: for an unknown package, class, key or a value of the wrong type.
+        ValueError: for an unknown package, a class that may not be used, an unknown key or a value of the wrong type.
     """
+    if _made is None or "." in name:
+        return _build(node, name, packages, target, role)
+    key = (id(node), name, *packages)
+    if key not in _made:
+        try:
+            _made[key] = node, _build(node, name, packages, target, role), None
+        except ValueError as error:
+            _made[key] = node, None, error
+    _, made, error = _made[key]
+    if error is not None:
+        raise error
+    return made
+
+
+_made: dict[tuple[Any, ...], tuple[DictConfig, Any, ValueError | None]] | None = None  # within `built_once`
+
+
+@contextmanager
+def built_once() -> Iterator[None]:
+    """Within it, a node is built once, whatever asks for it again; for checks, since a run's objects are its own."""
+    global _made
+    _made = {}
+    try:
+        yield
+    finally:
+        _made = None
+
+
+def _build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str], target: str, role: type | None) -> Any:
     if OmegaConf.is_missing(node, "_target_"):
         raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
+    if role is None and target:
+        role = find_class(target, name, packages, object)
     path = node.get("_target_", target)
-    if path.split(".")[0] not in (*OURS, *packages, node.get("_package_")):
-        raise ValueError(f"{name}._target_ names {path!r}: add its package by packages=[{path.split('.')[0]}]")
-    try:
-        cls = get_class(path)
-    except Exception as error:
-        raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}") from error
+    leave = [str(node[LEAVE])] if name == "renderer" and LEAVE in node else []
+    cls = find_class(path, name, [*packages, *leave], role)
     for key in node:
         if OmegaConf.is_missing(node, key):
             raise ValueError(f"{name}.{key} must be given: set {name}.{key}=...")
@@ -206,8 +243,9 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     if not path.is_file():
         known = [file.stem for file in (CONF / group).glob("*.yaml")]
         raise ValueError(f"unknown {group} {name!r}{nearest(name, known)}")
-    package = {"_package_": arguments.get("_target_", "").split(".")[0]}  # who names a class in Python trusts it
-    return build(OmegaConf.merge(_with_defaults(path), arguments, package), group)  # type: ignore[arg-type]
+    node = cast(DictConfig, OmegaConf.merge(_with_defaults(path), arguments))
+    node.pop(LEAVE, None)
+    return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # who names a class in Python trusts it
 
 
 def _with_defaults(path: Path) -> DictConfig:
@@ -240,7 +278,7 @@ def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | li
     values: Any = OmegaConf.to_container(flat)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
     values |= {
-        key: build(arguments[key], f"{name}.{key}", packages, target=_path(found) if found else "")
+        key: build(arguments[key], f"{name}.{key}", packages, _path(found) if found else "", role=found or types[key])
         for key, found in nested.items()
     }
     for item in fields(cls):

@@ -7,10 +7,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import Protocol, runtime_checkable
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 PLAIN = 15.0  # seconds between two printed lines of a phase, where there is no terminal
 HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may take minutes each
@@ -44,6 +54,15 @@ def notices_to(receive: Callable[[str], None]) -> None:
     _receive = receive
 
 
+class _Left(TimeRemainingColumn):
+    """The time left: the one that a task says, in seconds under `left`, or else one by its speed so far."""
+
+    def render(self, task: Task) -> Text:
+        if (left := task.fields.get("left")) is None:
+            return super().render(task)
+        return Text(str(timedelta(seconds=round(left))), style="progress.remaining")
+
+
 _shown: Progress | None = None  # the display of this process, shared by the lines of a sweep and of its run
 
 
@@ -61,7 +80,7 @@ def display() -> Iterator[Progress]:
         TextColumn("{task.fields[said]}", markup=False),
         TimeElapsedColumn(),
         TextColumn("left"),
-        TimeRemainingColumn(),
+        _Left(),
     )
     console = Console(stderr=True)
     with Progress(

@@ -39,7 +39,7 @@ def find_meshes(path: str | Path) -> list[Path]:
         siblings = [file.name for file in path.parent.iterdir()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, n=1)
         remedy = f"did you mean '{path.parent / near[0]}'?" if near else "check the spelling and the current folder"
-        raise ValueError(f"path: must be a mesh file or a folder of them, found nothing at '{path}'; {remedy}")
+        raise ValueError(f"dataset.path must be a mesh file or a folder of them, found nothing at '{path}'; {remedy}")
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(
             f"path: a mesh file must end in one of {known}, found '{path.name}'; export it in one of these formats"

@@ -22,7 +22,19 @@ FORBIDDEN = {  # what the modules of a package may not import
 }
 # The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
 ROOMS = (
-    *("hints", "rows", "config", "progress", "records", "machine", "trackers", "shape_prior", "setup", "evaluate"),
+    *(
+        "hints",
+        "rows",
+        "targets",
+        "config",
+        "progress",
+        "records",
+        "machine",
+        "trackers",
+        "shape_prior",
+        "setup",
+        "evaluate",
+    ),
     *("pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks", "run", "report"),
 )
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from bench.machine.processor import cpu_name
 from bench.records.record import Record
 from renderers.fields.bfloat16 import multiplies_faster
 
@@ -45,7 +46,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
         "torch": torch.__version__,  # with its build, which the package of some builds leaves out of its own version
         "platform": platform.platform(),
-        "cpu": _cpu_name(),
+        "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
@@ -194,14 +195,6 @@ def _resident(field: str) -> int | None:
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024
     return None
-
-
-def _cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def _git(*arguments: str) -> str:

@@ -15,8 +15,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import file_lock, write_text
+from bench.records.files import file_lock, leads_out, link_out, write_text
 from bench.records.folder import content_of, put_into, set_aside
+from bench.records.read import check_links
 from bench.records.record import read_record
 from bench.report.write.html import write_index
 
@@ -57,6 +58,8 @@ class Attempt:
 def merge(sources: list[Path], into: Path) -> list[str]:
     """Copies all runs and plans of the sources to `into`; gives a line for each cell that has more than one run.
 
+    A run with a link that leads out of its results folder is not copied, and has a line too.
+
     Raises:
         ValueError: for a source that is not a results folder, or that contains `into`.
     """
@@ -67,17 +70,22 @@ def merge(sources: list[Path], into: Path) -> list[str]:
     for source in sources:
         if source in into.parents:
             raise ValueError(f"{into} lies within {source}: give --into a folder outside of all sources")
+    check_links(into)
     (into / "runs").mkdir(parents=True, exist_ok=True)
+    lines: list[str] = []
     cells: dict[str, dict[str, Attempt]] = {}
     for results in dict.fromkeys([*sources, into]):
         for attempt in _attempts(results):
+            if link := link_out(attempt.folder, results):
+                lines.append(f"{attempt.folder}: not copied, since {link} is a link out of its results folder")
+                continue
             same = cells.setdefault(attempt.cell, {})
             known = same.get(attempt.content)
             if known is None or attempt.requested > known.requested:  # the same run, requested again
                 same[attempt.content] = attempt
     for source in sources:
         _copy_plans(source, into)
-    return [line for cell in sorted(cells) if (line := _place(cell, list(cells[cell].values()), into))]
+    return lines + [line for cell in sorted(cells) if (line := _place(cell, list(cells[cell].values()), into))]
 
 
 def _attempts(results: Path) -> list[Attempt]:
@@ -114,6 +122,8 @@ def _place(cell: str, attempts: list[Attempt], into: Path) -> str:
 def _copy_plans(source: Path, into: Path) -> None:
     """Copies all plans; of two with the same name, which have the same cells, the one requested last is kept."""
     for path in sorted((source / "sweeps").glob("*/plan.json")):
+        if leads_out(path, source):
+            continue
         place = into / "sweeps" / path.parent.name / "plan.json"
         mine, theirs = ((str(_json(p).get("asked", "")), p.read_bytes() if p.exists() else b"") for p in (place, path))
         if theirs > mine:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,33 @@ def file_lock(folder: Path, name: str) -> FileLock:
     locks = folder / ".locks"
     locks.mkdir(parents=True, exist_ok=True)
     return FileLock(locks / name)
+
+
+def leads_out(path: Path, root: Path) -> bool:
+    """Whether a path lies outside of a folder once links are followed; a results folder may be somebody else's."""
+    return not path.resolve().is_relative_to(root.resolve())
+
+
+def link_out(folder: Path, root: Path) -> str:
+    """The name of the first link that leads out of `root`: the folder's own, or one in it at any depth; else empty."""
+    if folder.is_symlink() and leads_out(folder, root):
+        return folder.name
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    if leads_out(Path(entry), root):
+                        return entry.name
+                elif entry.is_dir(follow_symlinks=False) and (found := link_out(Path(entry), root)):
+                    return f"{entry.name}/{found}"
+    except OSError:  # who reads it will say why it cannot be read
+        return ""
+    return ""
+
+
+def is_plain_name(text: Any) -> bool:
+    """Whether it can be the name of a file or folder in a given folder, and of nothing elsewhere."""
+    return isinstance(text, str) and re.fullmatch(r"[^./\\\0][^/\\\0]*", text) is not None
 
 
 def digest(data: Any) -> str:

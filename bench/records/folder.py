@@ -15,10 +15,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import OURS, Rerun
-from bench.records.files import digest, file_lock, to_json
+from bench.config import Rerun
+from bench.records.files import digest, file_lock, leads_out, link_out, to_json
 from bench.records.record import NEUTRAL_KEYS, RunStatus, read_record
 from bench.rows import own_row
+from bench.targets import OURS
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
@@ -32,8 +33,8 @@ PASSIVE = (
         "bench/turntable",
         "bench/progress.py",
     ),
-    *("bench/run/sweep.py", "bench/run/summary.py"),
-    *("bench/records/format.py", "bench/records/read.py"),
+    *("bench/run/check.py", "bench/run/plan.py", "bench/run/sweep.py", "bench/run/summary.py"),
+    *("bench/records/expected.py", "bench/records/format.py", "bench/records/read.py"),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
@@ -41,7 +42,7 @@ FILE_KEYS = ("path", "image_path", "mask_path")  # of files that a run reads
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"
-DECIDING = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun"}  # whether a run that failed would fail again
+DECIDING = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan"}  # whether a run that failed would fail again
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,14 @@ def claimed(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterator[Cla
 
     Raises:
         OSError: where the results folder cannot be written.
+        ValueError: where a link in it leads to another folder.
     """
     folder = results_dir / "runs" / identity.name
+    for path in (folder, results_dir / "earlier", results_dir / ".locks" / identity.name):
+        if leads_out(path, results_dir):
+            raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
+    if link := link_out(folder, results_dir):
+        raise ValueError(f"{folder / link} is a link out of the results folder: remove that folder")
     with file_lock(results_dir, identity.name):
         record = reusable(folder, identity, rerun)
         if record is None:

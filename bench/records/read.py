@@ -6,10 +6,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import to_json, write_text
+from bench.records.files import is_plain_name, leads_out, link_out, to_json, write_text
 from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, started
 
 PLAN = "plan.json"
+FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks")  # of a results folder
+TEXTS = ("id", "task", "renderer", "dataset", "method")  # of a planned cell
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,14 @@ class Plan:
         """The folder of the plan; the same sweep has the same folder."""
         return self.results_dir / "sweeps" / self.name
 
+    def differing(self, cell: PlannedCell) -> list[str]:
+        """The overrides of a cell that not all cells have."""
+        common = set.intersection(*(set(one.overrides) for one in self.cells))
+        return [override for override in cell.overrides if override not in common]
+
     def write(self) -> None:
         """Writes `plan.json`."""
+        check_links(self.results_dir)
         self.folder.mkdir(parents=True, exist_ok=True)
         plain = {"schema": SCHEMA, "name": self.name, "asked": self.asked, "cells": [asdict(c) for c in self.cells]}
         write_text(self.folder / PLAN, to_json(plain))
@@ -60,6 +68,8 @@ def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     plans, problems = [], []
     for path in sorted((results_dir / "sweeps").glob(f"*/{PLAN}")):
         try:
+            if leads_out(path, results_dir):
+                raise ValueError("it is a link out of the results folder")
             plan = json.loads(path.read_text(encoding="utf-8"))
             if plan["schema"] != SCHEMA:
                 raise ValueError(f"schema must be {SCHEMA}, found {plan['schema']!r}")
@@ -68,6 +78,8 @@ def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
             cells = [{"method": ""} | {name: cell[name] for name in names if name in cell} for cell in plan["cells"]]
             if any(len(cell) < len(names) for cell in cells):
                 raise ValueError(f"each cell must have {', '.join(names)}")
+            if not all(_sound(cell) for cell in cells):
+                raise ValueError("each cell's id must be the name of a folder, and its config an object")
             plans.append({"name": plan["name"], "asked": plan["asked"], "cells": cells})
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             problems.append(f"sweeps/{path.parent.name}/{PLAN}: {error!r}")
@@ -81,13 +93,17 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     have no folder are among the records, with the status `not_run` and no numbers.
 
     Raises:
-        ValueError: if `results_dir` is not a folder.
+        ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
     """
     if not results_dir.is_dir():
         raise ValueError(f"results_dir must be an existing folder, found {results_dir}; make a run there first.")
+    check_links(results_dir)
     records, problems = [], []
     folders = [f for f in sorted((results_dir / "runs").glob("*")) if f.is_dir() and not f.name.startswith(".")]
     for folder in folders:
+        if link := link_out(folder, results_dir):
+            problems.append(f"{folder.name}: not read, since {link} is a link out of the results folder")
+            continue
         try:
             records.append(read_record(folder))
         except FileNotFoundError:
@@ -100,6 +116,24 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     records.extend(missing.values())
     records.sort(key=started, reverse=True)
     return records, problems + unread
+
+
+def check_links(results_dir: Path) -> None:
+    """Checks that what is written to a results folder stays in it: it may be somebody else's, with links in it.
+
+    Raises:
+        ValueError: where one of its folders, a file of it or one of its tables is a link that leads out.
+    """
+    entries = [*results_dir.glob("*"), *(results_dir / "paper").glob("*"), *(results_dir / name for name in FOLDERS)]
+    for path in entries:
+        if path.is_symlink() and (path.name in FOLDERS or not path.is_dir()) and leads_out(path, results_dir):
+            raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
+
+
+def _sound(cell: dict[str, Any]) -> bool:
+    """Whether the fields of a planned cell have their types, and its id leads to no other folder."""
+    texts = all(isinstance(cell[name], str) for name in TEXTS)
+    return texts and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
 
 
 def _not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:

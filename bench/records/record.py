@@ -13,7 +13,10 @@ from bench.records.files import decoded, to_json, write_text
 SCHEMA = 1
 # Keys of a configuration that change no result, and are left out of its hash.
 NEUTRAL_KEYS = frozenset(
-    ("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun", "tracker")
+    (
+        *("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun"),
+        *("tracker", "plan"),
+    )
 )
 NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
 LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked")  # fields that old records may lack

@@ -10,14 +10,18 @@ from pathlib import Path
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, check_names, register
 from bench.hints import nearest, renamed
+from bench.run.check import check_apart
+from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
+from bench.targets import check_targets
 
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
 USAGE = 2  # exit status of a command line that asks for what there is not
@@ -41,6 +45,9 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
         begun.append(config)
         try:
             check_names(config)
+            chosen = HydraConfig.get()
+            check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
+            check_apart(config)
             job(config)
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
@@ -89,6 +96,8 @@ def _call(program: Callable[[], None]) -> None:
     try:
         program()
         raise_if_stopped()  # also where a library swallowed it
+    except Shown:
+        return
     except (Refused, Exception) as error:
         if stopped := stopped_by(error):
             raise KeyboardInterrupt(stopped) from error

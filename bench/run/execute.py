@@ -72,7 +72,7 @@ def execute(
     log = _open_log(folder)
     contention = Contention()
     try:
-        task, inputs = _built(config, record.task, progress)
+        task, inputs = built(config, progress)
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         checkpoint(record)
@@ -98,8 +98,8 @@ def execute(
         _close_log(log)
 
 
-def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunInputs]:
-    """The task of that name and its inputs, before anything slow.
+def built(config: DictConfig, progress: Report) -> tuple[Task, RunInputs]:
+    """The task and its inputs, before anything slow.
 
     Raises:
         BadInput: for anything invalid in the configuration.
@@ -111,7 +111,7 @@ def _built(config: DictConfig, name: str, progress: Report) -> tuple[Task, RunIn
             raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/task.py")
         inputs = set_up(config, progress)
         if not inputs.field.of_prior and not isinstance(task, TakesField):
-            raise ValueError(f"task={name} does not take field={config.field}: leave it out")
+            raise ValueError(f"the task {type(task).__name__} does not take field={config.field}: leave it out")
     except (ValueError, OSError) as error:
         raise BadInput(_one_line(error)) from error
     return task, inputs

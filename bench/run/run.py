@@ -14,9 +14,12 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import Isolation, build, register
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
-from bench.records.folder import Claim, Identity, claimed, identify, release
+from bench.records.folder import Claim, Identity, claimed, identify, release, reusable
+from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus, now, read_record
+from bench.run.check import refusals
 from bench.run.command import unwritten
+from bench.run.plan import show_plan
 from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
@@ -49,6 +52,10 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     register()  # again, since a launcher's worker has not read the command line
     _stay_in_place(config)
     single = OmegaConf.is_missing(HydraConfig.get().job, "num")
+    if single and (config.plan or config.isolation == Isolation.process):  # a sweep's cells were checked before
+        _check(config)
+    if config.plan:
+        return RunStatus.OK
     try:
         folder, record = run(config)
     except Interrupted as error:
@@ -66,6 +73,22 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     if single:
         show(folder, record, write_index(folder.parent.parent))
     return record.status
+
+
+def _check(config: DictConfig) -> None:
+    """Checks a run that is not there yet, before it has a folder; with plan=true, says what it will take.
+
+    Raises:
+        ValueError: where it would be refused.
+    """
+    identity = identify(config, HydraConfig.get().runtime)
+    results_dir = Path(config.results_dir)
+    reused = reusable(results_dir / "runs" / identity.name, identity, config.rerun) is not None
+    if not reused and (reason := refusals([identity.config], config.isolation)[0]):
+        raise ValueError(reason)
+    if config.plan:
+        cell = PlannedCell(identity.name, [], **identity.choices, seed=identity.config["seed"], config=identity.config)
+        show_plan(Plan("", results_dir, [cell]), {cell.id} if reused else set(), 1)
 
 
 def _stay_in_place(config: DictConfig) -> None:

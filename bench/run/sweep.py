@@ -1,5 +1,6 @@
 """Plans a sweep before its first cell starts, and prints a line as each cell ends."""
 
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -14,13 +15,17 @@ from hydra.experimental.callback import Callback
 from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import check_names
+from bench.config import Isolation, Rerun, check_names
 from bench.progress import display
+from bench.records.expected import Remaining
 from bench.records.files import digest
-from bench.records.folder import identify
+from bench.records.folder import identify, reusable
 from bench.records.format import number, seconds
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
+from bench.run.check import check_apart, check_plan, identity_of, warm_up
+from bench.run.plan import Shown, remaining, show_plan
+from bench.targets import check_targets
 
 SHOWN = (  # metric, its name in the line of a cell, factor
     ("recommended_field", "recommended", 1.0),
@@ -45,11 +50,11 @@ class Sweep:
     shown = ExitStack()
 
     @classmethod
-    def start(cls, plan: Plan) -> None:
+    def start(cls, plan: Plan, left: Remaining) -> None:
         """Writes and keeps the plan, and shows the sweep's progress from now on."""
         plan.write()
         cls.plan = plan
-        cls.shown.enter_context(followed(plan))
+        cls.shown.enter_context(followed(plan, left))
 
     @classmethod
     def end(cls) -> None:
@@ -67,7 +72,15 @@ class Planner(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Plans the sweep and starts to follow it."""
         try:
-            Sweep.start(make_plan(config))
+            if config.isolation == Isolation.process:
+                warm_up()
+            plan, launcher = make_plan(config), config.hydra.runtime.choices["hydra/launcher"]
+            reused, workers = {cell.id for cell in plan.cells if is_reused(plan, cell)}, workers_of(config)
+            check_plan(plan, launcher, reused)
+            if config.plan:
+                show_plan(plan, reused, workers)
+                raise Shown
+            Sweep.start(plan, remaining(plan, reused, workers))
         except Exception as error:
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
@@ -86,11 +99,18 @@ def make_plan(config: DictConfig) -> Plan:
     """
     loader = GlobalHydra.instance().config_loader()
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
+    typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
     cells: list[PlannedCell] = []
     for cell in combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task]):
         composed = loader.load_sweep_config(config, cell)
         plain = _without_hydra(composed)
         check_names(plain)
+        by_hand = [override for override in cell if _key(override) in typed]
+        check_targets(plain, by_hand, composed.hydra.runtime.choices.get("renderer", ""))
+        try:
+            check_apart(plain)
+        except ValueError as error:
+            raise ValueError(f"cell {len(cells) + 1} ({' '.join(cell)}): {error}; nothing was run") from error
         identity = identify(plain, composed.hydra.runtime)
         cells.append(
             PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
@@ -102,6 +122,20 @@ def make_plan(config: DictConfig) -> Plan:
     return Plan(name, Path(first["results_dir"]), cells)
 
 
+def is_reused(plan: Plan, cell: PlannedCell) -> bool:
+    """Whether a cell's finished run is there already, and will be reused."""
+    folder = plan.results_dir / "runs" / cell.id
+    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
+
+
+def workers_of(config: DictConfig) -> int:
+    """How many cells the launcher runs at a time, as far as its settings say so."""
+    for key in ("n_jobs", "array_parallelism"):  # of joblib, and of submitit
+        if (count := OmegaConf.select(config, f"hydra.launcher.{key}")) is not None:
+            return max(int(count), 1) if count > 0 else os.cpu_count() or 1
+    return 1
+
+
 def combinations(texts: list[str]) -> list[list[str]]:
     """The overrides of each cell, from those of a sweep, such as `seed=0,1`, in the order in which Hydra runs them.
 
@@ -109,6 +143,10 @@ def combinations(texts: list[str]) -> list[list[str]]:
     """
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     return BasicSweeper.split_arguments(parser.parse_overrides(texts), None)[0]
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")
 
 
 def _without_hydra(config: DictConfig) -> DictConfig:
@@ -119,38 +157,36 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 @contextmanager
-def followed(plan: Plan) -> Iterator[None]:
+def followed(plan: Plan, left: Remaining) -> Iterator[None]:
     """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
 
     It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
     """
     with display() as shown:
-        progress = shown.add_task("sweep", total=len(plan.cells), said="")
+        progress = shown.add_task("sweep", total=len(plan.cells), said="", left=left.left(0.0))
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
-        begun, anew = time.monotonic(), 0
+        begun = time.monotonic()
 
-        common = set.intersection(*(set(cell.overrides) for cell in plan.cells))
-
-        def place() -> str:
-            """What stands in front of a cell's line where there is no terminal; cells that are reused take no time."""
+        def place(time_left: float | None) -> str:
+            """What stands in front of a cell's line where there is no terminal."""
             if not shown.disable:
                 return ""
             parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if anew and pending:
-                parts.append(f"{seconds((time.monotonic() - begun) / anew * len(pending))} left")
+            if time_left is not None and pending:
+                parts.append(f"{seconds(time_left)} left")
             return f"[{', '.join(parts)}] "
 
         def update() -> None:
-            nonlocal failed, anew
+            nonlocal failed
             for cell in list(pending.values()):
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    anew += not record["reused"]
-                    differing = " ".join(override for override in cell.overrides if override not in common)
-                    text = line(plan.results_dir / "runs" / cell.id, record, differing)
-                    print(place() + text, flush=True)
-            shown.update(progress, completed=len(plan.cells) - len(pending), said=f"{failed} failed")
+                    left.ended(cell.id)
+                    text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
+                    print(place(left.left(time.monotonic() - begun)) + text, flush=True)
+            ended = len(plan.cells) - len(pending)
+            shown.update(progress, completed=ended, said=f"{failed} failed", left=left.left(time.monotonic() - begun))
 
         def follow() -> None:
             while not stop.wait(max(INTERVAL, 1e-3 * len(pending))):

@@ -128,6 +128,8 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     """
     values: Any = OmegaConf.to_container(renderer, resolve=True)
     requested = [name for name, value in values.items() if value == AUTO]
+    if not requested:
+        return renderer, []
     for name in requested:
         if name not in FORMULAS:
             known = ", ".join(FORMULAS)

@@ -22,7 +22,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
-from bench.single_view.own_image import best_view, read_picture
+from bench.single_view.own_image import best_view, check_files, read_picture
 from bench.single_view.search import MaskSearch
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
@@ -113,6 +113,7 @@ class OneImage:
             raise ValueError(f"task.image_path needs task.method=network, not {self.method}: a picture has no truth")
         if self.mask_path is not None and self.image_path is None:
             raise ValueError("task.mask_path is the mask of a picture: give task.image_path as well")
+        check_files(self.image_path, self.mask_path)
 
     @property
     def knows_colours(self) -> bool:

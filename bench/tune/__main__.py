@@ -6,17 +6,20 @@ on the validation shapes, of those with the fewest failures; the test shapes tak
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 
-from bench.records.files import write_text
+from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import read_records
 from bench.report.data.experiments import Experiment, choose
 from bench.report.data.tuning import SPACE, TUNING, Tuning, left_out, tunings, unfinished
 
+DRAWN = ("task", "renderer")  # nodes whose keys a search space may draw
 HEAD = """# @package _global_
 # Draw {draw} of {draws} of method/space/{method}: geometric mean of Chamfer x 1000 on {runs} validation runs
 # at scale={scale} of {families}: {best}, of the median draw {middle}.
@@ -49,6 +52,11 @@ def write(results_dir: Path, folder: Path) -> list[str]:
             f"draw {found[0].draws[0]} alone has a run on every shape for every method, and one is no choice: type the "
             "command of the sweep again, it makes the others"
         )
+    for method in found:
+        if not is_plain_name(method.method):
+            raise ValueError(
+                f"runs name the method {method.method!r}, which is no name of a file: leave these runs out"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     lines = left_out(experiment, found)
     for method in found:
@@ -70,14 +78,19 @@ def _text(method: Tuning, experiment: Experiment) -> str:
         runs=method.validation.shape[1],
         best=number(np.exp(method.scores[method.best])),
         middle=number(np.exp(np.median(method.scores))),
-        scale=" and ".join(sorted({record["config"]["scale"]["name"] for record in records})),
-        families=" and ".join(sorted({record["config"]["dataset"]["name"] for record in records})),
-        commit=" and ".join(sorted(commits)),
+        scale=_names(record["config"]["scale"]["name"] for record in records),
+        families=_names(record["config"]["dataset"]["name"] for record in records),
+        commit=_names(commits),
     )
     node = OmegaConf.create({"label": f"{method.label}, tuned"})
     for name, value in method.settings[method.best].items():
         OmegaConf.update(node, name, value)
     return head + OmegaConf.to_yaml(node)
+
+
+def _names(found: Iterable[Any]) -> str:
+    """Names from records in one line, so that none of them writes a line of its own into the file."""
+    return " and ".join(sorted({" ".join(str(name).split()) for name in found}))
 
 
 def main(arguments: list[str]) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from bench.records.files import leads_out
 from bench.records.record import read_record
 from bench.turntable.turntable import PARTS, Turn, turntable
 from datasets.mesh import Mesh, normalise
@@ -143,6 +144,9 @@ def main(arguments: list[str] | None = None) -> int:
             better = into.parent / f"{into.stem or 'turn'}.webp"
             raise ValueError(f"--into must end in .webp or .gif, found '{into}'; type --into {better}")
         turn = Turn(given.frames, given.size, given.elevation, tuple(word.strip() for word in given.show.split(",")))
+        for file in (into, given.shape / "mesh.ply"):
+            if run and file.parent == given.shape and leads_out(file, given.shape):
+                raise ValueError(f"{file} is a link out of the run folder: remove it")
         mesh, doubts = read_surface(mesh_of_run(given.shape) if run else given.shape)
         frames = [Image.fromarray(frame) for frame in turntable(stand(mesh, given.up), turn)]
         into.parent.mkdir(parents=True, exist_ok=True)

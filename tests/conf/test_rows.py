@@ -16,7 +16,10 @@ from bench.records.record import Record, row_name
 from bench.run import sweep
 from bench.run.command import command_line
 
-CLASS = "class Mine:\n    def __init__(self, size):\n        self.size = size\n"
+CLASS = (
+    "class Mine:\n    def __init__(self, size):\n        self.size = size\n    def render(self, field, rays): ...\n"
+    "    def silhouette_loss(self, field, rays, rendering, mask): ...\n"
+)
 YAMLS = {
     "mine": "_target_: {package}.Mine\nsize: 3\n",
     "mine_first": "defaults: [mine, _self_]\n_label_: Mine, first\n_rows_: {{table1: 0}}\nsize: 4\n",
@@ -48,12 +51,14 @@ def swept(monkeypatch, tmp_path):
     def run(*arguments: str, folder: Path | None = None, launch: bool = False) -> tuple[sweep.Plan, list[DictConfig]]:
         plans, ran = [], []
 
-        def start(plan: sweep.Plan) -> None:
+        def start(plan: sweep.Plan, left: object) -> None:
             plans.append(plan)
             if not launch:
                 raise Planned("planned")
 
         monkeypatch.setattr(sweep.Sweep, "start", start)
+        monkeypatch.setattr(sweep, "check_plan", lambda *_: None)  # the plan is what is looked at
+        monkeypatch.setattr(sweep, "warm_up", lambda: None)
         GlobalHydra.instance().clear()
         options = [] if folder is None else ["--config-dir", str(folder)]
         overrides = [*arguments, "hydra/launcher=basic", "scale=smoke", f"results_dir={tmp_path}/r"]

@@ -82,7 +82,9 @@ def _drive(output: Path, arguments: tuple[str, ...]) -> None:
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(output / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
     server = multiprocessing.forkserver._forkserver
-    server.ensure_running = lambda: None  # its runs come from the server that it came from; Python would start another
+    multiprocessing.forkserver.ensure_running = server.ensure_running = lambda: (
+        None
+    )  # its runs come from the server that it came from; Python would start another
     process.GRACE = PATIENCE / 4  # a run that is stopped on a busy machine takes longer to say how far it came
     sys.argv = ["bench", *arguments]
     sys.exit(main())

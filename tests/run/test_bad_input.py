@@ -133,7 +133,7 @@ def test_a_mask_loss_that_no_task_reads_is_told_before_any_run(bench, tmp_path, 
         ("+renderer.alhpa=1", ("renderer has no key 'alhpa'", "did you mean alpha")),
         ("+renderer.samples=3", ("renderer has no key 'samples'", "renamed, write renderer.n_gradient_samples")),
         ("renderer=custom", ("renderer._target_ must be given", "renderer._target_=PACKAGE.CLASS")),
-        ("renderer._target_=os.system", ("'os.system'", "packages=[os]")),
+        ("renderer._target_=os.system", ("'os.system'", "os is of Python's standard library")),
         ("renderer._target_=renderers.Dist", ("'renderers.Dist'", "cannot be imported")),
         ("view.resolution=-3", ("resolution must be at least 4, not -3", "resolution=64")),
         ("view.resolution=0", ("resolution must be at least 4, not 0", "resolution=64")),
@@ -163,16 +163,7 @@ def test_a_value_that_cannot_be_is_told_before_anything_slow(bench, tmp_path, no
     assert code == 2
     assert_one_line(err, "error: ", *words)
     assert out == ""
-    assert not list((tmp_path / "r" / "runs").iterdir())
-
-
-def test_in_a_sweep_a_value_that_cannot_be_is_a_record(bench, tmp_path):
-    code, *_ = bench("-m", *TINY, "task.optimiser.iterations=1", "renderer.steps=0,50")
-    assert code == 1
-    records = [json.loads(path.read_text()) for path in (tmp_path / "r" / "runs").glob("*/record.json")]
-    assert sorted(record["status"] for record in records)[1:] == ["refused"]
-    (refused,) = [record for record in records if record["status"] == "refused"]
-    assert refused["reason"].startswith("steps must be at least 1, not 0")
+    assert not list((tmp_path / "r" / "runs").glob("*"))
 
 
 def test_more_points_than_pixels_are_told(bench):
@@ -357,7 +348,7 @@ def test_a_real_process_that_is_refused_ends_with_one_line_and_no_folder(tmp_pat
         done = running.ended()
     assert (done.code, done.out) == (2, "")
     assert_one_line(done.err, "error: ", "resolution must be at least 4, not -3")
-    assert not list((tmp_path / "runs").iterdir())
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])

@@ -1,0 +1,152 @@
+"""What runs will take, by the records of like runs: seconds, memory, how sure that is, and a sweep's time left.
+
+Like runs have the same task, scale, renderer, dataset, sizes, processor and threads. Where there are none, one demand
+after another is dropped, as `LADDER` says, and the estimate says which. Runs of another task or scale are never like.
+"""
+
+import statistics
+from collections import defaultdict
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+Record = dict[str, Any]  # as `read_record` gives it; a planned cell has the same fields, but no environment
+FEWEST = 4  # like runs from which on the spread is that of quartiles; below, the least and the largest
+ALWAYS = ("task", "scale")  # demands that are never dropped
+# What is dropped, in this order, and what an estimate then says of the runs that it is from.
+LADDER = (
+    ((), "like runs"),
+    (("dataset",), "runs on other shapes"),
+    (("dataset", "machine"), "runs on other machines or threads"),
+    (("dataset", "machine", "renderer"), "runs of other renderers"),
+    (("dataset", "machine", "renderer", "sizes"), "runs of other sizes"),
+)
+SIZES = ("resolution", "iterations", "steps", "views", "repeats")  # numbers of a task that decide its time
+UNMEASURED = ("killed", "crashed", "refused", "oom", "not_run")  # statuses of runs that did not take their whole time
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a run will take.
+
+    Args:
+        seconds: the median of like runs.
+        low, high: their quartiles; of fewer than `FEWEST` runs the least and the largest.
+        memory: most bytes that one of them took beyond those of its start; None where none says.
+        n: the number of like runs.
+        like: what they have in common with it, in words.
+    """
+
+    seconds: float
+    low: float
+    high: float
+    memory: float | None
+    n: int
+    like: str
+
+
+class Model:
+    """Expects of a run what like runs took."""
+
+    def __init__(self, records: Iterable[Record], cpu: str) -> None:
+        """Learns from records.
+
+        Args:
+            records: those of a results folder.
+            cpu: the name of this machine's processor.
+        """
+        self.cpu = cpu
+        self.known: list[dict[Hashable, list[Record]]] = [defaultdict(list) for _ in LADDER]
+        for record in records:
+            if not _measured(record):
+                continue
+            parts = _parts(record, record["environment"].get("cpu", ""))
+            for (dropped, _), known in zip(LADDER, self.known, strict=True):
+                known[_key(parts, dropped)].append(record)
+
+    def of(self, planned: Record) -> Expected | None:
+        """What a planned run will take on this machine; None where there is no like run."""
+        parts = _parts(planned, self.cpu)
+        for (dropped, words), known in zip(LADDER, self.known, strict=True):
+            if like := known.get(_key(parts, dropped)):
+                return _expected(like, words)
+        return None
+
+
+@dataclass
+class Remaining:
+    """The time left of a sweep: what its cells are expected to take, corrected by what was measured so far.
+
+    Args:
+        cells: what each cell is expected to take, by its id; None where there is no like run. Those that are reused
+            are not among them.
+        workers: how many cells run at a time.
+    """
+
+    cells: dict[str, Expected | None]
+    workers: int
+    done: set[str] = field(default_factory=set)
+
+    def ended(self, cell: str) -> None:
+        """Notes that a cell has ended; one that was reused takes no time."""
+        if cell in self.cells:
+            self.done.add(cell)
+
+    def left(self, elapsed: float) -> float | None:
+        """Seconds left, `elapsed` seconds after the sweep began; None where nothing is known yet."""
+        known = [expected.seconds for expected in self.cells.values() if expected is not None]
+        usual = statistics.mean(known) if known else 1.0  # of a cell without a like run: as long as the others
+        if not known and not self.done:
+            return None
+        weights = {cell: usual if expected is None else expected.seconds for cell, expected in self.cells.items()}
+        ended = sum(weight for cell, weight in weights.items() if cell in self.done)
+        pending = sum(weight for cell, weight in weights.items() if cell not in self.done)
+        # Seconds of the clock for each that was expected; one cell's worth of them is believed from the beginning.
+        believed = usual if known else 0.0
+        return pending * (elapsed * bool(self.done) + believed / self.workers) / (ended + believed)
+
+
+def _measured(record: Record) -> bool:
+    total = record["seconds"].get("total")
+    return record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf")
+
+
+def _expected(like: list[Record], words: str) -> Expected:
+    seconds = sorted(float(record["seconds"]["total"]) for record in like)
+    memory = [r["peak_memory_bytes"] for r in like if isinstance(r.get("peak_memory_bytes"), int | float)]
+    low, high = seconds[0], seconds[-1]
+    if len(seconds) >= FEWEST:
+        low, _, high = statistics.quantiles(seconds, n=4, method="inclusive")
+    return Expected(statistics.median(seconds), low, high, max(memory, default=None), len(seconds), words)
+
+
+def _parts(record: Record, cpu: str) -> dict[str, Any]:
+    """What decides how long a run takes, each part by the name that `LADDER` has for it."""
+    config = record["config"]
+    scale, view = config.get("scale"), config.get("view")
+    sizes = [("view", view.get("resolution"))] if isinstance(view, dict) else []
+    return {
+        "task": record["task"],
+        "scale": scale.get("name") if isinstance(scale, dict) else None,
+        "renderer": (record["renderer"], record.get("method", "")),
+        "dataset": record["dataset"],
+        "sizes": (*sizes, *_numbers(config.get("task"), "")),
+        "machine": (cpu, str(config.get("device")), config.get("threads")),
+    }
+
+
+def _numbers(node: Any, name: str) -> list[tuple[str, Any]]:
+    """The values of the keys `SIZES` below a node, with their dotted names."""
+    if not isinstance(node, dict):
+        return []
+    found: list[tuple[str, Any]] = []
+    for key, value in sorted(node.items(), key=lambda item: str(item[0])):
+        if isinstance(value, dict):
+            found += _numbers(value, f"{name}{key}.")
+        elif key in SIZES and isinstance(value, int | float | str):
+            found.append((f"{name}{key}", value))
+    return found
+
+
+def _key(parts: dict[str, Any], dropped: tuple[str, ...]) -> Hashable:
+    return tuple((name, value) for name, value in parts.items() if name in ALWAYS or name not in dropped)

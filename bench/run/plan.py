@@ -1,0 +1,70 @@
+"""`plan=true`: lists what would run, with the time and the memory that like runs took; runs nothing, writes nothing."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from bench.machine.processor import cpu_name
+from bench.records.expected import Expected, Model, Remaining
+from bench.records.format import seconds, size
+from bench.records.read import Plan, PlannedCell, read_records
+from bench.records.record import row_name
+
+
+class Shown(BaseException):
+    """A plan was shown in place of a sweep. Not an Exception, which Hydra would turn into a warning."""
+
+
+def model_of(results_dir: Path) -> Model:
+    """The model of a results folder's records; it knows nothing where there is no such folder."""
+    records = read_records(results_dir)[0] if results_dir.is_dir() else []
+    return Model(records, cpu_name())
+
+
+def remaining(plan: Plan, reused: set[str], workers: int) -> Remaining:
+    """The time left of a sweep, as it is before its first cell."""
+    model = model_of(plan.results_dir)
+    return Remaining({c.id: model.of(asdict(c)) for c in plan.cells if c.id not in reused}, workers)
+
+
+def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
+    """Prints a line for each cell, and one for the whole plan."""
+    left = remaining(plan, reused, workers)
+    for number, cell in enumerate(plan.cells, 1):
+        about = "reused" if cell.id in reused else told(left.cells[cell.id])
+        print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
+    print(total(plan, left))
+
+
+def named(cell: PlannedCell) -> str:
+    """The task, the row and the dataset of a cell."""
+    return ", ".join((cell.task, row_name(cell.config, cell.renderer), cell.dataset))
+
+
+def told(expected: Expected | None) -> str:
+    """What a run will take, in words."""
+    if expected is None:
+        return "no like run"
+    spread = "" if expected.n == 1 else f", {seconds(expected.low)} to {seconds(expected.high)}"
+    memory = "" if expected.memory is None else f", +{size(expected.memory)}"
+    runs = expected.like.replace("runs", "run") if expected.n == 1 else expected.like
+    return f"about {seconds(expected.seconds)} ({expected.n} {runs}{spread}){memory}"
+
+
+def total(plan: Plan, left: Remaining) -> str:
+    """The sum over a plan's cells, in a line."""
+    known = [expected for expected in left.cells.values() if expected is not None]
+    parts = [f"{len(plan.cells)} planned: {len(left.cells)} to run"]
+    if reused := len(plan.cells) - len(left.cells):
+        parts.append(f"{reused} reused")
+    if unknown := len(left.cells) - len(known):
+        parts.append(f"{unknown} without a like run")
+    text = ", ".join(parts)
+    if not known:
+        return text + ("" if left.cells else "; nothing is left to do")
+    low, high = (sum(getattr(e, end) for e in known) / left.workers for end in ("low", "high"))
+    whole = sum(expected.seconds for expected in known) / left.workers
+    text += f"; about {seconds(whole)} ({seconds(low)} to {seconds(high)}), {left.workers} at a time"
+    if unknown:
+        text += f", and what the {unknown} take"
+    memory = [expected.memory for expected in known if expected.memory is not None]
+    return text + (f"; at most +{size(max(memory))} of memory each" if memory else "")
