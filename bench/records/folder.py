@@ -33,7 +33,7 @@ PASSIVE = (
         "bench/progress.py",
     ),
     *("bench/run/sweep.py", "bench/run/summary.py"),
-    *("bench/records/format.py", "bench/records/read.py"),
+    *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
