@@ -32,7 +32,7 @@ PASSIVE = (
         "bench/turntable",
         "bench/progress.py",
     ),
-    *("bench/run/sweep.py", "bench/run/summary.py"),
+    *("bench/run/sweep.py", "bench/run/summary.py", "bench/run/library.py"),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )

@@ -80,6 +80,11 @@ class Record:
         """Its name in tables: its label, or else that of its renderer, or else the renderer's name."""
         return row_name(self.config, self.renderer)
 
+    @property
+    def folder(self) -> Path:
+        """Its folder, by the results folder of its configuration."""
+        return Path(self.config["results_dir"]) / "runs" / self.id
+
     @classmethod
     def of(cls, data: dict[str, Any]) -> "Record":
         """The record of data that `read_record` has checked; unknown fields are ignored."""

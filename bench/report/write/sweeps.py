@@ -52,7 +52,7 @@ def table_of(sweep: SweepRuns) -> Result:
         f"Sweep {sweep.name}.",
         f"Medians over {OVER}; swept over {_listed(sweep)}.",
         n=f"{len(sweep.runs.records)} runs" if stress else "",
-        interval="95 % bootstrap intervals over shapes",
+        interval="95 % bootstrap intervals over shapes" if headings else "",
         estimates=[line.medians[name] for line in lines for name in headings if name in line.medians],
         remarks=(*_notes(sweep, headings), *definitions(sweep.runs.records, {n: m.label for n, m in headings.items()})),
         data=to_data(_data_columns(names), lines),
