@@ -87,7 +87,7 @@ def write_frame(records: Iterable[dict[str, Any]], results_dir: Path) -> list[Pa
 def _row(record: dict[str, Any]) -> dict[str, Any]:
     """The values of a run by column; a metric that has the name of another column gets `metric_` in front."""
     row = {name: record.get(name) for name in COLUMNS}
-    row |= {name: record["environment"].get(name) for name in MACHINE}
+    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in MACHINE}
     row |= {"name": row_name(record["config"], record["renderer"]), "index": index(record)}
     row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
     for part, prefix in PREFIXES.items():
