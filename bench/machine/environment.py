@@ -8,7 +8,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "commit": _git("rev-parse", "HEAD"),
         "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD")) else "",
+        "implicit_bench": _own_version(),
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
         "torch": torch.__version__,  # with its build, which the package of some builds leaves out of its own version
@@ -197,7 +198,18 @@ def _resident(field: str) -> int | None:
     return None
 
 
+def _own_version() -> str:
+    """The version of this package, of the checkout that was installed last; empty where none was installed."""
+    try:
+        return version("implicit-bench")
+    except PackageNotFoundError:
+        return ""
+
+
 def _git(*arguments: str) -> str:
+    """What git says of our repository; empty where the package is installed, perhaps within one of somebody else's."""
+    if not (ROOT / ".git").exists():
+        return ""
     try:
         return subprocess.run(
             ["git", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=10, check=True

@@ -33,8 +33,8 @@ PASSIVE = (
         "bench/turntable",
         "bench/progress.py",
     ),
-    *("bench/run/check.py", "bench/run/plan.py", "bench/run/sweep.py", "bench/run/summary.py"),
-    *("bench/records/expected.py", "bench/records/format.py", "bench/records/read.py"),
+    *(f"bench/run/{name}.py" for name in ("check", "library", "plan", "summary", "sweep")),
+    *(f"bench/records/{name}.py" for name in ("expected", "format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"

@@ -83,6 +83,11 @@ class Record:
         """Its name in tables: its label, or else that of its renderer, or else the renderer's name."""
         return row_name(self.config, self.renderer)
 
+    @property
+    def folder(self) -> Path:
+        """Its folder, by the results folder of its configuration."""
+        return Path(self.config["results_dir"]) / "runs" / self.id
+
     @classmethod
     def of(cls, data: dict[str, Any]) -> "Record":
         """The record of data that `read_record` has checked; unknown fields are ignored."""
@@ -95,13 +100,14 @@ class Record:
 
 
 def row_name(config: dict[str, Any], renderer: str) -> str:
-    """The name of a run's row: the label of its configuration, or of its renderer's node, or the renderer's name.
-
-    A silhouette loss that is not the renderer's own follows it.
-    """
-    name = config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer
-    loss = (config.get("silhouette") or {}).get("_label_")
+    """The name of a run's row: that of `renderer_name`, with a silhouette loss that is not the renderer's own."""
+    name, loss = renderer_name(config, renderer), (config.get("silhouette") or {}).get("_label_")
     return f"{name}, {loss}" if loss else name
+
+
+def renderer_name(config: dict[str, Any], renderer: str) -> str:
+    """The label of a run's configuration, or of its renderer's node, or the name of the renderer's file."""
+    return str(config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer)
 
 
 def read_record(folder: Path) -> dict[str, Any]:

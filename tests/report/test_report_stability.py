@@ -81,7 +81,7 @@ def test_a_breakdown_stands_with_its_interval_and_theory(tmp_path):
     assert table.table.loc[0, "Axis"] == "wires"
     assert table.table.loc[0, "DIST"] == "0.100 (0.126 to 0.0794)"
     assert "Predicted, wires: DIST 0.125, measured 0.100 (0.126 to 0.0794)." in table.notes
-    worst = "DIST: worst on wires 0.100 (0.126 to 0.0794) scene units."
+    worst = "DIST: worst on wires 0.100 scene units (0.126 to 0.0794)."
     assert f"{worst} Failed trials: 3 missed, 1 spurious." in table.notes
     assert "n = 10 trials in all, of 1 axes and 1 renderers" in table.caption
     assert "25 % of a full grid's" in told(table)
@@ -243,3 +243,11 @@ def test_all_four_are_written(tmp_path):
     ]  # fmt: skip
     for path in written[:3]:
         assert path.with_suffix(".png").stat().st_size > 1000
+
+
+def test_a_row_that_breaks_nowhere_is_told_without_a_worst_axis(tmp_path):
+    broke(tmp_path, "wires", "DIST", 1.1)
+    broke(tmp_path, "wires", "DVR", -0.1)
+    notes = " ".join(made(tmp_path, stability.make).notes)
+    assert "DIST: breaks on none of 1 axes. Failed trials:" in notes
+    assert "DVR: worst on wires at once (5 of 5 failed, 48-100 %" in notes

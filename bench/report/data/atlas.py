@@ -114,23 +114,24 @@ class Cell:
             return "at once" if self.at_once else "none"
         return format.number(self.number("breakdown"))
 
-    def full(self) -> str:
-        """The breakdown with its interval, or the count of failures at an end of the sweep."""
+    def full(self, unit: str = "") -> str:
+        """The breakdown, in its unit where one is given, with its interval, or the failures at an end of the sweep."""
         if not self.known:
             return self.short()
         if not self.falls:
             return f"success rises with severity (mild: {self._count('mild')}; severe: {self._count('severe')})"
+        unit = f" {unit}" if unit else ""
         low, high = self.number("breakdown_low"), self.number("breakdown_high")
         if self.one_trial and not (self.at_once or self.never):
-            return f"{self.short()} (one trial)"
+            return f"{self.short()}{unit} (one trial)"
         if self.at_once:
-            reach = f", up to {format.number(high)}" if high is not None else ""
+            reach = f", up to {format.number(high)}{unit}" if high is not None else ""
             return f"at once ({self._count('mild')}{reach})"
         if self.never:
-            reach = f", from {format.number(low)}" if low is not None else ""
+            reach = f", from {format.number(low)}{unit}" if low is not None else ""
             return f"none ({self._count('severe')}{reach})"
         ends = [format.number(end) if end is not None else "beyond" for end in (low, high)]
-        return f"{self.short()} ({' to '.join(ends)})"
+        return f"{self.short()}{unit} ({' to '.join(ends)})"
 
     def _trials(self, end: str) -> tuple[int, int]:
         """The numbers of successful and of all trials at an end of the sweep."""

@@ -1,39 +1,127 @@
-"""Writes all runs as one table, with a row per run, for pandas or a spreadsheet."""
+"""All runs of a results folder as one table with typed columns, for pandas, a spreadsheet or Parquet."""
 
+import importlib.util
+import os
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-PLAIN = ("folder", "task", "renderer", "dataset", "scene", "seed", "status", "reason", "started")
-NUMBERS = ("peak_memory_bytes", "flops", "gemm_fraction")
-NESTED = ("metrics", "metrics_start", "evaluations", "seconds")
-MACHINE = ("cpu", "device", "threads", "commit", "dirty")
+from bench.records.names import flat
+from bench.records.read import read_records
+from bench.records.record import row_name, started
+from bench.report.data.records import index
+
+TEXT, CATEGORY, WHOLE, NUMBER, TRUTH, TIME = (
+    *("string", "category", "Int64", "Float64", "boolean"),
+    "datetime64[ms, UTC]",
+)
+COLUMNS = {  # that every table has, with their types
+    **{name: TEXT for name in ("folder", "name")},
+    **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene")},
+    **{name: WHOLE for name in ("index", "seed")},
+    "status": CATEGORY,
+    "reason": TEXT,
+    "started": TIME,
+    "reused": TRUTH,
+    **{name: NUMBER for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
+    **{name: CATEGORY for name in ("cpu", "device")},
+    "threads": WHOLE,
+    "commit": CATEGORY,
+    "dirty": TRUTH,
+}
+MACHINE = ("cpu", "device", "threads", "commit", "dirty")  # of the record's environment
+PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
+CONFIG = "config."
+PARQUET = "results.parquet"
+NO_PARQUET = f"{PARQUET} was not written, as it needs pyarrow: pip install 'implicit-bench[parquet]'"
 
 
-def to_frame(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """A row per run, including failed ones; nested values are columns such as `metrics.chamfer_l2`, `config.seed`."""
-    rows = []
-    for record in records:
-        row = {name: record.get(name) for name in (*PLAIN, *NUMBERS)}
-        for part in NESTED:
-            row |= {f"{part}.{name}": value for name, value in record[part].items()}
-        row |= {f"environment.{name}": record["environment"].get(name) for name in MACHINE}
-        row |= _flat(record["config"], "config")
-        rows.append(row)
-    return pd.DataFrame(rows)
+def load(results: str | os.PathLike[str] = "results") -> pd.DataFrame:
+    """All runs of a results folder as a table, a row per run, failed and planned ones included, newest first.
+
+    >>> runs = load("results")
+    >>> runs[["name", "status", "seed"]]
+         name status  seed
+    0  Newton     ok     0
+    >>> bool((runs.chamfer_l2 < runs.start_chamfer_l2).all())
+    True
+
+    Args:
+        results: the folder that the runs' `results_dir` named.
+
+    Returns:
+        The columns of `COLUMNS`, then of each part of the record what its runs have: metrics by their names,
+        `start_NAME` of the start of an optimisation, `seconds_NAME`, `evaluations_NAME`, and `config.KEY` of all
+        settings. What a run lacks is missing (`pandas.NA`); the files of a run are in `runs/FOLDER` of the folder.
+
+    Raises:
+        ValueError: where there is no such folder.
+    """
+    records, problems = read_records(Path(results))
+    if problems:
+        warnings.warn(f"{len(problems)} not read: {'; '.join(problems)}", stacklevel=2)
+    return to_frame(records)
 
 
-def write_frame(records: list[dict[str, Any]], results_dir: Path) -> Path:
-    """Writes `results_dir/runs.csv` and gives its path."""
-    path = results_dir / "runs.csv"
-    to_frame(records).to_csv(path, index=False)
-    return path
+def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
+    """A row per run, with the columns that `load` states."""
+    rows = [_row(record) for record in records]
+    names = dict.fromkeys((*COLUMNS, *sorted({n for row in rows for n in row}, key=_place)))
+    columns = {name: [row.get(name) for row in rows] for name in names}
+    return pd.DataFrame({name: _series(values, _type(name, values)) for name, values in columns.items()})
 
 
-def _flat(node: dict[str, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in node.items():
-        name = f"{prefix}.{key}"
-        flat |= _flat(value, name) if isinstance(value, dict) else {name: value}
-    return flat
+def write_frame(records: Iterable[dict[str, Any]], results_dir: Path) -> list[Path]:
+    """Writes `runs.csv` of a results folder, and `results.parquet` where pyarrow is installed; gives the paths."""
+    frame, table = to_frame(records), results_dir / "runs.csv"
+    frame.to_csv(table, index=False)
+    if importlib.util.find_spec("pyarrow") is None:
+        return [table]
+    frame.to_parquet(results_dir / PARQUET, index=False)
+    return [table, results_dir / PARQUET]
+
+
+def _row(record: dict[str, Any]) -> dict[str, Any]:
+    """The values of a run by column; a metric that has the name of another column gets `metric_` in front."""
+    row = {name: record.get(name) for name in COLUMNS}
+    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in MACHINE}
+    row |= {"name": row_name(record["config"], record["renderer"]), "index": index(record)}
+    row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
+    for part, prefix in PREFIXES.items():
+        named = {f"{prefix}{name}": value for name, value in record[part].items()}
+        row |= {f"metric_{name}" if name in COLUMNS else name: _cell(value) for name, value in named.items()}
+    return row | {name: _cell(value) for name, value in flat(record["config"], CONFIG).items()}
+
+
+def _series(values: list[Any], kind: str) -> pd.Series:
+    """A column of that type; categories are text, also where there are none."""
+    if kind != CATEGORY:
+        return pd.Series(values, dtype=kind)
+    known = pd.Index(sorted({str(value) for value in values if value is not None}), dtype="str")
+    return pd.Series(pd.Categorical(values, categories=known))
+
+
+def _cell(value: Any) -> Any:
+    """A value that a cell can hold: a list becomes text."""
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _place(name: str) -> tuple[int, str]:
+    """Metrics first, then the start's, seconds, evaluations and settings, each by name."""
+    prefixes = [*list(PREFIXES.values())[1:], CONFIG]
+    return next((place for place, prefix in enumerate(prefixes, 1) if name.startswith(prefix)), 0), name
+
+
+def _type(name: str, values: list[Any]) -> str:
+    """The type of a column: of a measured one number, unless it is text; of a setting by its values."""
+    if name in COLUMNS:
+        return COLUMNS[name]
+    kinds = {type(value) for value in values if value is not None}
+    if kinds == {bool}:
+        return TRUTH
+    if kinds == {int} and name.startswith(CONFIG):
+        return WHOLE
+    return NUMBER if kinds <= {int, float} and (kinds or not name.startswith(CONFIG)) else TEXT

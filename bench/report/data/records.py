@@ -1,7 +1,6 @@
 """Reads values from a record: its row, shape, numbers and settings; and groups runs by shape."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,6 +175,6 @@ def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
 
 
 def repeated(records: list[Record]) -> str:
-    """The number of repeats of the times, as text; empty where no record has it."""
-    times = Counter(n for record in records if (n := measured(record, "repeats")) is not None)
-    return " or ".join(f"{int(n)}" for n in sorted(times)) if times else ""
+    """The number of repeats of the times, as text, such as 3, 1 or 3, 1 to 3; empty where no record has it."""
+    times = sorted({int(n) for record in records if (n := measured(record, "repeats")) is not None})
+    return " or ".join(map(str, times)) if len(times) < 3 else f"{times[0]} to {times[-1]}"

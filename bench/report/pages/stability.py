@@ -148,13 +148,15 @@ def _worst(grid: Atlas, row: Row) -> str:
     """A note on a row's mildest breakdowns, runs that did not end ok first, and on the kinds of its failed trials."""
     cells = [(axis, grid.cells[axis, row]) for axis in grid.axes if (axis, row) in grid.cells]
     tried = [(axis, cell) for axis, cell in cells if not cell.unsupported]
-    worst = sorted(tried, key=lambda item: (item[1].level if item[1].known else -math.inf, item[0]))[:WORST]
-    axes = [f"{title(axis)} {cell.full()}{' ' + grid.unit(axis) if cell.known else ''}" for axis, cell in worst]
+    broken = [(axis, cell) for axis, cell in tried if not cell.never]
+    worst = sorted(broken, key=lambda item: (item[1].level if item[1].known else -math.inf, item[0]))[:WORST]
+    axes = [f"{title(axis)} {cell.full(grid.unit(axis))}" for axis, cell in worst]
     kinds: Counter[str] = Counter()
     for _, cell in cells:
         kinds.update(cell.failures())
     failed = ", ".join(f"{count} {style.PIXEL_NAMES.get(kind, kind)}" for kind, count in kinds.most_common())
-    return f"{row.name}: worst on {'; '.join(axes) or 'no axis'}. Failed trials: {failed or 'none'}."
+    said = f"worst on {'; '.join(axes)}" if axes else f"breaks on none of {len(tried)} axes"
+    return f"{row.name}: {said}. Failed trials: {failed or 'none'}."
 
 
 def _predicted(grid: Atlas, axis: str) -> list[tuple[str, Cell, float]]:

@@ -90,7 +90,7 @@ def _setup(experiment: Experiment) -> str:
     sizes = {setting(record["config"], "view", "resolution") for record in experiment.records}
     resolution = sizes.pop() if len(sizes) == 1 else None
     config = experiment.requested()
-    network = setting(config, "prior", "network") or setting(config, "scale", "network")
+    network = setting(config, "prior", "network") or setting(config, "scale", "network") or {}
     layers, width = setting(network, "layers"), setting(network, "width")
     machines = [_machine(*machine) for machine in experiment.machines()]
     parts = {

@@ -38,10 +38,10 @@ def page_names() -> dict[str, tuple[str, str]]:
     """
     places: list[tuple[int, str, str, str]] = []
     for path in PAGES.glob("[!_]*.py"):
-        found = [(suffix.lower(), int(place)) for suffix, place in PLACE.findall(path.read_text(encoding="utf-8"))]
-        if not found:
+        own = [(suffix.lower(), int(place)) for suffix, place in PLACE.findall(path.read_text(encoding="utf-8"))]
+        if not own:
             raise ValueError(f"{path.name} must have a line such as PLACE = 10, its place among the pages; found none")
-        places += [(place, path.stem + suffix, path.stem, f"make{suffix}") for suffix, place in found]
+        places += [(place, path.stem + suffix, path.stem, f"make{suffix}") for suffix, place in own]
     return {name: (module, function) for _, name, module, function in sorted(places)}
 
 
@@ -53,9 +53,9 @@ def write_paper(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
     written = []
     for name, (module, function) in page_names().items():
         page = import_module(f"bench.report.pages.{module}")
-        found = [choose(records, selection, results_dir) for selection in page.READS]
-        if any(experiment is not None for experiment in found):
-            written.append(write(getattr(page, function)(*found), results_dir / FOLDER / name)[0])
+        chosen = [choose(records, selection, results_dir) for selection in page.READS]
+        if any(experiment is not None for experiment in chosen):
+            written.append(write(getattr(page, function)(*chosen), results_dir / FOLDER / name)[0])
     return written
 
 
@@ -67,7 +67,7 @@ def find_paper(results_dir: Path) -> list[dict[str, Any]]:
     folder = results_dir / FOLDER
     seen = {path.stem for path in folder.glob("*") if path.suffix in (*SUFFIXES, ".png") and path.is_file()}
     names = [*(name for name in page_names() if name in seen), *sorted(seen - {*page_names()})]
-    return [_found(folder, name) for name in names if not name.startswith(".")]
+    return [found(folder, name, (FOLDER,)) for name in names if not name.startswith(".")]
 
 
 def write_readme(results_dir: Path) -> Path | None:
@@ -75,19 +75,20 @@ def write_readme(results_dir: Path) -> Path | None:
 
     Gives its path; None where `results_dir/paper` has no table or figure.
     """
-    found = [page for page in find_paper(results_dir) if page["title"]]
-    if not found:
+    pages = [page for page in find_paper(results_dir) if page["title"]]
+    if not pages:
         return None
-    contents = [f"- [{page['title'].rstrip('.')}](#{page['name']})" for page in found]
-    parts = [_section(results_dir / FOLDER / f"{page['name']}.md", page["name"]) for page in found]
+    contents = [f"- [{page['title'].rstrip('.')}](#{page['name']})" for page in pages]
+    parts = [_section(results_dir / FOLDER / f"{page['name']}.md", page["name"]) for page in pages]
     path = results_dir / "README.md"
     write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
     return path
 
 
-def _found(folder: Path, name: str) -> dict[str, Any]:
+def found(folder: Path, name: str, place: tuple[str, ...]) -> dict[str, Any]:
+    """The contents of the table or figure of that name, whose folder is at a place in the results folder."""
     files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
-    links = {suffix: link(FOLDER, path.name) for suffix, path in files.items() if path.is_file()}
+    links = {suffix: link(*place, path.name) for suffix, path in files.items() if path.is_file()}
     text = files[".md"].read_text(encoding="utf-8", errors="replace") if ".md" in links else ""
     picture = links.get(".png")
     links.pop(".png", None)

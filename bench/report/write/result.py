@@ -89,12 +89,15 @@ class Result:
         return [*caption.warnings(self.experiment), *own]
 
 
-def write(result: Result, base: Path) -> list[Path]:
-    """Writes `base.csv` and `.md`, and where there is content `.tex`, `.png`, `.pdf`, `.html`; gives the paths."""
+def write(result: Result, base: Path, *, name: str = "") -> list[Path]:
+    """Writes `base.csv` and `.md`, and where there is content `.tex`, `.png`, `.pdf`, `.html`; gives the paths.
+
+    LaTeX has the label `tab:NAME`, by default that of the files.
+    """
     base.parent.mkdir(parents=True, exist_ok=True)
     texts = {".csv": result.data.to_csv(index=False), ".md": markdown(result, base.name)}
     if result.table is not None:
-        texts[".tex"] = latex(result, base.name)
+        texts[".tex"] = latex(result, name or base.name)
     for suffix, text in texts.items():
         base.with_suffix(suffix).write_bytes(text.encode("utf-8", "backslashreplace"))
     drawn = [base.with_suffix(suffix) for suffix in (".png", ".pdf")] if result.figure is not None else []
@@ -114,7 +117,7 @@ def markdown(result: Result, name: str) -> str:
     parts = [f"**{_md(result.title)}** {_md(result.caption)}"]
     if result.table is not None:
         head, *rows = ([_md(cell) for cell in row] for row in (result.table.columns, *result.table.to_numpy()))
-        rule = ["---", *["---:"] * (len(head) - 1)]
+        rule = ["---" if of_words else "---:" for of_words in _of_words(result.table)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if result.figure is not None:
         parts.append(f"![{_md(result.title)}]({name}.png)")
@@ -133,7 +136,7 @@ def latex(result: Result, name: str) -> str:
         rf"\label{{tab:{name}}}",
         r"\scriptsize",
         r"\setlength{\tabcolsep}{2pt}",
-        rf"\begin{{tabular}}{{@{{}}l{'r' * (table.shape[1] - 1)}@{{}}}}",
+        rf"\begin{{tabular}}{{@{{}}{''.join('l' if of_words else 'r' for of_words in _of_words(table))}@{{}}}}",
         r"\toprule",
         *_latex_rows(list(zip(*map(_two_lines, table.columns), strict=True))),
         r"\midrule",
@@ -145,6 +148,15 @@ def latex(result: Result, name: str) -> str:
         lines += [r"\par\smallskip", r"\begin{flushleft}"]
         lines += [rf"{_tex(note)}\par" for note in result.notes] + [r"\end{flushleft}"]
     return "\n".join([*lines, r"\end{table*}"]) + "\n"
+
+
+def _of_words(table: pd.DataFrame) -> list[bool]:
+    """Of each column, whether it is aligned to the left: the first one, and others without a digit but with a word."""
+    texts = [" ".join(map(str, table.iloc[:, place])) for place in range(table.shape[1])]
+    return [
+        place == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
+        for place, text in enumerate(texts)
+    ]
 
 
 def _two_lines(heading: str) -> tuple[str, str]:

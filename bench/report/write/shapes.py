@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.records import format
+from bench.records import format, metrics
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import (
@@ -31,7 +31,6 @@ from bench.report.write.table import Column, text
 ARRAYS = ("colours", "normals", "hit")  # of images.npz, of each row
 HELD_OUT = {"photograph": "held out"}  # arrays that are the same for all rows, and what they are
 MOST_COLUMNS = 8
-HIGHER = ("psnr", "ssim", "mask_iou", "mask_iou_least", "seen_fscore", "iou", "normal_consistency")  # more is better
 
 
 def _values(value: float | None) -> str:
@@ -65,7 +64,7 @@ def middle(records: list[Record], name: str) -> float | None:
     """The median of a metric, with failed runs worst; None where runs that ended ok do not have it."""
     if any(measured(record, name) is None for record in records if record["status"] == "ok"):
         return None
-    if name in HIGHER:
+    if metrics.better(name) == "higher":
         found = [measured(record, name) if record["status"] == "ok" else 0.0 for record in records]
         return float(median([value or 0.0 for value in found]))
     return float(median([error(record, name) for record in records]))

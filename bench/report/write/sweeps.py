@@ -1,0 +1,145 @@
+"""Writes the table of each sweep that no page shows beside its plan, and reads these tables back for index.html."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from bench.records import format
+from bench.records.metrics import SHOWN, Metric, better
+from bench.records.read import PLAN
+from bench.report.data.records import definitions
+from bench.report.data.statistics import Interval
+from bench.report.data.sweeps import RowNumbers, SweepRuns, numbers, read_sweeps
+from bench.report.write.caption import OVER
+from bench.report.write.paper import found, page_names
+from bench.report.write.result import Result, write
+from bench.report.write.table import Column, counted, shown, text, to_data, to_table
+
+FOLDER, TABLE = "sweeps", "table"
+MOST_VALUES = 6  # of a swept key that the caption lists
+MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
+FAILURE = (
+    "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: medians "
+    "are infinite where half of the runs failed."
+)
+UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
+
+
+def write_sweeps(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
+    """Writes `results_dir/sweeps/NAME/table.{csv,md,tex}` of every sweep without a page; gives the CSVs' paths."""
+    sweeps = read_sweeps(records, results_dir, _tabled())
+    places = [results_dir / FOLDER / sweep.name / TABLE for sweep in sweeps]
+    return [write(table_of(sweep), base, name=sweep.name)[0] for sweep, base in zip(sweeps, places, strict=True)]
+
+
+def find_sweeps(results_dir: Path) -> list[dict[str, Any]]:
+    """The tables of sweeps for `index.html`, the sweep that was asked for last first.
+
+    Each has what `find_paper` gives: a name, title, caption, notes, the table's header and rows, links to the files.
+    """
+    tables = (results_dir / FOLDER).glob(f"*/{TABLE}.md")
+    folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
+    return [found(folder, TABLE, (FOLDER, folder.name)) | {"name": folder.name} for folder in folders]
+
+
+def table_of(sweep: SweepRuns) -> Result:
+    """The table of a sweep: a line per row with its medians, what failed and what it cost."""
+    names, lines = sweep.metrics(), numbers(sweep)
+    headings = _headings(names)
+    stress = any(record["config"].get("stress") for record in sweep.runs.records)
+    return Result(
+        sweep.runs,
+        f"Sweep {sweep.name}.",
+        f"Medians over {OVER}; swept over {_listed(sweep)}.",
+        n=f"{len(sweep.runs.records)} runs" if stress else "",
+        interval="95 % bootstrap intervals over shapes" if headings else "",
+        estimates=[line.medians[name] for line in lines for name in headings if name in line.medians],
+        remarks=(*_notes(sweep, headings), *definitions(sweep.runs.records, {n: m.label for n, m in headings.items()})),
+        data=to_data(_data_columns(names), lines),
+        table=to_table(_columns(headings, lines), lines),
+    )
+
+
+def _asked(folder: Path) -> float:
+    """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
+    plan = folder / PLAN
+    return plan.stat().st_mtime if plan.is_file() else 0.0
+
+
+def _tabled() -> set[str]:
+    """The names of the experiments that pages read."""
+    pages = {module for module, _ in page_names().values()}
+    read = [selection for page in pages for selection in import_module(f"bench.report.pages.{page}").READS]
+    return {name for selection in read for name in (selection.experiment, selection.former) if name}
+
+
+def _headings(names: list[str]) -> dict[str, Metric]:
+    """The metrics of the readable table: those that tables show, or else the first ones, by their names."""
+    known = {name: SHOWN[name] for name in names if name in SHOWN}
+    return known or {name: Metric(name) for name in names[:MOST_METRICS]}
+
+
+def _columns(headings: dict[str, Metric], lines: list[RowNumbers]) -> list[Column]:
+    """The columns of the readable table."""
+    several = any(line.ratio is not None for line in lines)
+    first = next(iter(headings.values()), Metric(""))
+    return [
+        text("row", "Run", lambda line: line.name),
+        *(shown(metric.label, _median(name, metric.factor)) for name, metric in headings.items()),
+        *([shown(f"{first.label.split(' (')[0]} over the first row's", _ratio)] if several else []),
+        shown("Failed", lambda line: counted(line.failed, line.runs, line.rate)),
+        Column("", "Loop", lambda line: line.loop, format.seconds),
+        Column("", "Field values", lambda line: line.values, format.count),
+    ]
+
+
+def _median(name: str, factor: float) -> Any:
+    """The text of a metric in a line."""
+    return lambda line: str(line.medians[name].times(factor)) if name in line.medians else format.MISSING
+
+
+def _ratio(line: RowNumbers) -> str:
+    return format.MISSING if line.ratio is None else str(line.ratio)
+
+
+def _data_columns(names: list[str]) -> list[Column]:
+    """The columns of the CSV: of each metric the median and the ends of its interval, in scene units."""
+    return [
+        text("row", value=lambda line: line.name),
+        *(column for name in names for column in _ends(name, lambda line, name=name: line.medians.get(name))),
+        *_ends("ratio", lambda line: line.ratio),
+        *(Column(key, value=lambda line, key=key: getattr(line, key)) for key in ("runs", "failed")),
+        Column("failed_low", value=lambda line: line.rate.low),
+        Column("failed_high", value=lambda line: line.rate.high),
+        text("reasons", value=lambda line: "; ".join(line.reasons)),
+        Column("loop_seconds", value=lambda line: line.loop),
+        Column("value_evaluations", value=lambda line: line.values),
+    ]
+
+
+def _ends(key: str, get: Any) -> list[Column]:
+    """Columns of an estimate and of the ends of its interval."""
+
+    def part(line: RowNumbers, end: str) -> float | None:
+        interval: Interval | None = get(line)
+        return None if interval is None else getattr(interval, end)
+
+    ends = {"": "value", "_low": "low", "_high": "high"}
+    return [Column(key + suffix, value=lambda line, end=end: part(line, end)) for suffix, end in ends.items()]
+
+
+def _listed(sweep: SweepRuns) -> str:
+    """The keys that were swept over, with their values or the number of these."""
+    said = [
+        f"{key} ({', '.join(values)})" if len(values) <= MOST_VALUES else f"{key} ({len(values)} values)"
+        for key, values in sweep.swept.items()
+    ]
+    return ", ".join(said) or "nothing"
+
+
+def _notes(sweep: SweepRuns, headings: dict[str, Metric]) -> list[str]:
+    """How rows and numbers are to be read."""
+    more = [name for name in sweep.metrics() if name not in headings]
+    undirected = UNDIRECTED if any(not better(name) for name in headings) else ""
+    csv = f"The CSV also has {', '.join(more)}." if more else ""
+    return [FAILURE, undirected, csv]

@@ -1,0 +1,120 @@
+"""What the README files show: their commands, their code and their links; and the files that commands need."""
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+from PIL import Image
+
+from tests.datasets.test_captures import idr
+from tests.made_scans import write_scans
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = ("README.md", "CONTRIBUTING.md", *(f"{room}/README.md" for room in ("bench", "conf", "datasets", "renderers")))
+CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+COMMENT = re.compile(r"\s{2,}# .*$")
+SPAN = re.compile(r"`(python -m [^`]+)`")
+LINK = re.compile(r"\]\(([^)#\s]*)(#[^)\s]*)?\)")
+SCANS = re.compile(r"dataset=scans|\+experiment=scans")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of a README file, as its words."""
+
+    file: str
+    words: tuple[str, ...]
+
+    @property
+    def module(self) -> str:
+        """What follows `python -m`."""
+        return self.words[2]
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        return self.words[3:]
+
+    def __str__(self) -> str:
+        return " ".join(self.words)
+
+
+def text_of(file: str) -> str:
+    return (ROOT / file).read_text(encoding="utf-8")
+
+
+def commands() -> list[Command]:
+    """All `python -m ...` of the README files: indented lines without their comments, and spans within text."""
+    found = {}
+    for file in FILES:
+        bare = CODE.sub("", text_of(file))
+        lines = [COMMENT.sub("", line).strip() for line in bare.splitlines() if line.startswith("    ")]
+        spans = [" ".join(span.split()) for span in SPAN.findall(bare.replace("\n", " "))]
+        for part in (part.strip() for line in (*lines, *spans) for part in line.split("&&")):
+            if part.startswith("python -m "):
+                found.setdefault(part, Command(file, tuple(shlex.split(part))))
+    return list(found.values())
+
+
+def code_of(file: str, language: str) -> list[str]:
+    """The blocks of that language in a README file."""
+    return [code for found, code in CODE.findall(text_of(file)) if found == language]
+
+
+def links() -> list[tuple[str, str, str]]:
+    """The links to other files of the project: where they stand, the file, the heading."""
+    found = [(file, path, anchor) for file in FILES for path, anchor in LINK.findall(CODE.sub("", text_of(file)))]
+    return [link for link in found if ":" not in link[1]]
+
+
+def anchors(text: str) -> set[str]:
+    """The addresses of headings, as GitHub makes them, and those that a text sets itself."""
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", re.sub(r"<[^>]*>", "", heading)).strip().lower() for heading in headings]
+    return {heading.replace(" ", "-") for heading in plain} | set(re.findall(r'<a id="([^"]+)">', text))
+
+
+def make_files(folder: Path) -> dict[str, str]:
+    """Makes what the words of commands stand for, in a folder; gives the path of each word."""
+    for name in ("captures", "scans", "chairs", "mine/conf/renderer", "mine/conf/task", "mine/conf/experiment"):
+        (folder / name).mkdir(parents=True)
+    idr(folder / "captures")
+    write_scans(folder / "scans")
+    trimesh.creation.box((1, 0.6, 0.8)).export(folder / "one.obj")
+    for number in range(4):
+        trimesh.creation.box((1, 0.6 + 0.1 * number, 0.8)).export(folder / "chairs" / f"{number}.obj")
+    picture = Image.new("L", (48, 48))
+    picture.paste(255, (12, 16, 40, 32))
+    picture.save(folder / "mask.png")
+    picture.convert("RGB").save(folder / "picture.png")
+    named = dict.fromkeys(("YOURS.obj", "cow.obj", "spot.obj"), folder / "one.obj")
+    named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
+    named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
+    (folder / "mine" / "my_package.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
+    (folder / "mine" / "mypkg.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
+    (folder / "mine" / "mytask.py").write_text(code_of("CONTRIBUTING.md", "python")[1])
+    yaml = dict(zip(("task", "experiment"), code_of("CONTRIBUTING.md", "yaml"), strict=True))
+    for group, text in yaml.items():
+        (folder / "mine" / "conf" / group / "coverage.yaml").write_text(text)
+    mine = "_target_: my_package.Mine\n_label_: Mine\nsteps: 40\n"
+    (folder / "mine" / "conf" / "renderer" / "mine.yaml").write_text(mine)
+    return {word: str(path) for word, path in named.items()} | {"SCANS": str(folder / "scans")}
+
+
+def filled(command: Command, made: dict[str, str]) -> list[str]:
+    """A command's arguments with the made files in place of words, and without dots that stand for others."""
+    mesh = "dataset=mesh" in command.words
+    named = {"NAME": "sofa", **made}
+    if SCANS.search(str(command)):
+        named["FOLDER"] = made["SCANS"]
+    elif mesh:
+        named |= {"FOLDER": made["chairs/"], "FILE": made["YOURS.obj"]}
+    own = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []
+    kept = [argument for argument in (*own, *command.arguments) if argument not in ("...", "...,")]
+    return [key + is_ + named.get(value, value) for key, is_, value in map(_split, kept)]
+
+
+def _split(argument: str) -> tuple[str, str, str]:
+    key, is_, value = argument.rpartition("=")
+    return key, is_, value

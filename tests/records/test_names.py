@@ -1,0 +1,70 @@
+"""Runs are named by what differs among them, and by nothing else."""
+
+import pytest
+
+from bench.records.metrics import better
+from bench.records.names import differences
+
+
+def run(renderer: str = "dist", label: str = "DIST", **config) -> dict:
+    """The parts of a record that names are made of; keys of the configuration are dotted by `__`."""
+    nested: dict = {"renderer": {"_label_": label}, "seed": 0, "index": 0}
+    for key, value in config.items():
+        outer, _, inner = key.partition("__")
+        nested[outer] = {**nested.get(outer, {}), inner: value} if inner else value
+    return {"task": "completion", "method": "", "renderer": renderer, "dataset": "sofa", "config": nested}
+
+
+def own(path: str) -> dict:
+    return run("custom", path.rpartition(".")[2], renderer___target_=path)
+
+
+@pytest.mark.parametrize(
+    ("records", "names"),
+    [
+        ([run(), run("dvr", "DVR")], ["DIST", "DVR"]),
+        ([run(seed=0), run(seed=1)], ["seed 0", "seed 1"]),
+        ([run(), run("dvr", "DVR", index=1), run("dvr", "DVR")], ["DIST", "DVR, shape 1", "DVR, shape 0"]),
+        ([run(renderer__epsilon=1e-4), run(renderer__epsilon=5e-5)], ["epsilon 0.0001", "epsilon 5e-05"]),
+        ([run(), run("dvr", "DVR", renderer__n=8), run("dvr", "DVR", renderer__n=9)], ["DIST", "DVR, n 8", "DVR, n 9"]),
+        ([run("dist"), run("dist_fast")], ["dist", "dist_fast"]),
+        ([run(task__steps=1, prior__steps=1), run(task__steps=2, prior__steps=1)], ["steps 1", "steps 2"]),
+        ([run(scale__name="smoke", view__resolution=8), run(scale__name="desk", view__resolution=9)],
+         ["scale smoke", "scale desk"]),
+        ([run(silhouette___label_="hinge"), run()], ["hinge", "DIST"]),
+        ([run(time_limit=1), run(time_limit=2)], ["DIST", "DIST"]),
+        ([run(a__n=1, b__n=1), run(a__n=1, b__n=2), run(a__n=2, b__n=2)],
+         ["n 1, b.n 1", "n 1, b.n 2", "n 2"]),
+        ([run()], ["DIST"]),
+    ],
+)  # fmt: skip
+def test_a_name_is_what_differs(records, names):
+    assert differences(records).names == tuple(names)
+
+
+def test_renderers_of_ones_own_are_named_by_their_classes():
+    classes = [f"bad.{letter * 3}" for letter in "ABCDEFGHIJKL"]
+    assert differences([own(path) for path in classes]).names == tuple(path[4:] for path in classes)
+    assert differences([own("mine.Net"), own("yours.Net")]).names == ("mine.Net", "yours.Net")
+
+
+def test_what_keeps_runs_apart_is_not_in_their_names():
+    records = [run(seed=seed, renderer__alpha=alpha) for seed in (0, 1) for alpha in (1.0, 1.5)]
+    found = differences(records, apart=lambda record: record["config"]["seed"])
+    assert found.names == ("alpha 1", "alpha 1.5") * 2
+    assert found.keys == ("renderer.alpha",)
+
+
+def test_a_key_is_named_as_the_sweep_asked_for_it():
+    records = [run(renderer__steps=n, renderer__budget=2 * n) for n in (4, 8)]
+    assert differences(records).names == ("steps 4", "steps 8")
+    asked = [{"renderer.budget": "8.0"}, {"renderer.budget": "1e1"}]
+    assert differences(records, asked=asked).names == ("budget 8.0", "budget 1e1")
+
+
+@pytest.mark.parametrize(
+    ("name", "direction"),
+    [("chamfer_l2", "lower"), ("own_psnr", "higher"), ("seen_fscore", "higher"), ("queries", ""), ("own_queries", "")],
+)
+def test_which_direction_of_a_metric_is_better(name, direction):
+    assert better(name) == direction

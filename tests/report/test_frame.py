@@ -1,0 +1,84 @@
+"""The table of all runs has typed columns, whatever the runs are, and is the same as CSV and as Parquet."""
+
+import importlib.util
+import sys
+
+import pandas as pd
+import pytest
+
+import bench
+from bench.records.read import Plan, PlannedCell
+from bench.report.__main__ import main as report
+from bench.report.data.frame import COLUMNS, write_frame
+from tests.report.test_report import crashed, record, write_run
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Three runs: an ok one, one that crashed, one that a sweep planned."""
+    config = {"renderer": {"epsilon": "auto", "steps": 5}, "seed": 1, "index": 3, "packages": ["mine"]}
+    metrics = {"chamfer_l2": 0.001, "depth_mae": "inf", "psnr": "nan", "status": 4, "best": "grid_8"}
+    write_run(tmp_path, record("one", metrics=metrics, config=config, seed=1, started="2025-03-02T10:00:00Z"), "one")
+    other = {"renderer": {"epsilon": 1e-3, "steps": 7, "early": True}, "label": "Mine"}
+    write_run(tmp_path, crashed("two", config=other, seed=None, reason="why"), "two")
+    cell = PlannedCell("three", [], "completion", "dvr", "plane", 0, {"seed": 0, "index": 0})
+    Plan("planned", tmp_path, [cell], asked="2025-03-03T10:00:00Z").write()
+    return tmp_path
+
+
+def test_there_is_a_row_for_each_run_and_each_planned_cell(results):
+    runs = bench.load(results)
+    assert list(runs.folder) == ["three", "one", "two"]
+    assert list(runs.status) == ["not_run", "ok", "crashed"]
+    assert list(runs.name) == ["dvr", "dist", "Mine"]
+    assert runs.chamfer_l2.tolist()[1] == 0.001 and runs.chamfer_l2.isna().tolist() == [True, False, True]
+    assert runs.start_chamfer_l2[1] == 0.0456 and runs.seconds_forward[1] == 10 and runs.evaluations_value[1] == 1.43e6
+    assert runs["metric_status"].tolist()[1] == 4 and runs.best[1] == "grid_8"
+    assert runs.depth_mae[1] == float("inf") and pd.isna(runs.psnr[1])
+    assert runs.reason[2] == "why" and runs["config.renderer.steps"].tolist()[1:] == [5, 7]
+
+
+def test_columns_have_types_that_do_not_depend_on_the_runs(results, tmp_path_factory):
+    runs, none = bench.load(results), bench.load(tmp_path_factory.mktemp("none"))
+    assert {name: str(kind) for name, kind in none.dtypes.items()} == COLUMNS
+    assert {name: str(kind) for name, kind in runs.dtypes.items()} | COLUMNS == dict(runs.dtypes.map(str))
+    typed = {"chamfer_l2": "Float64", "start_fscore": "Float64", "seconds_total": "Float64", "best": "string"}
+    typed |= {"config.renderer.steps": "Int64", "config.renderer.early": "boolean", "config.packages": "string"}
+    typed |= {"config.renderer.epsilon": "string", "config.seed": "Int64", "metric_status": "Float64"}
+    assert {name: str(runs[name].dtype) for name in typed} == typed
+
+
+def test_the_files_have_the_columns_of_the_table(results, capsys):
+    report([f"results_dir={results}"])
+    runs = bench.load(results)
+    said = capsys.readouterr()
+    assert said.out.splitlines()[:2] == [str(results / name) for name in ("runs.csv", "results.parquet")]
+    pd.testing.assert_frame_equal(pd.read_parquet(results / "results.parquet"), runs, check_categorical=False)
+    table = pd.read_csv(results / "runs.csv")
+    assert list(table) == list(runs) and list(table.folder) == list(runs.folder)
+
+
+def test_without_pyarrow_a_note_says_what_is_missing(results, monkeypatch, capsys):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name))
+    report([f"results_dir={results}"])
+    assert "pip install 'implicit-bench[parquet]'" in capsys.readouterr().err
+    assert not (results / "results.parquet").exists() and (results / "runs.csv").is_file()
+
+
+def test_no_runs_are_a_table_and_no_folder_an_error(tmp_path):
+    assert [path.name for path in write_frame([], tmp_path)] == ["runs.csv", "results.parquet"]
+    with pytest.raises(ValueError, match="must be an existing folder"):
+        bench.load(tmp_path / "nowhere")
+
+
+def test_a_record_that_cannot_be_read_is_told(results):
+    write_run(results, "{", "damaged")
+    with pytest.warns(UserWarning, match=r"1 not read: damaged: record\.json is not JSON"):
+        assert len(bench.load(results)) == 3
+
+
+def test_the_module_says_what_it_has():
+    assert sys.modules["bench"].__all__ == ["load", "run"]
+    with pytest.raises(AttributeError, match="no attribute 'lode'"):
+        _ = bench.lode

@@ -1,0 +1,136 @@
+"""Any sweep has a table: a row for what varies, with failed and missing cells counted."""
+
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.records.read import Plan, PlannedCell, read_records
+from bench.report.__main__ import main as report
+from bench.report.data.sweeps import numbers, read_sweeps
+from bench.report.write.sweeps import find_sweeps, write_sweeps
+from tests.report.test_report import record, write_run
+
+
+def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **asked: str) -> PlannedCell:
+    """A planned cell; `asked` are keys of its renderer that the sweep asked for."""
+    renderer_node = {"_label_": renderer.upper(), **asked}
+    config = {"renderer": renderer_node, "seed": seed, "index": index, "experiment": None, "label": None}
+    overrides = [f"renderer={renderer}", f"dataset={dataset}", f"seed={seed}", f"index={index}"]
+    overrides += [f"+renderer.{key}={value}" for key, value in asked.items()]
+    name = "-".join(override.replace("=", "") for override in overrides)
+    return PlannedCell(name, overrides, "completion", renderer, dataset, seed, config)
+
+
+def ran(results: Path, planned: PlannedCell, chamfer: float | None, **changed) -> None:
+    """The run of a cell; without an error it crashed."""
+    metrics = {} if chamfer is None else {"chamfer_l2": chamfer, "fscore": 1 - chamfer, "steps_taken": 9}
+    ended = {"status": "ok"} if chamfer is not None else {"status": "crashed", "reason": "as planned"}
+    given = {"config": planned.config, "renderer": planned.renderer, "dataset": planned.dataset, "seed": planned.seed}
+    content = record(planned.id, **given, metrics=metrics, **ended, **changed)
+    write_run(results, content, planned.id)
+
+
+def swept(results: Path, cells: list[PlannedCell], name: str = "completion-1") -> None:
+    Plan(name, results, cells).write()
+
+
+def table(results: Path, name: str = "completion-1") -> pd.DataFrame:
+    write_sweeps(read_records(results)[0], results)
+    return pd.read_csv(results / "sweeps" / name / "table.csv").set_index("row")
+
+
+def test_rows_are_what_varies_beside_shapes_and_seeds(tmp_path):
+    cells = [cell(r, dataset=d, seed=s) for r in ("dist", "dvr") for d in ("sofa", "plane") for s in (0, 1)]
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 * (number + 1))
+    found = table(tmp_path)
+    assert list(found.index) == ["DIST", "DVR"]
+    assert list(found["chamfer_l2"]) == pytest.approx([0.0025, 0.0065])
+    assert list(found["runs"]) == [4, 4] and list(found["failed"]) == [0, 0]
+    assert found.loc["DVR", "ratio"] == pytest.approx(0.0065 / 0.0025) and math.isnan(found.loc["DIST", "ratio"])
+    assert list(found["loop_seconds"]) == [30, 30] and list(found["value_evaluations"]) == [1.43e6] * 2
+    assert found["chamfer_l2_low"].isna().all()  # two shapes give no interval
+
+
+def test_six_shapes_have_an_interval(tmp_path):
+    cells = [cell(r, index=i) for r in ("dist", "dvr") for i in range(6)]
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 * (1 + number % 6) * (2 if one.renderer == "dvr" else 1))
+    found = table(tmp_path)
+    assert (found["chamfer_l2_low"] < found["chamfer_l2"]).all() and (found["fscore_high"] > found["fscore"]).all()
+    assert found.loc["DVR", ["ratio", "ratio_low", "ratio_high"]].tolist() == pytest.approx([2, 2, 2])  # paired
+    text = (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
+    assert "95 % bootstrap intervals over shapes" in text
+
+
+def test_cells_that_failed_or_were_not_run_count_in_their_rows(tmp_path):
+    cells = [cell(r, seed=s) for r in ("dist", "dvr") for s in (0, 1, 2)]
+    swept(tmp_path, cells)
+    for one, chamfer in zip(cells[:5], (0.001, 0.002, 0.003, 0.002, None), strict=True):
+        ran(tmp_path, one, chamfer)
+    found = table(tmp_path)
+    assert list(found["failed"]) == [0, 2] and list(found["runs"]) == [3, 3]
+    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == -math.inf
+    assert found.loc["DVR", "steps_taken"] == 9  # neither direction is better
+    assert found.loc["DVR", "reasons"].startswith("crashed: as planned; not_run: planned by sweep completion-1")
+    assert math.isinf(found.loc["DVR", "ratio"])
+
+
+def test_settings_and_classes_are_told_apart(tmp_path):
+    swept(tmp_path, [cell("dist", epsilon=e) for e in ("1e-4", "1e-3")], "epsilons")
+    classes = [f"bad.{letter}" for letter in "ABCDEFGHIJKL"]
+    swept(tmp_path, [cell("custom", _target_=path) for path in classes], "classes")
+    assert list(table(tmp_path, "epsilons").index) == ["epsilon 1e-4", "epsilon 1e-3"]
+    assert len(set(table(tmp_path, "classes").index)) == 12
+    assert list(table(tmp_path, "classes")["failed"]) == [1] * 12  # not one was run
+
+
+def test_a_stress_is_a_row_and_no_shape(tmp_path):
+    cells = [cell("dist", dataset=stress) for stress in ("wires", "gap")]
+    for one in cells:
+        one.config["stress"] = {"scene": one.dataset}
+    swept(tmp_path, cells)
+    for one in cells:
+        ran(tmp_path, one, 0.001)
+    assert list(table(tmp_path).index) == ["wires", "gap"]
+    assert "n = 2 runs;" in (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
+
+
+def test_a_sweep_of_an_experiment_with_a_page_needs_no_table(tmp_path):
+    for experiment in ("table2", "of_mine"):
+        cells = [cell("dist", seed=s) for s in (0, 1)]
+        for one in cells:
+            one.config["experiment"] = experiment
+        swept(tmp_path, cells, experiment)
+    write_sweeps(read_records(tmp_path)[0], tmp_path)
+    assert [found["name"] for found in find_sweeps(tmp_path)] == ["of_mine"]
+
+
+def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
+    cells = [cell(r) for r in ("dist", "dvr")]
+    swept(tmp_path, cells)
+    for one in cells:
+        ran(tmp_path, one, 0.001)
+    report([f"results_dir={tmp_path}"])
+    folder = tmp_path / "sweeps" / "completion-1"
+    assert str(folder / "table.csv") in capsys.readouterr().out
+    assert not (tmp_path / "paper").exists()
+    (found,) = find_sweeps(tmp_path)
+    assert (found["name"], found["title"]) == ("completion-1", "Sweep completion-1.")
+    assert found["header"][:2] == ["Run", "Chamfer (x1000)"] and found["rows"][0][:2] == ["DIST", "1.00 (n = 1)"]
+    assert found["files"] == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
+    assert r"\label{tab:completion-1}" in (folder / "table.tex").read_text()
+    assert "swept over renderer (dist, dvr)." in found["caption"] and "All 2 runs ended ok." in found["caption"]
+
+
+def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):
+    cells = [cell("dist", seed=s) for s in (0, 1)]
+    swept(tmp_path, cells)
+    ran(tmp_path, cells[0], 0.001)
+    write_run(tmp_path, "{", cells[1].id)
+    (sweep,) = read_sweeps(read_records(tmp_path)[0], tmp_path)
+    assert [(row.name, row.runs, row.failed) for row in numbers(sweep)] == [("DIST", 2, 1)]

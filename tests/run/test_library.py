@@ -1,0 +1,119 @@
+"""Runs from Python: `bench.run` and `bench.load`, as their examples show them."""
+
+import doctest
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bench
+from bench.report.data import frame
+from bench.run import library
+from tests.run.driving import ROOT, Outcome, command
+
+SMALL = (
+    "isolation=off", "threads=1", "task.points=20", "task.optimiser.iterations=8", "view.resolution=16",
+    "evaluation.picture=null", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
+)  # fmt: skip
+EXAMPLES = {
+    "run": library.run_once.__doc__,
+    "load": frame.load.__doc__,
+    "README": (ROOT / "bench" / "README.md").read_text(encoding="utf-8"),
+}
+LIGHT = """
+import sys, bench
+heavy = {"torch", "pandas", "numpy", "hydra", "matplotlib", "omegaconf"} & set(sys.modules)
+assert not heavy, heavy
+assert callable(bench.run) and callable(bench.run)
+"""
+SCRIPT = """
+import bench
+record = bench.run(task="completion", renderer="newton", scale="smoke", results_dir="two words", overrides={small})
+print(record.status, record.reused, record.folder.relative_to({folder!r}), flush=True)
+"""
+
+
+@pytest.fixture
+def within(tmp_path, monkeypatch):
+    """The working directory is an empty folder, and a run of the library is made in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(library, "_command", lambda arguments: command(*arguments, *SMALL))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_do_what_they_say(within, name):
+    if name == "load":
+        bench.run(scale="smoke", renderer="newton")
+    globs = {"bench": bench, "load": bench.load}
+    found = doctest.DocTestParser().get_doctest(EXAMPLES[name], globs, name, None, 0)
+    assert len(found.examples) >= 2
+    said: list[str] = []
+    failed = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE).run(
+        found, out=said.append
+    )
+    assert failed.failed == 0, "".join(said)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "null"),
+        (True, "true"),
+        (1e-4, "0.0001"),
+        ("dist", "dist"),
+        (Path("a/b.obj"), "a/b.obj"),
+        ("two words", "'two words'"),
+        ("it's, a=b", r"'it\'s, a=b'"),
+        ([1, "a b"], "[1,'a b']"),
+    ],
+)
+def test_a_keyword_is_typed_as_on_the_command_line(value, text):
+    assert library._override("label", value) == f"label={text}"
+
+
+def test_a_value_with_special_characters_arrives_unchanged(compose_config):
+    for value in ("it's, a=b", "two words", "[x]", "back\\slash", "a\\'b"):
+        assert compose_config(library._override("label", value)).label == value
+
+
+def test_groups_that_are_not_chosen_by_default_have_a_plus():
+    assert library._override("method", "dist_mask") == "+method=dist_mask"
+
+
+@pytest.mark.parametrize(("code", "error"), [(2, ValueError), (1, OSError)])
+def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, code, error):
+    monkeypatch.setattr(library, "_command", lambda _: Outcome(code, "", "a note\nerror: unknown renderer 'dits'\n"))
+    with pytest.raises(error, match=r"^unknown renderer 'dits'$"):
+        bench.run(renderer="dits")
+
+
+def test_a_run_that_failed_is_a_record(within):
+    record = bench.run(["+renderer.how=raise"], renderer="custom", scale="smoke", **{
+        "renderer._target_": "tests.failing.Failing"
+    })  # fmt: skip
+    assert record.status == "crashed" and record.reason
+    assert record.folder.parent == within / "results" / "runs"
+
+
+def test_importing_bench_imports_nothing_that_is_slow():
+    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_script_without_a_guard_makes_a_run_from_any_folder(tmp_path):
+    script = tmp_path / "script.py"
+    small = [override for override in SMALL if override != "isolation=off"]
+    script.write_text(SCRIPT.format(small=small, folder=str(tmp_path)))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    said = [
+        subprocess.run(
+            [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert [line.split()[:2] for line in said] == [["ok", "False"], ["ok", "True"]]
+    assert "two words/runs/completion-newton-sofa-" in said[0] and said[0].count("\n") == 1

@@ -1,0 +1,243 @@
+"""The README files show commands that compose, code that runs, and links that lead somewhere."""
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+import bench
+from bench.config import CONF, build, check_names, register
+from bench.report import pages
+from bench.report.__main__ import main as report
+from bench.report.write import paper
+from bench.run import library
+from tests import documentation
+from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
+from tests.run.driving import command as typed
+
+PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
+CLASSES = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # of nodes whose class the code knows
+HYDRA = ("bench", "bench.prior", "bench.train")  # commands whose arguments are choices and keys
+COMMANDS = documentation.commands()
+COMPOSED = [command for command in COMMANDS if command.module in HYDRA]
+SMALL = (
+    "scale=smoke", "isolation=off", "threads=1", "task.optimiser.iterations=3", "view.resolution=16", "task.points=20",
+    "evaluation.picture=null", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
+)  # fmt: skip
+
+
+QUICK = (  # with all sizes of scale=smoke that make a run last
+    "scale=smoke", "isolation=off", "threads=1", "scale.grid=24", "scale.sweep_grid=24", "scale.points=200",
+    "scale.picture=16", "scale.iterations=3", "scale.priors.own.shapes=4", "scale.priors.own.steps=10",
+    "scale.fit_iterations=3", "scale.fit_steps=20", "scale.rendering=16", "scale.multiview.iterations=2",
+    "scale.reconstruction.iterations=4", "scale.single_view.steps=3", "scale.stability.search.levels=3",
+    "scale.gradient_pixels=4",
+)  # fmt: skip
+SHIPPED = (  # of networks that are shipped for scale=desk alone
+    "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200", "evaluation.picture=null",
+)  # fmt: skip
+ENDED = ("ok", "not_reached", "empty", "diverged", "timeout", "oom", "unsupported")  # a run that did what it can
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory) -> Iterator[dict[str, str]]:
+    """The files that commands name; what is written in CONTRIBUTING can be imported."""
+    folder = tmp_path_factory.mktemp("documentation")
+    named = documentation.make_files(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder / "mine")
+        yield named
+
+
+def first_cell(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Folders of configurations that a command adds, and the overrides of its first cell."""
+    texts = [argument for argument in arguments if not argument.startswith("-")]
+    folders = []
+    if "--config-dir" in arguments:
+        folders = [arguments[arguments.index("--config-dir") + 1]]
+        texts.remove(folders[0])
+    parsed = OverridesParser.create().parse_overrides(texts)
+    cells = [
+        f"{one.get_key_element()}={next(iter(one.sweep_string_iterator()))}" if one.is_sweep_override() else text
+        for one, text in zip(parsed, texts, strict=True)
+    ]
+    return folders, cells
+
+
+def composed(arguments: list[str]) -> DictConfig:
+    """The configuration of a command's first cell."""
+    register()
+    folders, overrides = first_cell(arguments)
+    extra = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=[*overrides, *extra])
+
+
+def test_there_are_commands_of_every_file():
+    assert {command.file for command in COMMANDS} == set(FILES)
+    assert len(COMMANDS) > 60 and len(COMPOSED) > 45
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=str)
+def test_every_command_is_there(command):
+    name = command.module.rstrip(",")
+    assert importlib.util.find_spec(name) is not None
+    if name.startswith("bench"):
+        assert importlib.util.find_spec(f"{name}.__main__") is not None
+
+
+@pytest.mark.parametrize("command", COMPOSED, ids=str)
+def test_every_command_composes_and_builds(made, command):
+    arguments = filled(command, made)
+    if "+experiment=sofa" in arguments:  # stands for any, which the tests of conf compose
+        return
+    config = composed(arguments)
+    check_names(config)
+    OmegaConf.resolve(config)
+    for part in PARTS:
+        build(config[part], part, list(config.packages), CLASSES.get(part, ""))
+
+
+def test_a_command_that_asks_for_what_there_is_not_does_not_compose():
+    with pytest.raises(Exception, match="rendrer"):
+        composed(["rendrer=dist"])
+
+
+@pytest.mark.parametrize(("file", "path", "anchor"), sorted(set(links())))
+def test_every_link_leads_to_a_file_and_a_heading(file, path, anchor):
+    target = (ROOT / file).parent / path if path else ROOT / file
+    assert target.exists()
+    assert not anchor or anchor[1:] in anchors(target.read_text(encoding="utf-8"))
+
+
+def test_every_question_has_a_link():
+    questions = re.findall(r"^\| (.+\?) \| (.+) \|$", text_of("README.md"), re.MULTILINE)
+    assert len(questions) >= 12 and all(answer.startswith("[") and "#" in answer for _, answer in questions)
+
+
+def test_every_extra_that_is_named_is_there():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {name for file in FILES for name in re.findall(r"'[.\w-]+\[(\w+)\]'", text_of(file))}
+    assert named and named <= set(extras)
+
+
+def test_every_target_of_make_is_there():
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = {name for file in FILES for name in re.findall(r"(?:^ {4}|`)make ([\w-]+)", text_of(file), re.MULTILINE)}
+    assert {"demo", "test", "benchmark"} <= named <= targets
+
+
+@pytest.mark.parametrize("place", range(2))
+def test_the_code_of_the_readme_runs(tmp_path, monkeypatch, capsys, place):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(library, "_command", lambda arguments: typed(*arguments, *SMALL))
+    code = code_of("README.md", "python")
+    assert len(code) == 2
+    exec(compile(code[place], "README.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert ("hits" in said and "gradient" in said) if place == 0 else ("Newton" in said and "chamfer_l2" in said)
+
+
+@pytest.fixture(scope="module")
+def own_task(made, tmp_path_factory) -> Path:
+    """The results of the task of CONTRIBUTING, which its experiment sweeps over."""
+    results = tmp_path_factory.mktemp("own") / "results"
+    (sweep,) = [command for command in COMMANDS if "+experiment=coverage" in command.words]
+    done = typed(
+        *filled(sweep, made), "dataset=sofa", "scale=smoke", "isolation=off", "threads=1", f"results_dir={results}"
+    )
+    assert done.code == 0, done.err
+    return results
+
+
+def test_the_task_of_contributing_counts_what_it_says(own_task):
+    runs = bench.load(own_task)
+    assert list(runs.status) == ["ok"] * 2 and (runs.hits > 100).all()
+
+
+def test_the_page_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
+    (tmp_path / "coverage.py").write_text(code_of("CONTRIBUTING.md", "python")[2])
+    monkeypatch.setattr(paper, "PAGES", tmp_path)
+    monkeypatch.setattr(pages, "__path__", [str(tmp_path), *pages.__path__])
+    paper.page_names.cache_clear()
+    try:
+        report([f"results_dir={own_task}"])
+    finally:
+        paper.page_names.cache_clear()
+        sys.modules.pop("bench.report.pages.coverage", None)
+    (page,) = paper.find_paper(own_task)
+    assert page["header"][0] == "Run" and len(page["rows"]) == 2
+    assert not list((own_task / "sweeps").glob("*/table.csv"))  # a page shows it
+
+
+def test_comments_and_other_words_are_no_part_of_a_command():
+    assert all("#" not in str(command) for command in COMMANDS)
+    assert isinstance(COMMANDS[0], Command)
+
+
+def cell_of(command: Command, made: dict[str, str]) -> list[str]:
+    """The first cell of a command, on this machine."""
+    arguments = filled(command, made)
+    folders, asked = first_cell([a for a in arguments if not a.startswith("hydra")])
+    if "-m" in arguments and (name := next((a for a in asked if a.startswith("+experiment=")), "")):
+        register()
+        paths = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            params = compose("config", [name, "scale=smoke", *paths], return_hydra_config=True).hydra.sweeper.params
+        _, swept = first_cell([f"{key}={value}" for key, value in params.items()])
+        given = [text.partition("=")[0] for text in asked]
+        swept = ["renderer=dist" if text.startswith("renderer=") else text for text in swept]  # the first is slow
+        asked += [text for text in swept if text.partition("=")[0] not in given]
+    return [*(word for folder in folders for word in ("--config-dir", folder)), *asked]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [c for c in COMPOSED if c.module == "bench" and "NAME" not in str(c)], ids=str)
+def test_every_command_runs(made, tmp_path, command):
+    if "+method=stereo" in command.words:
+        pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
+    small = SHIPPED if "+method=single_view" in command.words else QUICK
+    done = typed(*cell_of(command, made), *small, f"results_dir={tmp_path}")
+    assert done.out, done.err
+    record = bench.load(tmp_path).iloc[0]
+    assert record.status in ENDED, record.reason
+
+
+@pytest.mark.slow
+def test_the_other_commands_run(made, tmp_path):
+    """In one folder, whose words they have: a run, results folders, a folder of photographs."""
+    done = typed("renderer=newton", *QUICK, f"results_dir={tmp_path / 'A'}")
+    named = made | {"RUN": done.out.splitlines()[-1]}
+    for other in ("B", "C", "BEFORE", "AFTER"):
+        shutil.copytree(tmp_path / "A", tmp_path / other)
+    (tmp_path / "results").symlink_to(tmp_path / "A")
+    here = [c for c in COMMANDS if c.module not in ("bench", "pytest")]
+    for command in here:
+        words = filled(command, named) + (list(QUICK) if command.module in HYDRA else [])
+        ran = subprocess.run(
+            [sys.executable, "-m", command.module, *words], cwd=tmp_path, capture_output=True, text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
+        )  # fmt: skip
+        told = "has no runs of the tuning" in ran.stderr or (ran.returncode == 2 and not command.arguments)
+        assert ran.returncode == 0 or told, (str(command), ran.stderr)
+
+
+@pytest.mark.slow
+def test_the_contract_of_contributing_holds(made, tmp_path):
+    (contract,) = [command for command in COMMANDS if command.module == "pytest"]
+    paths = os.pathsep.join([str(ROOT), str(Path(made["my_conf"]).parent)])
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", *contract.arguments], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": paths}, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stdout[-3000:]

@@ -1,0 +1,112 @@
+"""The wheel and the sdist have all that runs need, and say one version."""
+
+import os
+import re
+import shutil
+import site
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("bench", "conf", "datasets", "renderers")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+VERSION = PROJECT["project"]["version"]
+LEFT_OUT = ("results/",)  # of the sdist
+DEMO = ("task=completion", "renderer=dist", "scale=smoke", "threads=1", "evaluation.picture=null")
+
+
+def tracked() -> list[str]:
+    """The files of the project, as git has them, those that are new but not ignored included."""
+    asked = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    if not (ROOT / ".git").exists():
+        pytest.skip("git says which files a package must have, and this is no clone")
+    said = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [name for name in said.splitlines() if (ROOT / name).is_file()]
+
+
+def of_packages(names: list[str]) -> set[str]:
+    return {name for name in names if name.split("/")[0] in PACKAGES}
+
+
+def test_patterns_of_the_package_cover_every_file():
+    patterns = PROJECT["tool"]["setuptools"]["package-data"]["*"]
+    others = [name for name in of_packages(tracked()) if not name.endswith(".py")]
+    assert len(others) > 150
+    assert [n for n in others if not any(fnmatch(n.partition("/")[2], p.replace("**/", "*")) for p in patterns)] == []
+
+
+def test_one_version_is_told_everywhere():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == VERSION and cited["cff-version"] == "1.2.0"
+    assert f"version = {{{VERSION}}}" in (ROOT / "README.md").read_text(encoding="utf-8")
+    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert VERSION in headings[:2]  # what is unreleased may stand before it
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """A folder with the wheel and the sdist of the project's files."""
+    folder = tmp_path_factory.mktemp("package")
+    for name in tracked():
+        if not name.startswith(LEFT_OUT):
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / "source" / name)
+    code = "from setuptools import build_meta as b; b.build_sdist('../dist'); b.build_wheel('../dist')"
+    (folder / "dist").mkdir()
+    subprocess.run([sys.executable, "-c", code], cwd=folder / "source", capture_output=True, check=True)
+    return folder / "dist"
+
+
+@pytest.mark.slow
+def test_the_wheel_has_every_file_of_the_packages(built):
+    (wheel,) = built.glob(f"implicit_bench-{VERSION}-py3-none-any.whl")
+    names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
+    assert set(names) == of_packages(tracked())
+
+
+@pytest.mark.slow
+def test_the_sdist_has_every_file_but_results(built):
+    (sdist,) = built.glob(f"implicit_bench-{VERSION}.tar.gz")
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = {name for name in tracked() if not name.startswith(LEFT_OUT) and name != ".gitignore"}
+    assert wanted - names == set()
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
+    """In an environment of its own, which has the libraries of this one, but not this project."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "-q"]
+    subprocess.run([*install, *built.glob("*.whl")], check=True)
+    (libraries,) = (tmp_path / "venv").glob("lib/*/site-packages")
+    (libraries / "libraries.pth").write_text("\n".join(site.getsitepackages()))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run(
+            [python, *arguments], cwd=empty, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("-c", "import bench; print(bench.__file__)").startswith(str(libraries))
+    folder = empty / run("-m", "bench", *DEMO).splitlines()[-1]
+    assert {"record.json", "mesh.ply"} <= {path.name for path in folder.iterdir()}
+    assert [path.name for path in empty.iterdir()] == ["results"]
+    assert run("-m", "bench.report").splitlines()[-1] == "results/index.html"
+    said = run(
+        "-c", "import bench; r = bench.load(); print(r.status[0], r['commit'].isna()[0] or r['commit'][0] == '')"
+    )
+    assert said.split() == ["ok", "True"]
