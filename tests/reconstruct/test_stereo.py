@@ -9,7 +9,6 @@ import torch
 
 from bench.reconstruct import stereo
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
-from datasets import photographs
 from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput
@@ -34,9 +33,7 @@ def sphere() -> Truth:
 def taken(sphere: Truth, *angles: tuple[float, float]) -> list[Shot]:
     """Photographs from these angles in degrees, about the vertical axis and above the horizon."""
     cameras = [camera_of(PIXELS, angles=one) for one in angles]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photographs, "circle", lambda first, count: cameras)
-        return replace(SETTINGS, views=len(cameras)).take(sphere, cameras[0], seed=0)
+    return SETTINGS.take_from(sphere, cameras, seed=0)
 
 
 def points_of(shots: list[Shot], matching: Matching = ALL) -> np.ndarray:
