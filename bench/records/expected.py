@@ -129,14 +129,14 @@ def _parts(record: Record, cpu: str) -> dict[str, Any]:
     """What decides how long a run takes, each part by the name that `LADDER` has for it."""
     config = record["config"]
     scale, view = config.get("scale"), config.get("view")
-    sizes = [("view", view.get("resolution"))] if isinstance(view, dict) else []
+    sizes = [("view", str(view.get("resolution")))] if isinstance(view, dict) else []
     return {
         "task": record["task"],
-        "scale": scale.get("name") if isinstance(scale, dict) else None,
+        "scale": str(scale.get("name")) if isinstance(scale, dict) else None,
         "renderer": (record["renderer"], record.get("method", "")),
         "dataset": record["dataset"],
         "sizes": (*sizes, *_numbers(config.get("task"), "")),
-        "machine": (cpu, str(config.get("device")), config.get("threads")),
+        "machine": (str(cpu), str(config.get("device")), str(config.get("threads"))),
     }
 
 

@@ -46,10 +46,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     def guarded(config: DictConfig) -> None:
         begun.append(config)
         try:
-            check_names(config)
-            chosen = HydraConfig.get()
-            check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
-            check_apart(config)
+            _check(config)
             job(config)
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
@@ -65,13 +62,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     except KeyboardInterrupt as error:
         return _tell(stopped_by(error), INTERRUPTED)
     except OverrideParseException as error:
-        if COMMA.search(error.override):
-            return _tell(f"{error.override!r} has a comma without a value beside it: write key=a,b", USAGE)
-        return _tell(
-            f"cannot read {error.override!r}: write key=value, and quote a value with special characters as "
-            f"'key=\"value\"'",
-            USAGE,
-        )
+        return _tell(_unreadable(error.override), USAGE)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         return _tell(_explain(error), USAGE)
     except OSError as error:
@@ -117,6 +108,14 @@ def unwritten(error: OSError) -> str:
     file = next((above for above in path.parents if above.is_file()), path) if path else None
     where = f" ({file})" if file else ""
     return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
+
+
+def _check(config: DictConfig) -> None:
+    """Raises ValueError for what can be told of a configuration without torch."""
+    check_names(config)
+    chosen = HydraConfig.get()
+    check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
+    check_apart(config)
 
 
 def _call(program: Callable[[], None]) -> None:
@@ -170,6 +169,13 @@ def _explain(error: Exception) -> str:
             detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
             return f"{message}: {detail}" if detail not in message else message
     return message
+
+
+def _unreadable(override: str) -> str:
+    """One line on an override that Hydra cannot read."""
+    if COMMA.search(override):
+        return f"{override!r} has a comma without a value beside it: write key=a,b"
+    return f"cannot read {override!r}: write key=value, and quote a value with special characters as 'key=\"value\"'"
 
 
 def _choices(group: str) -> list[str]:

@@ -44,7 +44,9 @@ def test_some_runs_are_like_no_other(known):
     assert Model([known], "A").of(run()) is None
 
 
-@pytest.mark.parametrize("config", [{"scale": None, "view": None}, {"scale": 3, "view": [], "task": "x"}])
+@pytest.mark.parametrize("config", [
+    {"scale": None, "view": None}, {"scale": 3, "view": [], "task": "x"}, {"scale": {"name": [1]}, "threads": [2]},
+])  # fmt: skip
 def test_a_record_of_another_kind_is_taken_as_it_is(config):
     assert Model([run(**config)], "A").of(run()) is None
 
