@@ -15,6 +15,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     Task,
     TextColumn,
     TimeElapsedColumn,
@@ -23,6 +24,7 @@ from rich.progress import (
 from rich.text import Text
 
 PLAIN = 15.0  # seconds between two printed lines of a phase, where there is no terminal
+NARROW = 80  # columns of a terminal, below which a line of progress has no room for a bar
 HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may take minutes each
 
 
@@ -63,6 +65,15 @@ class _Left(TimeRemainingColumn):
         return Text(str(timedelta(seconds=round(left))), style="progress.remaining")
 
 
+def columns(width: int) -> list[ProgressColumn]:
+    """What a line of progress shows; on a narrow terminal its name, how many are done, and the time left."""
+    name, count, left = TextColumn("{task.description}", markup=False), MofNCompleteColumn(), _Left()
+    if width < NARROW:
+        return [name, count, left]
+    padded, said = TextColumn("{task.description:<28}", markup=False), TextColumn("{task.fields[said]}", markup=False)
+    return [padded, BarColumn(), count, said, TimeElapsedColumn(), TextColumn("left"), left]
+
+
 _shown: Progress | None = None  # the display of this process, shared by the lines of a sweep and of its run
 
 
@@ -73,18 +84,9 @@ def display() -> Iterator[Progress]:
     if _shown is not None:
         yield _shown
         return
-    columns = (
-        TextColumn("{task.description:<28}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[said]}", markup=False),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        _Left(),
-    )
     console = Console(stderr=True)
     with Progress(
-        *columns,
+        *columns(console.width),
         console=console,
         disable=not console.is_terminal,
         refresh_per_second=5,

@@ -12,6 +12,7 @@ from typing import Any
 
 Record = dict[str, Any]  # as `read_record` gives it; a planned cell has the same fields, but no environment
 FEWEST = 4  # like runs from which on the spread is that of quartiles; below, the least and the largest
+BELIEVED = 0.25  # cells: how much the estimate weighs against what the sweep's own cells took
 ALWAYS = ("task", "scale")  # demands that are never dropped
 # What is dropped, in this order, and what an estimate then says of the runs that it is from.
 LADDER = (
@@ -35,6 +36,7 @@ class Expected:
         memory: most bytes that one of them took beyond those of its start; None where none says.
         n: the number of like runs.
         like: what they have in common with it, in words.
+        waited: share of their time for which the threads of like runs waited for a processor, the median.
     """
 
     seconds: float
@@ -43,6 +45,7 @@ class Expected:
     memory: float | None
     n: int
     like: str
+    waited: float
 
 
 class Model:
@@ -101,8 +104,8 @@ class Remaining:
         weights = {cell: usual if expected is None else expected.seconds for cell, expected in self.cells.items()}
         ended = sum(weight for cell, weight in weights.items() if cell in self.done)
         pending = sum(weight for cell, weight in weights.items() if cell not in self.done)
-        # Seconds of the clock for each that was expected; one cell's worth of them is believed from the beginning.
-        believed = usual if known else 0.0
+        # Seconds of the clock for each that was expected; a part of a cell's worth is believed from the beginning.
+        believed = BELIEVED * usual if known else 0.0
         return pending * (elapsed * bool(self.done) + believed / self.workers) / (ended + believed)
 
 
@@ -117,21 +120,23 @@ def _expected(like: list[Record], words: str) -> Expected:
     low, high = seconds[0], seconds[-1]
     if len(seconds) >= FEWEST:
         low, _, high = statistics.quantiles(seconds, n=4, method="inclusive")
-    return Expected(statistics.median(seconds), low, high, max(memory, default=None), len(seconds), words)
+    shares = [record["environment"].get("waited_share") for record in like]
+    waited = statistics.median([share for share in shares if isinstance(share, float)] or [0.0])
+    return Expected(statistics.median(seconds), low, high, max(memory, default=None), len(seconds), words, waited)
 
 
 def _parts(record: Record, cpu: str) -> dict[str, Any]:
     """What decides how long a run takes, each part by the name that `LADDER` has for it."""
     config = record["config"]
     scale, view = config.get("scale"), config.get("view")
-    sizes = [("view", view.get("resolution"))] if isinstance(view, dict) else []
+    sizes = [("view", str(view.get("resolution")))] if isinstance(view, dict) else []
     return {
         "task": record["task"],
-        "scale": scale.get("name") if isinstance(scale, dict) else None,
+        "scale": str(scale.get("name")) if isinstance(scale, dict) else None,
         "renderer": (record["renderer"], record.get("method", "")),
         "dataset": record["dataset"],
         "sizes": (*sizes, *_numbers(config.get("task"), "")),
-        "machine": (cpu, str(config.get("device")), config.get("threads")),
+        "machine": (str(cpu), str(config.get("device")), str(config.get("threads"))),
     }
 
 

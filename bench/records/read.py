@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,14 @@ class Plan:
         """The folder of the plan; the same sweep has the same folder."""
         return self.results_dir / "sweeps" / self.name
 
+    @cached_property
+    def common(self) -> set[str]:
+        """The overrides that all cells have."""
+        return set.intersection(*(set(cell.overrides) for cell in self.cells))
+
     def differing(self, cell: PlannedCell) -> list[str]:
         """The overrides of a cell that not all cells have."""
-        common = set.intersection(*(set(one.overrides) for one in self.cells))
-        return [override for override in cell.overrides if override not in common]
+        return [override for override in cell.overrides if override not in self.common]
 
     def write(self) -> None:
         """Writes `plan.json`."""

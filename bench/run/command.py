@@ -9,6 +9,7 @@ from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
@@ -23,6 +24,7 @@ from bench.run.process import catch_signals, forget_signals, raise_if_stopped, s
 from bench.run.sweep import Refused, Sweep
 from bench.targets import check_targets
 
+COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
 USAGE = 2  # exit status of a command line that asks for what there is not
 FAILED = 1
@@ -44,10 +46,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     def guarded(config: DictConfig) -> None:
         begun.append(config)
         try:
-            check_names(config)
-            chosen = HydraConfig.get()
-            check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
-            check_apart(config)
+            _check(config)
             job(config)
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
@@ -56,17 +55,14 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     catch_signals()
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
+        sys.argv[1:] = options_first(sys.argv[1:])
         _call(program)
         if raised:
             raise raised[0]
     except KeyboardInterrupt as error:
         return _tell(stopped_by(error), INTERRUPTED)
     except OverrideParseException as error:
-        return _tell(
-            f"cannot read {error.override!r}: write key=value, and quote a value with special characters as "
-            f"'key=\"value\"'",
-            USAGE,
-        )
+        return _tell(_unreadable(error.override), USAGE)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         return _tell(_explain(error), USAGE)
     except OSError as error:
@@ -83,12 +79,43 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
     return 0
 
 
+def options_first(arguments: list[str]) -> list[str]:
+    """The arguments with options, such as -m, before all `key=value`, as Hydra wants them.
+
+    Raises:
+        ValueError: for an option that there is not.
+    """
+    known = {name: action for action in get_args_parser()._actions for name in action.option_strings}
+    options, others, rest = [], [], list(arguments)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("-"):
+            others.append(word)
+            continue
+        action = known.get(word.partition("=")[0])
+        if action is None:
+            raise ValueError(f"unknown option {word!r}{nearest(word, sorted(known))}")
+        options.append(word)
+        given = rest and (action.nargs is None or (action.nargs == "?" and rest[0] in (action.choices or ())))
+        if given and "=" not in word:
+            options.append(rest.pop(0))
+    return [*options, *others]
+
+
 def unwritten(error: OSError) -> str:
     """One line on what could not be written, and what to do."""
     path = Path(error.filename) if error.filename else None
     file = next((above for above in path.parents if above.is_file()), path) if path else None
     where = f" ({file})" if file else ""
     return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
+
+
+def _check(config: DictConfig) -> None:
+    """Raises ValueError for what can be told of a configuration without torch."""
+    check_names(config)
+    chosen = HydraConfig.get()
+    check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
+    check_apart(config)
 
 
 def _call(program: Callable[[], None]) -> None:
@@ -142,6 +169,13 @@ def _explain(error: Exception) -> str:
             detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
             return f"{message}: {detail}" if detail not in message else message
     return message
+
+
+def _unreadable(override: str) -> str:
+    """One line on an override that Hydra cannot read."""
+    if COMMA.search(override):
+        return f"{override!r} has a comma without a value beside it: write key=a,b"
+    return f"cannot read {override!r}: write key=value, and quote a value with special characters as 'key=\"value\"'"
 
 
 def _choices(group: str) -> list[str]:

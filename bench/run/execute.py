@@ -20,7 +20,7 @@ from bench.machine import environment
 from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
-from bench.run.process import Ended, Job, Notice, Started, Step
+from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
 from bench.tasks.task import TakesField, Task
@@ -81,15 +81,15 @@ def execute(
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
-        record.status, record.reason = RunStatus.REFUSED, _one_line(error)
+        record.status, record.reason = RunStatus.REFUSED, reason_of(error)
         log.error(traceback.format_exc())
     except Unsupported as error:
-        record.status, record.reason = RunStatus.UNSUPPORTED, _one_line(error)
+        record.status, record.reason = RunStatus.UNSUPPORTED, reason_of(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
-        record.status, record.reason = RunStatus.OOM, _one_line(error)
+        record.status, record.reason = RunStatus.OOM, reason_of(error)
     except Exception as error:  # noqa: BLE001 - every failure of a run is recorded
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
-        record.status, record.reason = RunStatus.OOM if out_of_memory else RunStatus.CRASHED, _one_line(error)
+        record.status, record.reason = RunStatus.OOM if out_of_memory else RunStatus.CRASHED, reason_of(error)
         log.error(traceback.format_exc())
     finally:
         record.environment |= contention.measured()
@@ -113,7 +113,7 @@ def built(config: DictConfig, progress: Report) -> tuple[Task, RunInputs]:
         if not inputs.field.of_prior and not isinstance(task, TakesField):
             raise ValueError(f"the task {type(task).__name__} does not take field={config.field}: leave it out")
     except (ValueError, OSError) as error:
-        raise BadInput(_one_line(error)) from error
+        raise BadInput(reason_of(error)) from error
     return task, inputs
 
 
@@ -153,10 +153,6 @@ def _print_to(path: Path) -> None:
     os.dup2(log, 1)
     os.dup2(log, 2)
     os.close(log)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 class _LogFile(logging.FileHandler):

@@ -9,6 +9,8 @@ from bench.records.format import seconds, size
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
 
+BUSY = 0.05  # share of the time that like runs waited, above which it is told
+
 
 class Shown(BaseException):
     """A plan was shown in place of a sweep. Not an Exception, which Hydra would turn into a warning."""
@@ -33,6 +35,10 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
         about = "reused" if cell.id in reused else told(left.cells[cell.id])
         print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
     print(total(plan, left))
+    known = [expected for expected in left.cells.values() if expected is not None]
+    if (whole := sum(e.seconds for e in known)) and (waited := sum(e.waited * e.seconds for e in known) / whole) > BUSY:
+        free = seconds(whole * (1 - waited) / left.workers)
+        print(f"note: like runs waited {waited:.0%} of their time for a processor; alone on it, it is about {free}")
 
 
 def named(cell: PlannedCell) -> str:

@@ -1,5 +1,6 @@
 """The process of a run, seen from its parent: the job, the messages, the limits, how it ends, and signals."""
 
+import errno
 import multiprocessing
 import signal
 import time
@@ -103,6 +104,13 @@ class Ending:
 
     status: RunStatus
     reason: str
+
+
+def reason_of(error: BaseException) -> str:
+    """An error as the reason of a failure: in one line, with the remedy where the disk is full."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{text}: free space, or set results_dir to a folder on another disk" if full else text
 
 
 def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> Ending | None:

@@ -20,7 +20,17 @@ from bench.records.record import Record, RunStatus, now, read_record
 from bench.run.check import refusals
 from bench.run.command import unwritten
 from bench.run.plan import show_plan
-from bench.run.process import Job, Message, Notice, RunLimits, Step, run_isolated, signals_delayed, stopped_by
+from bench.run.process import (
+    Job,
+    Message,
+    Notice,
+    RunLimits,
+    Step,
+    reason_of,
+    run_isolated,
+    signals_delayed,
+    stopped_by,
+)
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
 
@@ -134,7 +144,7 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
             _carry_out(Job(config, folder, record), limits, progress)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit
         stopped = stopped_by(error)
-        record.status, record.reason = RunStatus.CRASHED, " ".join(str(error).split()) or type(error).__name__
+        record.status, record.reason = RunStatus.CRASHED, reason_of(error)
         if stopped:
             record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:

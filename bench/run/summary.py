@@ -1,5 +1,6 @@
 """Prints the summary of a run or a sweep at its end."""
 
+import shlex
 from collections import Counter
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from bench.records.format import count, number, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan
 from bench.records.record import NOT_RUN, Record, RunStatus
+
+PICTURES = ("summary.png", "strip.png", "failure.png")  # of a run, the one to look at first
 
 
 def show(folder: Path, record: Record, index: Path) -> None:
@@ -39,7 +42,7 @@ def show(folder: Path, record: Record, index: Path) -> None:
         )
     for note in record.notes:
         print(f"note: {note}")
-    print(f"report: {index}")
+    _print_next(index, *(folder / name for name in PICTURES))
     if record.reused:
         print(f"reused: the run of {record.started}; rerun=all runs it again")
     if record.status != RunStatus.OK and not record.reason.startswith("stopped by"):  # the command line prints that
@@ -54,9 +57,21 @@ def show_sweep(plan: Plan, index: Path) -> list[str]:
     print(f"{len(plan.cells)} planned: {counts}")
     if set(statuses) - {"ok", "unsupported"}:
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
-    print(f"report: {index}")
+    failed = [(cell, record) for cell in plan.cells if (record := plan.record(cell)) and record["status"] != "ok"]
+    for cell, record in failed[:1]:
+        print(f"first failure: {index.parent / 'runs' / cell.id} ({record['status']}: {record['reason']})")
+    _print_next(index)
     print(plan.folder)
     return statuses
+
+
+def _print_next(index: Path, *pictures: Path) -> None:
+    """Prints what to look at next: the picture of a run, the page, and the command that makes the tables."""
+    for picture in [picture for picture in pictures if picture.is_file()][:1]:
+        print(f"picture: {picture}")
+    print(f"report: {index}")
+    where = "" if index.parent == Path("results") else f" results_dir={shlex.quote(str(index.parent))}"
+    print(f"tables: python -m bench.report{where}")
 
 
 def _candidates(record: Record) -> Table:

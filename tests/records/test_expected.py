@@ -44,7 +44,9 @@ def test_some_runs_are_like_no_other(known):
     assert Model([known], "A").of(run()) is None
 
 
-@pytest.mark.parametrize("config", [{"scale": None, "view": None}, {"scale": 3, "view": [], "task": "x"}])
+@pytest.mark.parametrize("config", [
+    {"scale": None, "view": None}, {"scale": 3, "view": [], "task": "x"}, {"scale": {"name": [1]}, "threads": [2]},
+])  # fmt: skip
 def test_a_record_of_another_kind_is_taken_as_it_is(config):
     assert Model([run(**config)], "A").of(run()) is None
 
@@ -83,3 +85,11 @@ def test_cells_that_are_reused_take_no_time():
     left = Remaining(expected(10.0, 10.0), workers=1)
     left.ended("reused")
     assert left.left(0.5) == pytest.approx(20.0)
+
+
+def test_it_says_for_how_long_like_runs_waited_for_a_processor():
+    runs = [run(10.0) for _ in range(3)]
+    for share, one in zip((0.2, 0.5, None), runs, strict=True):
+        one["environment"]["waited_share"] = share
+    assert Model(runs, "A").of(run()).waited == pytest.approx(0.35)
+    assert Model([run()], "A").of(run()).waited == 0.0

@@ -15,6 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from bench.__main__ import main
 from bench.records import folder as run_folder
+from bench.run.command import options_first
 from bench.setup import inputs as stage
 from tests.run.driving import PATIENCE, ROOT, Outcome, driver, lines_of_curves, wait_for
 
@@ -105,6 +106,9 @@ def assert_one_line(err: str, *words: str) -> None:
         ("verbose=maybe", ("verbose", "'maybe'", "bool")),
         ("device=gpu", ("device", "'gpu'", "auto, cpu, cuda")),
         ("renderer", ("'renderer'", "=")),
+        ("renderer=dist,,dvr", ("'renderer=dist,,dvr' has a comma without a value beside it",)),
+        ("renderer=dist,", ("'renderer=dist,' has a comma without a value beside it",)),
+        ("--multi", ("unknown option '--multi'", "did you mean --multirun")),
     ],
 )
 def test_a_command_line_that_cannot_be_is_told_with_the_nearest_name(bench, tmp_path, argument, words):
@@ -113,6 +117,23 @@ def test_a_command_line_that_cannot_be_is_told_with_the_nearest_name(bench, tmp_
     assert_one_line(err, "error: ", *words)
     assert out == ""
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "arranged"),
+    [
+        (["seed=0,1", "-m"], ["-m", "seed=0,1"]),
+        (
+            ["a=1", "--config-dir", "my conf", "b=2", "--multirun"],
+            ["--config-dir", "my conf", "--multirun", "a=1", "b=2"],
+        ),
+        (["a=1", "--config-dir=x", "--cfg", "job"], ["--config-dir=x", "--cfg", "job", "a=1"]),
+        (["a=-1", "--help"], ["--help", "a=-1"]),
+        (["a=1", "--info", "b=2"], ["--info", "a=1", "b=2"]),
+    ],
+)
+def test_options_may_stand_anywhere(given, arranged):
+    assert options_first(given) == arranged
 
 
 @pytest.mark.parametrize("multirun", [[], ["-m"]])
@@ -289,7 +310,8 @@ def test_a_disk_that_fills_up_during_a_run_is_told(bench, monkeypatch):
     assert "Traceback" not in out + err
     assert_one_line(err, "No space left on device")
     record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
-    assert (record["status"], record["reason"]) == ("crashed", "[Errno 28] No space left on device")
+    full = "[Errno 28] No space left on device: free space, or set results_dir to a folder on another disk"
+    assert (record["status"], record["reason"]) == ("crashed", full)
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def test_a_part_that_cells_share_is_built_once(plain, monkeypatch):
     cells.append(plain("renderer=dist", "renderer.steps=0"))
     found = refusals(cells, Isolation.off)
     assert found == [""] * 40 + ["steps must be at least 1, not 0: the paper uses 50 to 100"]
-    assert (built["renderer"], built["task"], built["dataset"], built["prior"]) == (3, 2, 1, 1)
+    assert (built["renderer"], built["task"], built["dataset"], built["prior"]) == (3, 1, 1, 1)
 
 
 def test_a_process_of_its_own_finds_the_same(plain):

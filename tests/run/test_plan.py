@@ -33,10 +33,11 @@ def planned(results: Path) -> list[sweep.PlannedCell]:
     return plans[0].cells
 
 
-def write(results: Path, cell: sweep.PlannedCell, seconds: float) -> None:
+def write(results: Path, cell: sweep.PlannedCell, seconds: float, waited: float = 0.0) -> None:
     names = ("id", "task", "renderer", "dataset", "seed", "config")
     record = Record(**{name: value for name, value in asdict(cell).items() if name in names}, status=RunStatus.OK)
-    record.ended, record.seconds, record.environment = record.started, {"total": seconds}, {"cpu": cpu_name()}
+    record.ended, record.seconds = record.started, {"total": seconds}
+    record.environment = {"cpu": cpu_name(), "waited_share": waited}
     identity = sweep.identity_of(cell)
     record.config_hash, record.code = identity.config_hash, identity.code
     (results / "runs" / cell.id).mkdir(parents=True)
@@ -91,3 +92,10 @@ def test_that_it_was_planned_does_not_change_a_run(results):
 def test_an_estimate_says_how_sure_it_is():
     assert told(None) == "no like run"
     assert told(next(iter(expected(10.0).values()))) == "about 10.0 s (1 like run), +1.00 kB"
+
+
+def test_an_estimate_from_a_loaded_machine_says_so(results):
+    write(results, planned(results)[0], 30.0, waited=0.6)
+    *_, whole, note = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
+    assert "about 90.0 s" in whole
+    assert note == "note: like runs waited 60% of their time for a processor; alone on it, it is about 36.0 s"

@@ -1,0 +1,58 @@
+"""The last lines of a command say what to look at next, on narrow terminals and in logs too."""
+
+from pathlib import Path
+
+import pytest
+
+from bench.records.read import Plan, PlannedCell
+from bench.records.record import Record, RunStatus
+from bench.run.summary import show, show_sweep
+
+
+def ended(results: Path, name: str, status: str = "ok") -> Record:
+    record = Record(name, "completion", "dist", "sofa", 0, {"label": "DIST, a name that is long"}, scene="sofa test 0")
+    record.status, record.reason, record.ended = RunStatus(status), "" if status == "ok" else "why", record.started
+    record.metrics = record.metrics_start = {"chamfer_l2": 0.0125, "normal_consistency": 0.7}
+    (results / "runs" / name).mkdir(parents=True)
+    record.write(results / "runs" / name)
+    return record
+
+
+@pytest.mark.parametrize("width", [40, 120])
+def test_a_run_ends_with_its_picture_its_page_and_the_command_for_tables(tmp_path, capsys, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    record, folder = ended(tmp_path / "my r", "a"), tmp_path / "my r" / "runs" / "a"
+    (folder / "summary.png").touch()
+    (folder / "strip.png").touch()
+    show(folder, record, tmp_path / "my r" / "index.html")
+    *table, picture, page, tables, last = capsys.readouterr().out.splitlines()
+    assert [picture, page, last] == [
+        f"picture: {folder}/summary.png",
+        f"report: {folder.parents[1]}/index.html",
+        str(folder),
+    ]
+    assert tables == f"tables: python -m bench.report results_dir='{tmp_path / 'my r'}'"
+    assert max(map(len, table)) <= width
+    assert "12.5" in "\n".join(table)
+    assert all(letter.isprintable() for line in table for letter in line)
+
+
+def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    record = ended(Path("results"), "a")
+    show(Path("results/runs/a"), record, Path("results/index.html"))
+    out = capsys.readouterr().out.splitlines()
+    assert out[-3:] == ["report: results/index.html", "tables: python -m bench.report", "results/runs/a"]
+    assert not any(line.startswith("picture") for line in out)
+
+
+def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
+    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
+    plan = Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00")
+    for name, status in (("a", "ok"), ("b", "empty"), ("c", "crashed")):
+        ended(tmp_path, name, status)
+    assert show_sweep(plan, tmp_path / "index.html") == ["ok", "empty", "crashed", "not_run"]
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == "4 planned: 1 ok, 1 empty, 1 crashed, 1 not_run"
+    assert out[2] == f"first failure: {tmp_path}/runs/b (empty: why)"
+    assert out[-1] == str(plan.folder)
