@@ -7,6 +7,7 @@ from typing import Any
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip
+from bench.pictures.run_figures import save_gallery
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
 from bench.setup.inputs import RunContext
@@ -69,6 +70,8 @@ def solve(
         note_result(run, replace(after, failure=failure_of(history, after)))
         filmstrip.add(len(history.curve), *problem.frame())
         draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
+        if inputs.evaluation.gallery is not None:
+            save_gallery(run.folder, inputs, problem.observed, {"start": before.mesh, "found": after.mesh})
     return problem
 
 
