@@ -19,6 +19,8 @@ TILE = 160  # pixels of a picture's side in a gallery
 GAP = 4  # pixels between cells
 NAMES = 1.3  # inches beside the pictures, for the names of rows
 LETTERS = 18  # of a line of such a name
+LETTERS_PER_INCH = 19  # of names of columns
+LARGEST = 0.9  # inches of a picture's side
 FRAME = 0.85  # grey between cells
 FOUND, TRUE, START = "found", "true", "start"  # of images.npz, see `bench.pictures.run_figures.save_gallery`
 FRONT, BEHIND = 0, 1  # its views
@@ -128,16 +130,24 @@ def draw(blocks: Sequence[Block], across: int) -> Figure:
         across: pictures side by side in a cell.
     """
     columns = max((len(block.columns) for block in blocks), default=1)
-    inches = (style.WIDTH - NAMES) / max(columns * across, 8)
-    lines = [max(len(block.rows), 1) for block in blocks]
-    height = inches * sum(lines) + 0.35 * len(blocks) + 0.1
-    figure, axes = chart.sheet(height, max(len(blocks), 1), 1, height_ratios=lines or [1])
+    inches = min((style.WIDTH - NAMES) / (columns * across), LARGEST)  # of a picture
+    wide = max(round(inches * across * LETTERS_PER_INCH), 6)
+    blocks = [replace(block, columns=[_wrapped(name, wide) for name in block.columns]) for block in blocks]
+    heads = [0.3 + 0.1 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
+    lines = [max(len(block.rows), 1) * inches for block in blocks]
+    size = {"width": NAMES + columns * across * inches, "height_ratios": lines or [1]}
+    figure, axes = chart.sheet(sum(heads) + sum(lines) + 0.1, max(len(blocks), 1), 1, **size)
     figure.get_layout_engine().set(**pictures.CLOSE)
     for axis in axes.flat:
         axis.axis("off")
     for axis, block in zip(axes.flat, blocks, strict=False):
         _draw_block(axis, block, across)
     return figure
+
+
+def _wrapped(text: str, letters: int) -> str:
+    """The text in lines of so many letters, besides those that it has."""
+    return "\n".join(part for line in text.split("\n") for part in textwrap.wrap(line, letters) or [""])
 
 
 def _draw_block(axis: Axes, block: Block, across: int) -> None:
@@ -151,7 +161,7 @@ def _draw_block(axis: Axes, block: Block, across: int) -> None:
     axis.imshow(montage, interpolation="none")
     height, width = TILE + GAP, across * TILE + GAP
     axis.set_xticks([width * (place + 0.5) for place in range(len(block.columns))], block.columns)
-    names = ["\n".join(textwrap.wrap(name, LETTERS)) for name in block.rows]
+    names = [_wrapped(name, LETTERS) for name in block.rows]
     axis.set_yticks([height * (place + 0.5) for place in range(len(names))], names)
     axis.tick_params(length=0, top=False, bottom=False, labeltop=True, labelbottom=False, labelsize=6)
     axis.set_title(block.title, fontsize=7, loc="left")
