@@ -181,7 +181,7 @@ def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
     result = made(tmp_path, rerendering)
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "sofa 0"]
-    sizes = ["2 pixels", "4 pixels", "16 pixels", "turned 1", "turned 2"]
+    sizes = ["2 pixels", "4 pixels", "16 pixels", "turned by 120°", "turned by 240°"]
     assert columns == ["photograph", *sizes, *rerendering.LIGHTS]
     assert all(found["sofa 0", column] == pytest.approx((0.8,) * 3, abs=1e-3) for column in sizes)
     left, above, right = (found["sofa 0", name][0] for name in rerendering.LIGHTS)

@@ -19,7 +19,7 @@ READS = dvr_table2.READS
 PRESET = "rgb_dist"  # the row that is shown, where it was run; else the first
 MOST_SCENES = 3
 SIZES = ("size_0_", "size_1_", "size_2_")  # of images.npz, see `bench.reconstruct.pictures`
-TURNED = ("turned_0_", "turned_1_")
+TURNED = {"turned_0_": "turned by 120°", "turned_1_": "turned by 240°"}  # about the vertical axis, likewise
 LIGHTS = {  # towards the light; axes to the right, up, towards the camera
     "light from the left": (-0.8, 0.3, 0.5),
     "light from above": (0.0, 0.9, 0.45),
@@ -28,7 +28,7 @@ LIGHTS = {  # towards the light; axes to the right, up, towards the camera
 AMBIENT = 0.25  # of a light; the rest falls off with the cosine
 NOTES = (
     "The shape was learnt from photographs alone, by {row}; scenes are the first ones, not chosen ones. The photograph "
-    "was held out, and sizes and lights are seen by its camera; “turned” is by 120 and 240 degrees about the vertical.",
+    "was held out, and sizes and lights are seen by its camera; the turns are about the vertical axis.",
     f"Lights: the learnt colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
     "DIST, Fig. 19, renders a network of textures with codes; here colours are a network of position, normal and view.",
 )
@@ -68,7 +68,7 @@ def _line(record: Record, folder: Path) -> tuple[list[str], list[Cell], str]:
     last = SIZES[-1]
     columns = {"photograph": shown_alone(found["photograph"].astype(float), hits[last])}
     for prefix in (*SIZES, *TURNED):
-        name = f"{max(hits[prefix].shape)} pixels" if prefix in SIZES else f"turned {TURNED.index(prefix) + 1}"
+        name = TURNED.get(prefix, f"{max(hits[prefix].shape)} pixels")
         columns[name] = shown_alone(_on_white(found[f"{prefix}colours"], hits[prefix]), hits[prefix])
     for name, light in LIGHTS.items():
         lit = found[f"{last}colours"] * _shade(found[f"{last}normals"].astype(float), light)

@@ -133,7 +133,7 @@ def draw(blocks: Sequence[Block], across: int) -> Figure:
     inches = min((style.WIDTH - NAMES) / (columns * across), LARGEST)  # of a picture
     wide = max(round(inches * across * LETTERS_PER_INCH), 6)
     blocks = [replace(block, columns=[_wrapped(name, wide) for name in block.columns]) for block in blocks]
-    heads = [0.3 + 0.1 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
+    heads = [0.33 + 0.12 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
     lines = [max(len(block.rows), 1) * inches for block in blocks]
     size = {"width": NAMES + columns * across * inches, "height_ratios": lines or [1]}
     figure, axes = chart.sheet(sum(heads) + sum(lines) + 0.1, max(len(blocks), 1), 1, **size)
