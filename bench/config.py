@@ -26,6 +26,7 @@ LEAST = {
     "evaluation.grid": 8,
     "evaluation.points": 1,
     "evaluation.picture": 4,
+    "evaluation.gallery": 4,
     "evaluation.every": 1,
 }
 DOUBLING = "doubling"
@@ -64,6 +65,7 @@ class EvaluationSettings:
     points: int = MISSING
     fscore_threshold: float = MISSING
     picture: int | None = MISSING
+    gallery: int | None = MISSING
     every: int | str | None = MISSING
     film: str | None = MISSING
 

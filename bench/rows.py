@@ -65,17 +65,26 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
     return ",".join(renderers_of(experiment, runtime))
 
 
-def _methods(kind: str, *, _root_: DictConfig) -> str:
+def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     """The methods with a search space, to be swept over: of the kind `space` the spaces, of `tuned` the methods.
 
-    Of `tuned`, the tuned setting stands behind each method for which it has been written.
+    Of `tuned`, those for which a tuned setting has been written, each with that behind it.
+
+    Args:
+        without: names of methods that are left out.
+
+    Raises:
+        ValueError: for such a name that has no search space.
     """
     folders = [folder / "method" for folder in _folders(_root_.hydra.runtime)]
     names = sorted({path.stem for folder in folders for path in (folder / "space").glob("*.yaml")})
+    if unknown := {*without} - {*names}:
+        raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
+    names = [name for name in names if name not in without]
     if kind == "space":
         return ",".join(f"space/{name}" for name in names)
     written = [name for name in names if any((folder / "tuned" / f"{name}.yaml").is_file() for folder in folders)]
-    return ",".join(part for name in names for part in (name, f"tuned/{name}") if part == name or name in written)
+    return ",".join(part for name in written for part in (name, f"tuned/{name}"))
 
 
 def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:

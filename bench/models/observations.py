@@ -196,7 +196,9 @@ def together(views: list[GivenView]) -> GivenView:
     flat = [view.rays.flat() for view in views]
     rays = Rays(torch.cat([rays.origins for rays in flat]), torch.cat([rays.directions for rays in flat]))
     masks = [view.mask.flatten() for view in views if view.mask is not None]
-    return replace(views[0], rays=rays, **parts, mask=torch.cat(masks) if masks else None)
+    normals = [view.normals.flatten(0, -2) for view in views if view.normals is not None]
+    parts |= {name: torch.cat(some) if some else None for name, some in (("mask", masks), ("normals", normals))}
+    return replace(views[0], rays=rays, **parts)
 
 
 def held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:

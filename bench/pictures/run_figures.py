@@ -16,11 +16,12 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from bench.evaluate.evaluate import picture_view
+from bench.evaluate.evaluate import picture_view, unseen
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
 from bench.setup.inputs import RunInputs
+from datasets.mesh import Mesh
 from datasets.scene import View, see
 from datasets.truth import Truth
 from renderers.camera import Camera
@@ -96,7 +97,7 @@ def draw_run(
         curve: lines of curve.jsonl.
         title: of the summary.
     """
-    front, back = _cameras(inputs)
+    front, back = _cameras(inputs, inputs.evaluation.picture)
     truth = Truth(inputs.scene.mesh)
     pairs = (
         *(
@@ -192,15 +193,39 @@ def save_images(folder: Path, found: View, true: View, **more: np.ndarray) -> No
     np.savez_compressed(folder / "images.npz", **plain, **more)  # type: ignore[arg-type]
 
 
+def save_gallery(
+    folder: Path, inputs: RunInputs, observed: Bool[Tensor, "height width"], meshes: dict[str, Mesh | None]
+) -> None:
+    """Writes `folder/images.npz` for galleries: given depths, and meshes seen by the scene's camera and from behind.
+
+    `given` is NaN where no depth is given. NAME_normals [2, h, w, 3] and NAME_hit [2, h, w] are those of each mesh, by
+    its name, and of the truth, "true".
+
+    Args:
+        folder: the run folder.
+        inputs: of the run.
+        observed: pixels of the scene's view whose depth is given.
+        meshes: by name; None shows nothing.
+    """
+    cameras = _cameras(inputs, inputs.evaluation.gallery)
+    arrays = {"given": torch.where(observed.cpu(), inputs.scene.given()[0].depth, torch.nan).half().numpy()}
+    for name, mesh in {**meshes, "true": inputs.scene.mesh}.items():
+        truth = None if mesh is None else Truth(mesh, closed=False)
+        views = [unseen(camera) if truth is None else see(truth, camera) for camera in cameras]
+        arrays[f"{name}_normals"] = torch.stack([picture_normals(view) for view in views]).half().numpy()
+        arrays[f"{name}_hit"] = torch.stack([view.mask for view in views]).numpy()
+    np.savez_compressed(folder / "images.npz", **arrays)  # type: ignore[arg-type]
+
+
 def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
     """Normals with axes to the right, up and towards the camera, as pictures show them."""
     rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
     return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
 
 
-def _cameras(inputs: RunInputs) -> tuple[Camera, Camera]:
-    """The scene's camera at the pictures' resolution, and one behind the shape."""
-    camera, size = inputs.scene.view.camera, inputs.evaluation.picture
+def _cameras(inputs: RunInputs, size: int) -> tuple[Camera, Camera]:
+    """The scene's camera at so many pixels per side, and one behind the shape."""
+    camera = inputs.scene.view.camera
     x, _, z = camera.center.tolist()
     views = replace(inputs.views, resolution=size)
     behind = views.camera(degrees(atan2(x, z)) + BEHIND, BEHIND_ELEVATION)

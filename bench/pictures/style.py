@@ -61,7 +61,9 @@ _LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<"
 _PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
 _OFFICIAL_DIST = Look("#2f9e9e", "<", "-.")
 _MESH = Look("#8a8a8a", "d", "-.")
-_NEWTON, _NEUS_BUDGET = Look("#1b9e77", "h", (0, (1, 1))), Look("#f59cc6", ">", "--")
+_NEWTON, _NEUS, _NEUS_BUDGET = Look("#1b9e77", "h", (0, (1, 1))), Look("#e7298a", ">"), Look("#f59cc6", ">", "--")
+_VOLSDF, _UNISURF = Look("#e69f00", "P"), Look("#7a4a00", "X", "-.")
+_RELAXED_BOUNDARY, _RANGE_ANALYSIS = Look("#66a61e", "*"), Look("#2f6f8f", "8", "--")
 # By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
 KNOWN = {
     "naive": _NAIVE,
@@ -87,12 +89,12 @@ KNOWN = {
     "dvr_official_slope": Look("#e7a1ab", "^", "--"),
     "idr": _IDR,
     "newton": _NEWTON,
-    "neus": Look("#e7298a", ">"),
+    "neus": _NEUS,
     "neus_budget": _NEUS_BUDGET,
-    "volsdf": Look("#e69f00", "P"),
-    "unisurf": Look("#7a4a00", "X", "-."),
-    "relaxed_boundary": Look("#66a61e", "*"),
-    "range_analysis": Look("#2f6f8f", "8", "--"),
+    "volsdf": _VOLSDF,
+    "unisurf": _UNISURF,
+    "relaxed_boundary": _RELAXED_BOUNDARY,
+    "range_analysis": _RANGE_ANALYSIS,
     "mesh_proxy": _MESH,
     "deepsdf": Look("#009e73", "P", "-."),
     "dist_mask": _DIST,
@@ -103,6 +105,14 @@ KNOWN = {
     "dvr_mask": _DVR,
     "idr_mask": _IDR,
     "naive_mask": _NAIVE_OF_METHODS,
+    "newton_mask": _NEWTON,
+    "neus_mask": _NEUS,
+    "neus_budget_mask": _NEUS_BUDGET,
+    "volsdf_mask": _VOLSDF,
+    "unisurf_mask": _UNISURF,
+    "relaxed_boundary_mask": _RELAXED_BOUNDARY,
+    "range_analysis_mask": _RANGE_ANALYSIS,
+    "mesh_mask": _MESH,
     "multiview_dist": _LIGHT_DIST,
     "multiview_restarts": _DIST,
     "multiview_paper": _PAPER_DIST_DEPTH,

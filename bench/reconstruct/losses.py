@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error, slopes_at
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
@@ -100,9 +100,7 @@ class Losses:
             neighbours = torch.nn.functional.normalize(slopes_at(metered, beside), dim=-1)
             terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
         if self.normals and pixels.normals is not None:
-            known = pixels.normals[inside].square().sum(-1) > 0
-            cosine = (normals * pixels.normals[inside]).sum(-1)[known]
-            terms["normals"] = self.normals * (1 - cosine).sum() / known.sum().clamp_min(1)
+            terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
         if self.eikonal and shape.kind is not Kind.LEVEL:
             anywhere = 2 * torch.rand(ANYWHERE, 3, device=points.device) - 1
             off = [
@@ -113,12 +111,6 @@ class Losses:
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
-
-
-def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The field's gradients at points, with a graph towards its parameters and the points."""
-    points = points if points.requires_grad else points.detach().requires_grad_(True)
-    return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
 
 
 def _summed_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:

@@ -30,6 +30,8 @@ from renderers.fields.coloured import Coloured
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
 ERRORS = colormaps["magma_r"].with_extremes(bad="0.85")  # grey where nothing is judged
 Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
+SMALLER = (8, 4, 1)  # by which the largest size of a rendering is divided
+TURNS = (120.0, 240.0)  # degrees about the vertical axis
 WORST = 0.3  # mean difference of colours that is shown darkest
 
 
@@ -89,23 +91,37 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
     shot = subject.held_out[len(subject.held_out) // 2]
-    view, image = seen(_larger(shot.camera, inputs))
-    arrays = {"photograph": shot.colours, "colours": image, "normals": picture_normals(view), "hit": view.mask}
+    arrays = {"photograph": shot.colours} | _seen_arrays(seen, _larger(shot.camera, inputs.evaluation.picture))
     if len(subject.given) == 1:
         arrays["given"] = subject.given[0].colours
     if subject.truth is not None:
-        behind = turned(view.camera, np.pi)
-        back, painted = seen(behind)
-        true = torch.from_numpy(normals_image(see(Truth(subject.truth), behind)))
-        arrays |= {"back_colours": painted, "back_normals": picture_normals(back), "back_hit": back.mask}
-        arrays |= {"back_truth": true[..., :3]}
+        behind = turned(_larger(shot.camera, inputs.evaluation.picture), np.pi)
+        true = normals_image(see(Truth(subject.truth), behind))
+        arrays |= _seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
+    if inputs.evaluation.gallery is not None:
+        arrays |= _rendered_again(seen, shot.camera, inputs.evaluation.gallery)
     plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
     np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 
-def _larger(camera: Camera, inputs: RunInputs) -> Camera:
-    """The camera at the size of pictures."""
-    larger = inputs.evaluation.picture / max(camera.height, camera.width)
+def _rendered_again(seen: Seen, camera: Camera, largest: int) -> dict[str, Tensor]:
+    """Pictures of a shape in several sizes, size_0_... and so on, and at the last from other sides, turned_0_..."""
+    cameras = {f"size_{place}_": _larger(camera, largest // smaller) for place, smaller in enumerate(SMALLER)}
+    at_last = _larger(camera, largest)
+    cameras |= {f"turned_{place}_": turned(at_last, np.radians(angle)) for place, angle in enumerate(TURNS)}
+    return {k: v for prefix, one in cameras.items() for k, v in _seen_arrays(seen, one, prefix).items()}
+
+
+def _seen_arrays(seen: Seen, camera: Camera, prefix: str = "") -> dict[str, Tensor]:
+    """The colours, normals and hits that a camera sees, by names with a prefix."""
+    view, image = seen(camera)
+    parts = {"colours": image, "normals": picture_normals(view), "hit": view.mask}
+    return {prefix + name: part for name, part in parts.items()}
+
+
+def _larger(camera: Camera, size: int) -> Camera:
+    """The camera with so many pixels on the longer side."""
+    larger = size / max(camera.height, camera.width)
     return camera.resized(round(larger * camera.height), round(larger * camera.width))
 
 
@@ -116,7 +132,7 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 1.2), layout="constrained")
     axes = figure.subplots(len(shots), 4, squeeze=False)
     for row, shot in zip(axes, shots, strict=True):
-        view, image = seen(_larger(shot.camera, inputs))
+        view, image = seen(_larger(shot.camera, inputs.evaluation.picture))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
         row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
         shown = row[2].imshow(_error(seen, shot), cmap=ERRORS, vmin=0, vmax=WORST, interpolation="nearest")

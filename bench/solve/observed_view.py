@@ -1,7 +1,8 @@
 """The observations of a view or of some rays, depths and a mask, and the loss that compares a field with them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,20 @@ def depth_error(
     """The error of each ray's depth or of its point, as `loss` says; `at_one` is the depth at distance 1."""
     error = (found - given).abs()
     return error / at_one if loss == POINTS else error
+
+
+def normal_error(found: Float[Tensor, "n 3"], given: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """1 less the cosine between unit normals and given ones, the mean over those that are not 0 (DIST, B.3)."""
+    known = given.square().sum(-1) > 0
+    cosine = (found * given).sum(-1)[known]
+    return (1 - cosine).sum() / known.sum().clamp_min(1)
+
+
+def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """The field's gradients at points, with a graph towards its parameters and the points."""
+    points = points if points.requires_grad else points.detach().requires_grad_(True)
+    with torch.enable_grad():  # also where only the loss is wanted
+        return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
 
 
 @runtime_checkable
@@ -55,6 +70,8 @@ class GivenView:
     depth_of_distance: Float[Tensor, "*rays"]  # depth at distance 1, the cosine of DIST, Eq. 2
     observed: Bool[Tensor, "*rays"]
     mask: Bool[Tensor, "*rays"] | None
+    normals: Float[Tensor, "*rays 3"] | None = None  # unit, in world coordinates; None where they are not given
+    normal_weight: float = 0.0  # of 1 less their cosine with those of the rendered surface
 
     @staticmethod
     def of(
@@ -77,15 +94,17 @@ class GivenView:
             mask=mask,
         ).to(device)
 
+    def with_normals(self, normals: Float[Tensor, "*rays 3"], weight: float) -> "GivenView":
+        """The same with normals that are given as well, and compared at pixels that are observed and hit."""
+        return replace(self, normals=normals.to(self.depth.device), normal_weight=weight)
+
     def to(self, device: torch.device) -> "GivenView":
         """The same on a device."""
-        parts = {name: getattr(self, name).to(device) for name in ("rays", "depth", "depth_of_distance", "observed")}
-        return replace(self, **parts, mask=None if self.mask is None else self.mask.to(device))
+        return self._changed(lambda part: part.to(device))
 
     def some(self, rays: Int[Tensor, " n"]) -> "GivenView":
         """The observations of some rays of one row."""
-        parts = {name: getattr(self, name)[rays] for name in ("rays", "depth", "depth_of_distance", "observed")}
-        return replace(self, **parts, mask=None if self.mask is None else self.mask[rays])
+        return self._changed(lambda part: part[rays])
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted terms of DIST, Eq. 5."""
@@ -95,8 +114,17 @@ class GivenView:
         found = rendering.distance * self.depth_of_distance
         error = depth_error(self.settings.depth_loss, found, self.depth, self.depth_of_distance)
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
+        if self.normals is not None:
+            slopes = slopes_at(field, rendering.points[compared])
+            off = normal_error(torch.nn.functional.normalize(slopes, dim=-1), self.normals[compared])
+            terms["normals"] = self.normal_weight * off
         if self.mask is not None:
             given = torch.where(self.observed, self.depth / self.depth_of_distance, torch.nan)
             silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, Observed(self.mask, given))
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
+
+    def _changed(self, change: Callable[[Any], Any]) -> "GivenView":
+        """The same with each part changed that there is."""
+        names = ("rays", "depth", "depth_of_distance", "observed", "mask", "normals")
+        return replace(self, **{name: change(part) for name in names if (part := getattr(self, name)) is not None})

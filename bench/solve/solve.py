@@ -7,6 +7,7 @@ from typing import Any
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip
+from bench.pictures.run_figures import save_gallery
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
 from bench.setup.inputs import RunContext
@@ -36,7 +37,12 @@ COSTS = {
 
 
 def solve(
-    make_problem: Callable[[], Problem], settings: OptimiserSettings, run: RunContext, definitions: dict[str, str]
+    make_problem: Callable[[], Problem],
+    settings: OptimiserSettings,
+    run: RunContext,
+    definitions: dict[str, str],
+    *,
+    gallery: bool = False,
 ) -> Problem:
     """Makes a problem, solves it, fills the run's record and folder, and gives the problem in its final state.
 
@@ -45,6 +51,7 @@ def solve(
         settings: iterations and learning rate.
         run: its record has the definitions of its numbers also where it ends before it has a problem.
         definitions: of the metrics of the problem's `evaluate`.
+        gallery: whether pictures for galleries are written, where the configuration asks for them.
 
     Raises:
         Unsupported: where the renderer cannot do what the problem's field needs.
@@ -69,6 +76,8 @@ def solve(
         note_result(run, replace(after, failure=failure_of(history, after)))
         filmstrip.add(len(history.curve), *problem.frame())
         draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
+        if gallery and inputs.evaluation.gallery is not None:
+            save_gallery(run.folder, inputs, problem.observed, {"start": before.mesh, "found": after.mesh})
     return problem
 
 
@@ -79,7 +88,7 @@ def solve_task(task: InverseTask, run: RunContext) -> Problem:
     def problem() -> Problem:
         return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
 
-    return solve(problem, task.optimiser, run, DEFINITIONS)
+    return solve(problem, task.optimiser, run, DEFINITIONS, gallery=True)
 
 
 def note_result(run: RunContext, after: Evaluation) -> None:

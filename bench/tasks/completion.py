@@ -38,6 +38,8 @@ class Completion:
         depth_loss: over pixels that are observed and hit, the mean of "depth", the error of the camera's depth (DIST,
             B.3), or of "points", the distance in space between the points (DVR's official code).
         depth_weight: of that mean.
+        normal_weight: of 1 less the cosine between the normals of the rendered surface and the true ones, the mean over
+            the same pixels (DIST, B.3); beyond 0 the normals of these pixels are given as well.
         silhouette: loss of the mask.
         silhouette_weight: of that loss.
         code: penalty on the code.
@@ -49,6 +51,7 @@ class Completion:
     mask: bool
     depth_loss: str
     depth_weight: float
+    normal_weight: float
     silhouette: SilhouetteLoss
     silhouette_weight: float
     code: CodePenalty
@@ -60,7 +63,7 @@ class Completion:
         parse_amount(self.points)
         check_choice("task.depths", self.depths, (MEASURED, EXACT))
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
-        for name in ("depth_weight", "silhouette_weight"):
+        for name in ("depth_weight", "normal_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
 
     def execute(self, run: RunContext) -> None:
@@ -95,4 +98,5 @@ class Completion:
         view, known = scene.given(exact=self.depths == EXACT)
         observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
-        return GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device), observed
+        given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
+        return given.with_normals(view.normals, self.normal_weight) if self.normal_weight else given, observed

@@ -18,9 +18,9 @@ from bench.evaluate.finite_differences import (
     subrays,
 )
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
-from bench.reconstruct.losses import slopes_at
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
+from bench.solve.observed_view import slopes_at
 from bench.solve.problem import check_field_gradient, check_kind
 from renderers.boundary import check_gradients, rendered
 from renderers.camera import Camera, Rays, sphere_span

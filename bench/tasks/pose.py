@@ -14,7 +14,7 @@ from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, ren
 from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.solve.solve import solve
@@ -260,8 +260,7 @@ class PoseProblem:
         }
         if self.settings.normal_weight:
             found = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
-            difference = 1 - (found * self.normals[compared]).sum(-1)
-            terms["normals"] = self.settings.normal_weight * difference.sum() / count
+            terms["normals"] = self.settings.normal_weight * normal_error(found, self.normals[compared])
         total = torch.stack(list(terms.values())).sum()
         self.starts.note(start, step, total)
         return {"total": total, **terms}

@@ -1,5 +1,6 @@
 """A renderer is one file and one YAML: every experiment that compares renderers then has a row for it."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -176,19 +177,48 @@ def test_records_and_plans_without_a_method_are_read(tmp_path):
 SPACE = "label: Mine\ntask:\n  silhouette_weight: ${drawn:0,1.0,100.0}\n"
 
 
-def test_the_tuning_has_all_spaces_and_the_tuned_rows_that_there_are(swept, tmp_path):
-    for folder, text in (("", "label: Mine\n"), ("space", SPACE), ("tuned", "label: Mine, tuned\n")):
-        path = tmp_path / "own/method" / folder / "mine_mask.yaml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"# @package _global_\n{text}")
+SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
+
+
+def own_methods(folder: Path) -> None:
+    """Two methods with search spaces, of which one has been tuned."""
+    files = {"": "label: Mine\n", "space": SPACE, "tuned": "label: Mine, tuned\n"}
+    for name, of in (("mine_mask", files), ("mine_untuned", {"": files[""], "space": SPACE})):
+        for part, text in of.items():
+            path = folder / "method" / part / f"{name}.yaml"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"# @package _global_\n{text}")
+
+
+def test_the_tuning_has_all_spaces_but_slow_ones_and_the_methods_that_were_tuned(swept, tmp_path):
+    own_methods(tmp_path / "own")
     plan, _ = swept("+experiment=tuning", "draw=0", "split=test", folder=tmp_path / "own")
     spaces = {path.stem for path in (CONF / "method/space").glob("*.yaml")}
-    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in (*spaces, "mine_mask")}
+    own = {"mine_mask", "mine_untuned"}
+    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in (spaces - SLOW) | own}
     plan, _ = swept("+experiment=tuned", "task.points=20", folder=tmp_path / "own")
     methods = [cell.method for cell in plan.cells]
     assert {*methods} >= {"dist_mask", "dist_mask_paper", "mine_mask", "tuned/mine_mask"}
     assert methods.index("tuned/mine_mask") == methods.index("mine_mask") + 1
+    assert "mine_untuned" not in methods
     assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_mask"}
+
+
+def test_slow_methods_join_the_tuning_by_the_command_that_its_file_names(swept):
+    (named,) = re.findall(r"by (\+method=\S+)", (CONF / "experiment/tuning.yaml").read_text())
+    plan, _ = swept("+experiment=tuning", "draw=0", "split=test", named)
+    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in SLOW}
+    assert {cell.config["experiment"] for cell in plan.cells} == {"tuning"}
+
+
+def test_a_method_without_a_space_cannot_be_left_out(swept, tmp_path, capsys):
+    path = tmp_path / "own/experiment/mine.yaml"
+    path.parent.mkdir(parents=True)
+    sweep_over = "hydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}"
+    path.write_text(f"# @package _global_\ndefaults: [tuning, _self_]\n{sweep_over}\n")
+    with pytest.raises(IndexError):  # there is no plan
+        swept("+experiment=mine", folder=tmp_path / "own")
+    assert "${methods:space,...} leaves out neus: not in method/space" in capsys.readouterr().err
 
 
 def test_a_sweep_composes_each_cell_once_for_the_plan_and_once_to_run_it(swept, monkeypatch):

@@ -37,7 +37,9 @@ def inputs(tmp_path_factory) -> RunInputs:
         make_scene=lambda: Scene("sphere test 0", mesh, see(Truth(mesh), VIEWS.camera(30.0, 20.0))),
         views=VIEWS,
         make_prior=lambda: Prior(decoder, torch.zeros(1, 0)),
-        evaluation=EvaluationSettings(grid=48, points=3000, fscore_threshold=0.05, picture=16, every=None, film=None),
+        evaluation=EvaluationSettings(
+            grid=48, points=3000, fscore_threshold=0.05, picture=16, gallery=None, every=None, film=None
+        ),
         seed=0,
         device=torch.device("cpu"),
         cache=tmp_path_factory.mktemp("cache"),

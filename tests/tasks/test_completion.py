@@ -30,6 +30,7 @@ SETTINGS = Completion(
     mask=True,
     depth_loss="depth",
     depth_weight=10.0,
+    normal_weight=0.0,
     silhouette=Own(),
     silhouette_weight=4.0,
     code=CodePenalty(0.1, "sum"),
@@ -69,7 +70,8 @@ def scene() -> Scene:
     motion = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]])
     camera = Camera(torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]), motion, height=2, width=2)
     mesh = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
-    return Scene("a scene", mesh, View(camera, torch.tensor(DEPTH), torch.zeros(2, 2, 3), torch.tensor(MASK)))
+    normals = torch.tensor([[[0.0, 0.6, 0.8], [0.6, 0.0, 0.8]], [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]])
+    return Scene("a scene", mesh, View(camera, torch.tensor(DEPTH), normals, torch.tensor(MASK)))
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +105,18 @@ def test_depth_is_compared_at_the_given_points_only(problem_of):
     assert problem.observed.sum() == 1
     expected = {(0, 0): 0.1, (0, 1): 0.3, (1, 0): 0.0}[tuple(problem.observed.nonzero()[0].tolist())]
     assert values(problem)["depth"] == pytest.approx(10.0 * expected, rel=1e-4)
+
+
+def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
+    """See tests/solve/test_observed_view.py for the term itself."""
+    assert "normals" not in values(problem_of())
+    assert problem_of().compare.__self__.normals is None
+    problem = problem_of(normal_weight=3.0)
+    assert 0 <= values(problem)["normals"] <= 2 * 3.0
+    given = problem.compare.__self__
+    assert given.normal_weight == 3.0 and torch.equal(given.normals, scene.view.normals)
+    terms = problem.loss(0)
+    assert terms["total"].item() == pytest.approx(sum(terms[name].item() for name in terms if name != "total"))
 
 
 def test_no_pixel_to_compare_costs_nothing(problem_of):
@@ -261,6 +275,7 @@ def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(problem_of, 
         ({"optimiser.learning_rate": float("nan")}, "task.optimiser.learning_rate must be positive, not nan"),
         ({"depth_loss": "normals"}, "task.depth_loss must be one of depth, points, not 'normals'"),
         ({"depth_weight": -1.0}, "task.depth_weight must be at least 0, not -1"),
+        ({"normal_weight": -1.0}, "task.normal_weight must be at least 0, not -1"),
         ({"silhouette_weight": float("inf")}, "task.silhouette_weight must be at least 0, not inf"),
         ({"code.weight": -0.1}, "task.code.weight must be at least 0, not -0.1"),
     ],

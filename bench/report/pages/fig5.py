@@ -12,7 +12,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, Record, Row
+from bench.report.data.records import SCALE, Record, Row, setting
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, to_data
@@ -57,10 +57,18 @@ def make(experiment: Experiment) -> Result:
         "Loss and Chamfer distance as shapes are completed.",
         "Loss and Chamfer distance over iterations and seconds, and Chamfer distance over loss.",
         interval="bands are the minimum and maximum over runs" if several else "one run per row, no interval",
-        remarks=(*unread, about if several else "", *NOTES),
+        remarks=(*unread, about if several else "", _loss(experiment), *NOTES),
         data=_data(experiment.records, lines, strategies),
         figure=draw(strategies),
     )
+
+
+def _loss(experiment: Experiment) -> str:
+    """A note on the terms of the loss."""
+    weight = setting(experiment.requested(), "task", "normal_weight")
+    if weight:
+        return f"The loss has depths, normals (weight {weight:g}) and the silhouette, as the paper's Fig. 5 has it."
+    return "The loss has depths and the silhouette; the paper's Fig. 5 has normals as well."
 
 
 @style.styled

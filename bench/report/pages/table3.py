@@ -45,6 +45,12 @@ NOTES = (
     "“Published” is DIST, Table 3: 50 shapes of PMO's renderings of ShapeNet, with another prior and metric scale, so "
     "it cannot be compared directly with the measured rows.",
 )
+MESH = "multiview_mesh"  # the preset that PMO's rows are to be read beside
+ON_MESH = (
+    "“{row}” moves the vertices of the prior's mesh by the photometric error, as PMO (Lin et al. 2019) does, from the "
+    "same random codes as the other rows: read it beside “published: PMO, random start”. “Published: PMO” starts from "
+    "the code of an encoder, which PMO trained on shapes of the same kind as its test."
+)
 RUNS = (
     *(FAMILY, *IDENTITY),
     *metrics(ONE_WAY, "chamfer_l2", "accuracy", "completeness", "mask_iou"),
@@ -59,7 +65,8 @@ def _words(key: str, heading: str) -> Column:
 
 
 COLUMNS = (
-    *(text("family", "Family"), text("method", "Method"), _words("start", "Start"), Column("end", "End")),
+    *(text("family", "Family"), text("method", "Method"), _words("start", "Start")),
+    Column("end", "End", show=lambda end: end if isinstance(end, str) else format.number(end)),
     *(_words("middle", "Interquartile mean"), _words("of_start", "End / start"), _words("of_oracle", "End / oracle")),
     *(_words("failed", "Failed"), _words("seconds", "Loop"), _words("evaluations", "Evaluations")),
 )
@@ -77,7 +84,7 @@ def make(experiment: Experiment) -> Result:
         interval="95 % bootstrap intervals of interquartile means over {shapes and seeds}, Clopper and Pearson's of "
         "failures over shapes",
         estimates=[_middle(of) for all in experiment.families().values() for of in grouped(all, row_of).values()],
-        remarks=NOTES,
+        remarks=(*NOTES, *(ON_MESH.format(row=row.name) for row in experiment.rows() if row.preset == MESH)),
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines),
         figure=draw(experiment, oracle),
@@ -89,7 +96,7 @@ def _lines(name: str, records: list[Record], oracle: float | None) -> list[dict[
     rows = grouped(records, row_of)
     lines = [{"method": row.name, **_line(of_row, oracle)} for row, of_row in rows.items()]
     lines += [] if oracle is None else [{"method": LABEL, "end": oracle}]
-    lines += [{"method": f"published: {row}", "end": number} for row, number in PUBLISHED.get(name, {}).items()]
+    lines += [{"method": f"published: {row}", "end": str(number)} for row, number in PUBLISHED.get(name, {}).items()]
     return [{"family": name, **line} for line in lines]
 
 

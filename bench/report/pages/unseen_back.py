@@ -17,7 +17,7 @@ from bench.report.write.table import (
     to_table,
 )
 
-PLACE = 49
+PLACE = 51
 READS = (Selection("unseen_back", ("reconstruction",), ("dataset", "task", "silhouette"), setup=("scenes", "machine")),)
 NAMES = ("seen_roughness", "unseen_roughness", "own_early_weight", "seen_chamfer_l1", "chamfer_l1", "mask_iou")
 DEFINED = {"seen_roughness": "Roughness", "unseen_roughness": "Roughness", "own_early_weight": "Early weight"}

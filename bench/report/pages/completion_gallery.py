@@ -1,0 +1,54 @@
+"""Figs. 20 to 22 of DIST: completed shapes in pictures, over the sparsity of the depth image."""
+
+from bench.report.data.completions import POINTS, TABLE2, heading
+from bench.report.data.experiments import Experiment
+from bench.report.data.records import Record, grouped, row_of, setting
+from bench.report.write.gallery import TRUE, Block, Cell, Scene, draw, first_shapes
+from bench.report.write.result import Result
+from bench.report.write.table import COMPLETION, FAMILY, configured, to_data
+
+PLACE = 22
+READS = (TABLE2,)
+PRESETS = ("deepsdf", "dist_depth", "dist_mask")  # rows that are shown, where they were run
+NOTES = (
+    "The shape is the one with the least number, not a chosen one. Normals are red, green and blue (right, up, towards "
+    "the camera) of the mesh that is judged, seen from the given camera on the left and from behind on the right.",
+    "Above them the given depths, near ones yellow; all rows but “DIST with mask” see nothing else, and that sees the "
+    "mask as well. Dense depth implies the mask. DeepSDF is given the true normals at these points.",
+    "DIST, Figs. 20 to 22, shows shapes of ShapeNet from three sides; these are of other families and another prior.",
+)
+RUNS = (FAMILY, configured("points", "task", "points"), *COMPLETION)
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a block per family: the given depths, and each row's shape below them."""
+    shown = first_shapes(experiment, 1, PRESETS)
+    blocks, missing = [], []
+    for name, records in shown.families().items():
+        scene = Scene(shown, records)
+        blocks.append(_block(name, records, scene))
+        missing += scene.missing(name)
+    return Result(
+        shown,
+        "Completed shapes in pictures.",
+        "The first shape of each family at each number of given depth points, from the given camera and from behind.",
+        remarks=(*NOTES, *missing),
+        data=to_data(RUNS, shown.records),
+        figure=draw(blocks, across=2),
+    )
+
+
+def _block(name: str, records: list[Record], scene: Scene) -> Block:
+    """The rows of a family over the number of points, behind them the truth."""
+    by_row = grouped(records, row_of)
+    found = {points: of for points, of in grouped(records, _points).items()}
+    points = [p for p in POINTS if p in found] + sorted(found.keys() - {*POINTS})
+    rows = {"given depths": [*(scene.given(found[p][0]) for p in points), scene.any(records, TRUE)]}
+    for row, of_row in by_row.items():
+        at = {_points(record): record for record in of_row}
+        rows[row.name] = [scene.shape(at[p]) if p in at else Cell(note="no run") for p in points]
+    return Block(name, [*map(heading, points), "truth"], rows)
+
+
+def _points(record: Record) -> str:
+    return str(setting(record["config"], "task", "points"))

@@ -1,0 +1,212 @@
+"""The galleries, from run folders whose pictures are known."""
+
+import numpy as np
+import pytest
+
+from bench.records.read import read_records
+from bench.report.data.experiments import choose
+from bench.report.pages import completion_gallery, misplaced_gallery, multiview_gallery, rerendering
+from bench.report.write.gallery import GAP, TILE, Block, Cell, draw, tile
+from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+
+UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+COLOURS = {normal: tuple(np.array(normal) / 2 + 0.5) for normal in (UP, RIGHT, TOWARDS)}
+NAMES = {
+    "DeepSDF samples": "deepsdf",
+    "DIST": "dist_depth",
+    "DIST with mask": "dist_mask",
+    "IDR with mask": "idr_mask",
+}
+SQUARE = np.zeros((8, 8), dtype=bool)
+SQUARE[2:6, 2:6] = True
+
+
+def saved(folder, found=UP, start=RIGHT, true=TOWARDS, **left_out):
+    """Writes squares with one normal each; None is a shape that nothing shows."""
+    arrays = {"given": np.where(SQUARE, 2.0, np.nan).astype(np.float16)}
+    for name, normal in (("found", found), ("start", start), ("true", true)):
+        hit = np.stack([SQUARE, SQUARE]) & (normal is not None)
+        arrays |= {f"{name}_hit": hit, f"{name}_normals": (hit[..., None] * np.array(normal or UP)).astype(np.float16)}
+    np.savez(folder / "images.npz", **{name: array for name, array in arrays.items() if name not in left_out})
+
+
+def completed(results, row, points, *, dataset="sofa", index=0, seed=0, status="ok", pictures=True, **shown):
+    folder = write_run(
+        results,
+        "table2",
+        row,
+        **{"task": "deepsdf" if row.startswith("DeepSDF") else "completion", "method": NAMES[row], "dataset": dataset},
+        status=status,
+        settings={
+            "task": {"points": points},
+            "dataset": {"name": dataset},
+            "index": index,
+            "seed": seed,
+        },
+    )
+    if pictures:
+        saved(folder, **shown)
+
+
+def many_views(results, experiment, row, *, dataset="car", index=0, status="ok", pictures=True, task=None, **shown):
+    folder = write_run(
+        results,
+        experiment,
+        row,
+        **{"task": "multiview", "dataset": dataset, "status": status, "method": f"multiview_{row[:4].lower()}"},
+        settings={
+            "task": {"shift": 0.0, "degrees": 0.0, "scale": 1.0, **(task or {})},
+            "dataset": {"name": dataset},
+            "index": index,
+        },
+    )
+    if pictures:
+        saved(folder, **shown)
+
+
+def made(results, page):
+    return page.make(choose(read_records(results)[0], page.READS[0], results))
+
+
+def cells(axis, across=1):
+    """The colour in the middle of the first picture of each cell; the names of rows and columns."""
+    image = axis.get_images()[0].get_array()
+    rows = [label.get_text().replace("\n", " ") for label in axis.get_yticklabels()]
+    columns = [label.get_text().replace("\n", " ") for label in axis.get_xticklabels()]
+    width = across * TILE + GAP
+    return {
+        (row, column): tuple(image[line * (TILE + GAP) + TILE // 2, place * width + (TILE // 2)].tolist())
+        for line, row in enumerate(rows)
+        for place, column in enumerate(columns)
+    }
+
+
+def notes(figure):
+    return [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text()]
+
+
+def test_completed_shapes_stand_over_the_points_with_the_truth_behind(tmp_path):
+    for row, normal in (("DeepSDF samples", UP), ("DIST", RIGHT), ("DIST with mask", UP), ("IDR with mask", UP)):
+        for points in ("dense", "20"):
+            completed(tmp_path, row, points, found=normal)
+    result = made(tmp_path, completion_gallery)
+    found = cells(result.figure.axes[0], across=2)
+    assert [column for row, column in found if row == "DIST"] == ["dense", "20 pts", "truth"]
+    assert list(dict.fromkeys(row for row, _ in found)) == ["given depths", *list(NAMES)[:3]]
+    assert found["DIST", "20 pts"] == COLOURS[RIGHT] and found["DIST with mask", "dense"] == COLOURS[UP]
+    assert found["given depths", "truth"] == COLOURS[TOWARDS] and found["DIST", "truth"] == (1, 1, 1)
+    assert notes(result.figure) == [] and "No pictures" not in told(result)
+    assert "n = 6 runs (1 shape, 1 seed)" in result.caption and len(result.data) == 6
+
+
+def test_the_first_shape_of_each_family_and_the_first_seed_are_shown(tmp_path):
+    for dataset in ("sofa", "plane"):
+        for index in (3, 1):
+            for seed in (1, 0):
+                completed(tmp_path, "DIST", "20", dataset=dataset, index=index, seed=seed)
+    result = made(tmp_path, completion_gallery)
+    assert [axis.get_title(loc="left") for axis in result.figure.axes] == ["sofa", "plane"]
+    assert result.data[["index", "seed"]].to_numpy().tolist() == [[1, 0], [1, 0]]
+    assert "Not shown: 6 runs" in told(result)
+
+
+def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path):
+    completed(tmp_path, "DeepSDF samples", "20")
+    completed(tmp_path, "DIST", "20", status="not_reached", found=RIGHT)
+    completed(tmp_path, "DIST with mask", "20", status="crashed", pictures=False)
+    completed(tmp_path, "DIST with mask", "50", status="empty", found=None)
+    completed(tmp_path, "DIST", "50", pictures=False)
+    result = made(tmp_path, completion_gallery)
+    assert sorted(notes(result.figure)) == sorted(["not_reached", "crashed", "empty", "no picture", "no run"])
+    assert cells(result.figure.axes[0], across=2)["DIST", "20 pts"] == COLOURS[RIGHT]
+    assert "3 of 5 runs did not end ok" in result.caption
+    assert "No pictures of 2 runs, sofa: no images.npz." in told(result)
+
+
+def test_a_folder_of_another_task_has_no_such_pictures(tmp_path):
+    completed(tmp_path, "DIST", "20", true_hit=None)
+    result = made(tmp_path, completion_gallery)
+    assert notes(result.figure) == ["no picture", "no picture"]  # given, found
+    assert "images.npz lacks an array: true_hit" in told(result)
+
+
+def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
+    for index in range(6):
+        many_views(tmp_path, "table3", "DIST", index=index, found=UP)
+        many_views(tmp_path, "table3", "Mesh, 48³", index=index, status="ok" if index else "diverged", found=RIGHT)
+    result = made(tmp_path, multiview_gallery)
+    found = cells(result.figure.axes[0])
+    assert list(dict.fromkeys(row for row, _ in found)) == [f"car {index}" for index in range(4)]
+    assert [found["car 0", column] for column in ("truth", "start", "DIST", "Mesh, 48³")] == [
+        COLOURS[normal] for normal in (TOWARDS, RIGHT, UP, RIGHT)
+    ]
+    assert notes(result.figure) == ["diverged"]
+    assert "n = 8 runs (4 shapes, 1 seed)" in result.caption
+
+
+def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
+    for task in ({"degrees": 20.0}, {}, {"shift": 0.1}, {"scale": 0.8}):
+        many_views(tmp_path, "fig12", "DIST", task=task, found=UP if task else RIGHT)
+    result = made(tmp_path, misplaced_gallery)
+    found = cells(result.figure.axes[0])
+    columns = [column for row, column in found if row == "DIST"]
+    assert columns == ["0.8 times as large", "in place", "turned by 20°", "shifted by 0.1", "truth"]
+    assert [found["DIST", column] for column in columns[:2]] == [COLOURS[UP], COLOURS[RIGHT]]
+    assert {found["start", column] for column in columns[:-1]} == {COLOURS[RIGHT]}
+    assert found["start", "truth"] == COLOURS[TOWARDS]
+
+
+def rendered(results, row, method, *, dataset="sofa", status="ok", size=16):
+    folder = write_run(
+        results,
+        "dvr_table2",
+        row,
+        **{"task": "reconstruction", "dataset": dataset, "method": method, "status": status},
+        settings={"task": {"_target_": "reconstruction"}, "dataset": {"name": dataset}, "index": 0},
+    )
+    if not size:
+        return
+    arrays = {"photograph": np.ones((8, 8, 3), np.float16)}
+    for prefix, length in (("size_0_", 2), ("size_1_", 4), ("size_2_", size), ("turned_0_", size), ("turned_1_", size)):
+        hit = np.ones((length, length), dtype=bool)
+        arrays |= {f"{prefix}hit": hit, f"{prefix}colours": np.full((length, length, 3), 0.8, np.float16)}
+        arrays[f"{prefix}normals"] = np.broadcast_to(np.array(RIGHT, np.float16), (length, length, 3))
+    np.savez(folder / "images.npz", **arrays)
+
+
+def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
+    rendered(tmp_path, "Newton, RGB", "rgb_newton", size=0)
+    rendered(tmp_path, "DIST, RGB", "rgb_dist")
+    rendered(tmp_path, "DIST, RGB", "rgb_dist", dataset="car", status="crashed", size=0)
+    result = made(tmp_path, rerendering)
+    found = cells(result.figure.axes[0])
+    columns = [column for row, column in found if row == "sofa 0"]
+    sizes = ["2 pixels", "4 pixels", "16 pixels", "turned by 120°", "turned by 240°"]
+    assert columns == ["photograph", *sizes, *rerendering.LIGHTS]
+    assert all(found["sofa 0", column] == pytest.approx((0.8,) * 3, abs=1e-3) for column in sizes)
+    left, above, right = (found["sofa 0", name][0] for name in rerendering.LIGHTS)
+    assert left == pytest.approx(above) == pytest.approx(0.8 * rerendering.AMBIENT, abs=1e-3)  # normals to the right
+    cosine = 0.8 / np.sqrt(0.8**2 + 0.3**2 + 0.5**2)
+    assert right == pytest.approx(0.8 * (rerendering.AMBIENT + (1 - rerendering.AMBIENT) * cosine), abs=1e-3)
+    assert notes(result.figure) == ["crashed"]
+    assert "No pictures of DIST, RGB, car 0: no images.npz." in told(result)
+    assert "1 of 2 runs did not end ok" in result.caption and "by DIST, RGB" in told(result)
+
+
+def test_a_tile_is_the_part_in_the_window_with_its_pixels_as_they_are():
+    picture = np.arange(16.0).reshape(4, 4, 1).repeat(3, axis=2)
+    found = tile(picture, (0.25, 0.5, 0.5))
+    assert found.shape == (TILE, TILE, 3)
+    assert np.unique(found).tolist() == [6, 7, 10, 11]
+    assert (found[: TILE // 2, : TILE // 2] == 6).all()
+
+
+def test_names_of_narrow_columns_are_wrapped_and_stay_within_the_figure():
+    names = ["DIST, paper's, 72 views, 180 iterations", *(f"row {number}" for number in range(10))]
+    rows = {"a name of a row that is long": [Cell((np.ones((TILE, TILE, 3)),))] * len(names)}
+    figure = draw([Block("car", names, rows)], across=1)
+    figure.draw_without_rendering()
+    axis = figure.axes[0]
+    boxes = [label.get_window_extent() for label in (*axis.get_xticklabels(), *axis.get_yticklabels())]
+    assert all(box.x0 >= -1 and box.x1 <= figure.bbox.x1 + 1 and box.y1 <= figure.bbox.y1 + 1 for box in boxes)
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])

@@ -1,0 +1,112 @@
+"""The term of the normals: its value by closed forms, its gradient by differences in float64."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from bench.models.observations import together
+from bench.solve.observed_view import GivenView, normal_error
+from datasets.scene import View
+from renderers.fields.analytic import Shape, sphere
+from renderers.silhouette import Own
+from tests.tiny import CPU, camera_of
+
+WEIGHTS = SimpleNamespace(depth_loss="depth", depth_weight=0.0, silhouette=Own(), silhouette_weight=0.0)
+RENDERERS = {
+    "idr": load("renderer", "idr", steps=300, epsilon=1e-11),
+    "newton": load("renderer", "newton", warm=False, march_epsilon=1e-6),
+}
+CAMERA = camera_of(6, field_of_view=18.0).double()  # all rays hit, away from the outline, so that all go on to do so
+FACTORS, OFFSET = torch.tensor([0.7, 0.5, 0.6]).double(), torch.tensor([0.03, -0.02, 0.05]).double()
+
+
+def ellipsoid(factors: Tensor, offset: Tensor) -> Shape:
+    return sphere(1.0).stretch(factors).translate(offset)
+
+
+def normals_of(points: Tensor, factors: Tensor, offset: Tensor) -> Tensor:
+    return torch.nn.functional.normalize((points - offset) / factors**2, dim=-1)
+
+
+def hits(factors: Tensor, offset: Tensor) -> Tensor:
+    """Where the camera's rays meet the ellipsoid first, by the quadratic equation."""
+    rays = CAMERA.rays()
+    start, along = (rays.origins - offset) / factors, rays.directions / factors
+    a, b, c = (along * along).sum(-1), (along * start).sum(-1), (start * start).sum(-1) - 1
+    return rays.at((-b - (b * b - a * c).sqrt()) / a)
+
+
+def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: float = 2.0) -> GivenView:
+    blank = torch.zeros(6, 6, dtype=torch.float64)
+    view = View(CAMERA, blank, blank[..., None].expand(-1, -1, 3), torch.ones(6, 6, dtype=torch.bool))
+    seen = GivenView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
+    return seen.with_normals(normals, weight)
+
+
+ALL = torch.ones(6, 6, dtype=torch.bool)
+SOME = torch.arange(36).view(6, 6) % 3 == 0
+OTHER = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET).roll(1, 0)  # those of the pixels above
+
+
+@pytest.mark.parametrize("observed", [ALL, SOME], ids=["all", "some"])
+def test_the_term_is_one_less_the_cosine_over_observed_pixels(observed):
+    found = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET)
+    expected = 2.0 * (1 - (found * OTHER).sum(-1))[observed].mean()
+    assert expected > 0.01
+    terms = given(OTHER, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
+    torch.testing.assert_close(terms["normals"], expected, rtol=1e-7, atol=0)
+    exact = given(found, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
+    assert abs(exact["normals"].item()) < 1e-9
+
+
+def test_rays_without_a_hit_have_no_part_and_none_at_all_costs_nothing():
+    far = torch.tensor([0.0, 3.0, 0.0]).double()
+    leaves = FACTORS.clone().requires_grad_()
+    terms = given(OTHER, ALL).compare(ellipsoid(leaves, far), 0)
+    assert terms["normals"].item() == 0
+    half = torch.tensor([-0.72, 0.0, 0.0]).double()  # of which a part of the rays hit
+    points = hits(FACTORS, half)
+    hit = points.isfinite().all(-1)
+    assert 6 <= int(hit.sum()) <= 30
+    expected = 2.0 * (1 - (normals_of(points, FACTORS, half) * OTHER).sum(-1))[hit].mean()
+    found = given(OTHER, ALL).compare(ellipsoid(FACTORS, half), 0)["normals"]
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_the_gradient_is_that_of_differences(renderer):
+    """Through the field's gradient at a point, and through the point, which moves along its ray."""
+    seen = given(OTHER, SOME, renderer)
+
+    def loss(numbers: Tensor) -> Tensor:
+        return seen.compare(ellipsoid(numbers[:3], numbers[3:]), 0)["normals"]
+
+    start = torch.cat([FACTORS, OFFSET]).requires_grad_()
+    (found,) = torch.autograd.grad(loss(start), start)
+    step = 1e-5
+    moves = step * torch.eye(6, dtype=torch.float64)
+    with torch.no_grad():
+        ends = [[loss(start + sign * move) for sign in (1, -1)] for move in moves]
+    expected = torch.stack([(up - down) / (2 * step) for up, down in ends])
+    assert expected.abs().min() > 1e-3
+    torch.testing.assert_close(found, expected, rtol=1e-4 if renderer == "newton" else 1e-6, atol=1e-8)
+
+
+def test_views_without_normals_have_no_such_term_and_parts_keep_theirs():
+    view = given(OTHER, ALL)
+    flat = together([view])
+    some = flat.some(torch.tensor([0, 7]))
+    assert torch.equal(some.normals, OTHER.flatten(0, 1)[[0, 7]])
+    assert set(some.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth", "normals"}
+    plain = GivenView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_of_distance, ALL, None)
+    assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
+    assert together([plain]).normals is None
+
+
+def test_normals_that_are_not_given_have_no_part():
+    found = torch.tensor([[0.0, 0, 1], [0, 1, 0]])
+    assert normal_error(found, torch.tensor([[0.0, 0, 0], [0, 0.6, 0.8]])).item() == pytest.approx(0.4)
+    assert normal_error(found, torch.zeros(2, 3)).item() == 0
