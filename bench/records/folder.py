@@ -33,7 +33,7 @@ PASSIVE = (
         "bench/progress.py",
     ),
     *("bench/run/sweep.py", "bench/run/summary.py"),
-    *("bench/records/format.py", "bench/records/read.py"),
+    *("bench/records/format.py", "bench/records/metrics.py", "bench/records/read.py", "bench/records/statuses.py"),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"

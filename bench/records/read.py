@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import to_json, write_text
+from bench.records.files import decoded, to_json, write_text
 from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, started
 
 PLAN = "plan.json"
@@ -100,6 +100,23 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     records.extend(missing.values())
     records.sort(key=started, reverse=True)
     return records, problems + unread
+
+
+def curve_lines(folder: Path) -> list[dict[str, Any]] | None:
+    """The lines of `curve.jsonl`, empty for those that cannot be read; None where there is no such file."""
+    try:
+        text = (folder / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    return [_line(line) for line in text.splitlines()]
+
+
+def _line(text: str) -> dict[str, Any]:
+    try:
+        found = decoded(json.loads(text))
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:

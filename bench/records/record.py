@@ -16,7 +16,8 @@ NEUTRAL_KEYS = frozenset(
     ("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun", "tracker")
 )
 NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
-LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked")  # fields that old records may lack
+# Fields that old records may lack.
+LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
 
 
 class RunStatus(StrEnum):
@@ -74,6 +75,7 @@ class Record:
     asked: str = field(default_factory=now)  # when it was last requested; a reused run ran earlier
     ended: str = ""  # empty while it is under way, and where it was killed before it could write this
     log: list[str] = field(default_factory=list)  # the last lines of log.txt, where the run failed
+    overrides: list[str] = field(default_factory=list)  # what the command line set, as KEY=VALUE
 
     @property
     def name(self) -> str:
@@ -96,9 +98,13 @@ def row_name(config: dict[str, Any], renderer: str) -> str:
 
     A silhouette loss that is not the renderer's own follows it.
     """
-    name = config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer
-    loss = (config.get("silhouette") or {}).get("_label_")
+    of_renderer, of_loss = (_labelled(config.get(key)) for key in ("renderer", "silhouette"))
+    name, loss = str(config.get("label") or of_renderer or renderer), of_loss
     return f"{name}, {loss}" if loss else name
+
+
+def _labelled(node: Any) -> str:
+    return str(node.get("_label_") or "") if isinstance(node, dict) else ""
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -9,25 +9,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.records.format import count, number, seconds
+from bench.records.metrics import COMPARED
 from bench.records.read import Plan
 from bench.records.record import NOT_RUN, Record, RunStatus
-
-ROWS = (  # metric, its name in the table, factor, which direction is better
-    ("chamfer_l2", "Chamfer (x1000)", 1000.0, "lower"),
-    ("seen_chamfer_l1", "Chamfer-L1 of what is seen (x1000)", 1000.0, "lower"),
-    ("accuracy", "accuracy (x1000)", 1000.0, "lower"),
-    ("completeness", "completeness (x1000)", 1000.0, "lower"),
-    ("fscore", "F-score", 1.0, "higher"),
-    ("normal_consistency", "normal consistency", 1.0, "higher"),
-    ("iou", "IoU of volumes", 1.0, "higher"),
-    ("fitted_mask_iou", "mask IoU from the best view", 1.0, "higher"),
-    ("depth_mae", "depth error (x1000)", 1000.0, "lower"),
-    ("mask_iou", "mask IoU", 1.0, "higher"),
-    ("psnr", "PSNR (dB)", 1.0, "higher"),
-    ("ssim", "SSIM", 1.0, "higher"),
-    ("rotation_error_deg", "rotation error (degrees)", 1.0, "lower"),
-    ("translation_error", "translation error (x1000)", 1000.0, "lower"),
-)
 
 
 def show(folder: Path, record: Record, index: Path) -> None:
@@ -36,7 +20,7 @@ def show(folder: Path, record: Record, index: Path) -> None:
     table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}"))
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
-    for name, label, factor, better in ROWS:
+    for name, label, factor, better in COMPARED:
         if name in record.metrics_start:
             before, after = record.metrics_start[name], record.metrics.get(name)
             table.add_row(label, number(before, factor), number(after, factor), better)
@@ -101,7 +85,7 @@ def _measured(record: Record) -> Table:
     table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene}"))
     table.add_column("")
     table.add_column("measured", justify="right")
-    known = {name: (label, factor) for name, label, factor, _ in ROWS}
+    known = {name: (label, factor) for name, label, factor, _ in COMPARED}
     for name, value in record.metrics.items():
         label, factor = known.get(name, (name, 1.0))
         table.add_row(label, number(value, factor))

@@ -5,6 +5,8 @@ from typing import Any
 
 import pandas as pd
 
+from bench.report.data.records import flattened
+
 PLAIN = ("folder", "task", "renderer", "dataset", "scene", "seed", "status", "reason", "started")
 NUMBERS = ("peak_memory_bytes", "flops", "gemm_fraction")
 NESTED = ("metrics", "metrics_start", "evaluations", "seconds")
@@ -19,7 +21,7 @@ def to_frame(records: list[dict[str, Any]]) -> pd.DataFrame:
         for part in NESTED:
             row |= {f"{part}.{name}": value for name, value in record[part].items()}
         row |= {f"environment.{name}": record["environment"].get(name) for name in MACHINE}
-        row |= _flat(record["config"], "config")
+        row |= flattened(record["config"], "config")
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -29,11 +31,3 @@ def write_frame(records: list[dict[str, Any]], results_dir: Path) -> Path:
     path = results_dir / "runs.csv"
     to_frame(records).to_csv(path, index=False)
     return path
-
-
-def _flat(node: dict[str, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in node.items():
-        name = f"{prefix}.{key}"
-        flat |= _flat(value, name) if isinstance(value, dict) else {name: value}
-    return flat

@@ -13,6 +13,7 @@ from bench.records.record import row_name
 
 SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
+DEEPEST = 20  # levels of a configuration
 OURS = "renderers."  # beginning of the targets of this project's renderers
 # Presets of older records, which have none, by their labels.
 FORMER = {
@@ -62,7 +63,7 @@ def base_renderer(record: Record) -> str:
 def family(record: Record) -> str:
     """The name of the record's dataset: the family, or the end of the path of a mesh file or folder."""
     path = setting(record["config"], "dataset", "path")
-    return "/".join(Path(path).absolute().parts[-2:]) if path else record["dataset"]
+    return "/".join(Path(str(path)).absolute().parts[-2:]) if path else record["dataset"]
 
 
 def iterations_of(record: Record) -> int | None:
@@ -119,6 +120,16 @@ def shape(record: Record) -> tuple[str, Any]:
     return family(record), index(record)
 
 
+def flattened(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
+    """All values of nested data by dotted keys; what lies deeper than `depth` levels is left out, as "…"."""
+    flat: dict[str, Any] = {}
+    for key, value in node.items():
+        name = f"{prefix}.{key}" if prefix else str(key)
+        inner = isinstance(value, dict)
+        flat |= flattened(value, name, depth - 1) if inner and depth else {name: "…" if inner else value}
+    return flat
+
+
 def solid(record: Record) -> tuple[str, Any]:
     """The shape of a run, one for all numbers of a mesh file that is not deformed: these are its views."""
     return family(record), None if _is_view(record) else index(record)
@@ -131,7 +142,7 @@ def view(record: Record) -> Any:
 
 def _is_view(record: Record) -> bool:
     path, strength = (setting(record["config"], "dataset", key) for key in ("path", "strength"))
-    return bool(path) and bool(Path(path).suffix) and strength == 0
+    return bool(path) and bool(Path(str(path)).suffix) and strength == 0
 
 
 def run_key(record: Record) -> RunKey:

@@ -12,7 +12,8 @@ from urllib.parse import quote
 from bench.records.files import write_text
 
 FOLDER = "paper"
-SUFFIXES = (".html", ".pdf", ".csv", ".md", ".tex")
+SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
+SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 PAGES = Path(__file__).parents[1] / "pages"
 PLACE = re.compile(r"^PLACE(_[A-Z_]+)? = (\d+)$", re.MULTILINE)
 
@@ -88,11 +89,16 @@ def write_readme(results_dir: Path) -> Path | None:
 def _found(folder: Path, name: str) -> dict[str, Any]:
     files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
     links = {suffix: link(FOLDER, path.name) for suffix, path in files.items() if path.is_file()}
-    text = files[".md"].read_text(encoding="utf-8", errors="replace") if ".md" in links else ""
     picture = links.get(".png")
     links.pop(".png", None)
     named = {suffix[1:].upper(): link for suffix, link in links.items()}
-    return {"name": name, "picture": picture, "files": named, **_parsed(text)}
+    return {"name": name, "picture": picture, "files": named, **read_page(folder / name)}
+
+
+def read_page(base: Path) -> dict[str, Any]:
+    """The title, caption, table and notes of `base.md`; empty ones where there is no such file."""
+    path = base.with_name(base.name + ".md")
+    return _parsed(path.read_text(encoding="utf-8", errors="replace") if path.is_file() else "")
 
 
 def _parsed(markdown: str) -> dict[str, Any]:
