@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -141,14 +142,20 @@ def started(record: dict[str, Any]) -> datetime:
 
 def _check(record: dict[str, Any]) -> None:
     """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`."""
-    hints = get_type_hints(Record)
-    for item in fields(Record):
-        if item.name not in record:
-            if item.name in LATER:
+    for name, classes in _fields().items():
+        if name not in record:
+            if name in LATER:
                 continue
-            raise ValueError(f"record.json must have the field {item.name!r}, found none")
-        if not isinstance(record[item.name], _classes(hints[item.name])):
-            raise ValueError(f"{item.name} in record.json has the wrong type, found {type(record[item.name]).__name__}")
+            raise ValueError(f"record.json must have the field {name!r}, found none")
+        if not isinstance(record[name], classes):
+            raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
+
+
+@cache
+def _fields() -> dict[str, tuple[type, ...]]:
+    """The classes that each field allows."""
+    hints = get_type_hints(Record)
+    return {item.name: _classes(hints[item.name]) for item in fields(Record)}
 
 
 def _classes(hint: Any) -> tuple[type, ...]:

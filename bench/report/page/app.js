@@ -32,7 +32,7 @@
 
   const VIEWS = {
     "": (home, {query}) => bench.overview(home, {board: query}),
-    runs: (home, {query}) => bench.overview(home, {board: query}),
+    runs: (home, {query}) => bench.overview(home, {board: query, alone: true}),
     run: (home, {path}) => bench.run(home, path[1] || ""),
     compare: (home, {path}) => bench.compare(home, path.slice(1)),
     table: (home, {path}) => bench.paper(home, path[1] || ""),
@@ -45,9 +45,7 @@
     view(home, address);
     const heading = home.querySelector("h1");
     document.title = heading ? `${heading.textContent} – implicit-bench` : "implicit-bench";
-    const board = address.path[0] === "runs" && document.getElementById("board");
-    if (board) board.scrollIntoView();
-    else window.scrollTo(0, 0);
+    window.scrollTo(0, 0);
   }
 
   start();

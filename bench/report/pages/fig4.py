@@ -59,6 +59,6 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     most, least = data.loc[wrong.idxmax()], data.loc[wrong.idxmin()]
     said = (
         f"Missed and spurious pixels: *{wrong.min():.0f}* ({least['row']}) to {wrong.max():.0f} ({most['row']}) "
-        f"of {most['hits']:.0f}."
+        f"of {most['hits']:,.0f}."
     )
     return Answer("Which pixels does each strategy get wrong?", said)

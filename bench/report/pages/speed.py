@@ -23,6 +23,7 @@ from bench.report.write.table import Column, defined, shown, text, to_data, to_t
 PLACE_FRONT = 80
 PLACE_VOLUME = 100
 READS = tuple(trial.selection for trial in TRIALS)
+NOTE = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
 NOTES = (
     "Final error of a completion over the seconds of its loop, and depth error of one rendering (95th percentile over "
     "pixels, missed and spurious ones count as infinite) over its seconds. A run that did not end ok is infinite in "
@@ -199,8 +200,8 @@ def answer_front(data: pd.DataFrame, notes: list[str]) -> Answer:
             said.append(f"{title}: {len(front)} of {len(found)} settings, {ends[0]}{rest}")
         heading = next((trial.heading for trial in TRIALS if trial.title == title), "error × 1000")
         panels.append(chart_panel(title, "time (seconds)", heading, _points(found, front), height=440))
-    verdict = f"On the front of {'; of '.join(said)}." if said else ""
-    return Answer("What does accuracy cost in time?", verdict, {"panels": panels})
+    verdict = f"On the front of {said[0]}." if said else ""
+    return Answer("What does accuracy cost in time?", verdict, {"panels": panels, "note": NOTE})
 
 
 def _points(found: pd.DataFrame, front: pd.DataFrame) -> list[dict[str, Any]]:
@@ -230,7 +231,7 @@ def answer_volume(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The renderer with the largest area in each trial."""
     best = data.loc[data.groupby("trial", sort=False)["hypervolume"].idxmax()]
     said = "; ".join(
-        f"{row['trial']}: {row['renderer']} *{format.number(row['hypervolume'])}*, of {row['settings']:.0f}"
+        f"{row['trial']}: {row['renderer']} *{format.number(row['hypervolume'])}* (settings: {row['settings']:.0f})"
         for _, row in best.iterrows()
     )
     return Answer("Which renderer dominates most of the plane of error and time?", f"The largest area: {said}.")

@@ -185,7 +185,11 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
         if len(finite) < len(first)
         else ""
     )
-    return Answer("How fast does the error fall?", f"{said}{last}." if said else "", {"panels": _panels(data)})
+    return Answer(
+        "How fast does the error fall?",
+        f"{said}{last}." if said else "",
+        {"panels": _panels(data), "note": "A line is a run, which a click opens."},
+    )
 
 
 def _panels(data: pd.DataFrame) -> list[dict[str, Any]]:

@@ -104,6 +104,8 @@ def _value(value: Any) -> int | float | str | None:
 
 def definition(definitions: dict[str, Any], name: str) -> str:
     """The definition of a metric. A key is a list of names; `saved_...` matches a prefix, `NAME.error` a suffix."""
+    if name in definitions:
+        return text(definitions[name])
     keys = [([part.strip() for part in key.split(",")], words) for key, words in definitions.items()]
     last = name.rsplit(".", 1)[-1] if "." in name else None
     for fits in (

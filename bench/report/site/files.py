@@ -26,7 +26,9 @@ class Folder:
     """A run's folder as the page sees it, with links relative to `index.html`."""
 
     def __init__(self, results_dir: Path, name: str) -> None:
-        self.name, self.path, self.root = name, results_dir / "runs" / name, results_dir.resolve()
+        self.name, self.path = name, results_dir / "runs" / name
+        self.results_dir = results_dir
+        self.linked = self.path.is_symlink() or self.path.parent.is_symlink()
 
     @property
     def key(self) -> str:
@@ -36,7 +38,10 @@ class Folder:
     def has(self, name: str) -> bool:
         """Whether it has this file, and not a link to something outside of the results folder."""
         path = self.path / name
-        return path.is_file() and path.resolve().is_relative_to(self.root)
+        if not path.is_file():
+            return False
+        linked = self.linked or path.is_symlink()
+        return not linked or path.resolve().is_relative_to(self.results_dir.resolve())
 
     def thumb(self) -> str:
         """The picture that stands for the run; empty without one."""

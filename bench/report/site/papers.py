@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bench.report.site.script import to_script
 from bench.report.write.paper import FOLDER, SMOKE, find_paper
 
 SHOWN = ("question", "verdict", "chart", "atlas")  # what `bench.report` adds to a page's files
@@ -20,7 +19,9 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
         texts = {name: added.get(name) or "" for name in ("question", "verdict")}
         if texts["verdict"] and found["caption"].startswith(SMOKE):
             texts["verdict"] = SMOKE
-        entries.append({"name": found["name"], "key": key, "title": found["title"] or found["name"], **texts})
+        entries.append(
+            {"name": found["name"], "key": key, "title": (found["title"] or found["name"]).rstrip("."), **texts}
+        )
         parts = {name: found[name] for name in ("caption", "notes", "header", "rows", "files", "picture")}
         wholes[key] = parts | {name: added.get(name) for name in ("chart", "atlas")}
     return entries, wholes
@@ -35,8 +36,3 @@ def read_shown(path: Path) -> dict[str, Any]:
     kinds = {"question": str, "verdict": str, "chart": dict, "atlas": dict}
     sound = isinstance(found, dict)
     return {name: found[name] for name in SHOWN if isinstance(found.get(name), kinds[name])} if sound else {}
-
-
-def scripts(wholes: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """The script of each table and figure by its key."""
-    return {key: to_script("paper", key, whole) for key, whole in wholes.items()}

@@ -2,13 +2,15 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
 from bench.records.files import plain
 
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
-UNSAFE = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029\x7f"}
+UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
+ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
 def to_script(kind: str, key: str, data: Any) -> str:
@@ -22,8 +24,11 @@ def to_script(kind: str, key: str, data: Any) -> str:
 
 def safe_json(data: Any) -> str:
     """JSON in ASCII that can stand within a script element."""
-    text = json.dumps(plain(data), allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
-    return text.translate(UNSAFE)
+    try:
+        text = ENCODER.encode(data)
+    except ValueError:  # a number that is not finite
+        text = ENCODER.encode(plain(data))
+    return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def write_script(path: Path, text: str) -> None:

@@ -12,7 +12,7 @@ from bench.records.read import read_records
 from bench.report.site.columns import columns
 from bench.report.site.detail import detail
 from bench.report.site.files import Folder
-from bench.report.site.papers import papers, scripts
+from bench.report.site.papers import papers
 from bench.report.site.script import to_script, write_script
 
 ASSETS = Path(__file__).parents[1] / "page"
@@ -27,6 +27,7 @@ SCRIPTS = (  # in the order in which they need each other
 )
 START = "app.js"  # after the data
 LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
+DATA = tuple(f"data/{kind}" for kind in ("list", "run", "mesh", "paper"))
 KEY = re.compile(r"[0-9a-f]{16}\.js")  # of the files with details
 MOST_MESHES = 500  # of the newest runs; `bench.report meshes=all` makes all
 # Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
@@ -55,16 +56,28 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
         "papers": entries,
         "runs": columns(records, results_dir),
     }
+    _refuse_links(results_dir)
     _copy_assets(results_dir / FOLDER)
     for name, content in lists.items():
         write_script(data / "list" / f"{name}.js", to_script("list", name, content))
-    _write_all(data / "paper", scripts(wholes))
-    details = {folder.key: detail(r, folder, results_dir) for r, folder in zip(records, folders, strict=True)}
-    _write_all(data / "run", {key: to_script("run", key, each) for key, each in details.items()})
+    for key, whole in wholes.items():
+        write_script(data / "paper" / f"{key}.js", to_script("paper", key, whole))
+    _remove_others(data / "paper", set(wholes))
+    for record, folder in zip(records, folders, strict=True):
+        details = detail(record, folder, results_dir)
+        write_script(data / "run" / f"{folder.key}.js", to_script("run", folder.key, details))
+    _remove_others(data / "run", {folder.key for folder in folders})
     _write_meshes(data / "mesh", [folder for folder in folders if folder.has("mesh.ply")], meshes)
     page = results_dir / "index.html"
     write_text(page, shell())
     return page
+
+
+def _refuse_links(results_dir: Path) -> None:
+    """Raises ValueError where a folder that the page is written to is a link, which may lead anywhere."""
+    for name in (FOLDER, *(f"{FOLDER}/{inner}" for inner in ("base", "parts", "views", "data", *DATA))):
+        if (results_dir / name).is_symlink():
+            raise ValueError(f"{results_dir / name} is a link, and the page is not written through it: remove it")
 
 
 def shell() -> str:
@@ -109,14 +122,8 @@ def _copy(source: Path, target: Path) -> None:
     scratch.replace(target)
 
 
-def _write_all(folder: Path, texts: dict[str, str]) -> None:
-    """Writes a script for each key, and removes those of runs that are gone."""
-    for key, text in texts.items():
-        write_script(folder / f"{key}.js", text)
-    _remove_others(folder, set(texts))
-
-
 def _remove_others(folder: Path, keys: set[str]) -> None:
+    """Removes the scripts of what is gone."""
     for path in folder.glob("*.js") if folder.is_dir() else ():
         if KEY.fullmatch(path.name) and path.stem not in keys:
             path.unlink(missing_ok=True)

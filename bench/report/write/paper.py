@@ -66,9 +66,15 @@ def find_paper(results_dir: Path) -> list[dict[str, Any]]:
     Each has a name, title, caption, notes, the table's header and rows, and links to the picture and the files.
     """
     folder = results_dir / FOLDER
-    seen = {path.stem for path in folder.glob("*") if path.suffix in (*SUFFIXES, ".png") and path.is_file()}
+    kinds = (*SUFFIXES, ".png")
+    seen = {path.stem for path in folder.glob("*") if path.suffix in kinds and _is_within(path, results_dir)}
     names = [*(name for name in page_names() if name in seen), *sorted(seen - {*page_names()})]
     return [_found(folder, name) for name in names if not name.startswith(".")]
+
+
+def _is_within(path: Path, results_dir: Path) -> bool:
+    """Whether a file is there, and is no link to something outside of the results folder."""
+    return path.is_file() and path.resolve().is_relative_to(results_dir.resolve())
 
 
 def write_readme(results_dir: Path) -> Path | None:
@@ -88,7 +94,8 @@ def write_readme(results_dir: Path) -> Path | None:
 
 def _found(folder: Path, name: str) -> dict[str, Any]:
     files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
-    links = {suffix: link(FOLDER, path.name) for suffix, path in files.items() if path.is_file()}
+    within = {suffix: path for suffix, path in files.items() if _is_within(path, folder.parent)}
+    links = {suffix: link(FOLDER, path.name) for suffix, path in within.items()}
     picture = links.get(".png")
     links.pop(".png", None)
     named = {suffix[1:].upper(): link for suffix, link in links.items()}
@@ -98,7 +105,8 @@ def _found(folder: Path, name: str) -> dict[str, Any]:
 def read_page(base: Path) -> dict[str, Any]:
     """The title, caption, table and notes of `base.md`; empty ones where there is no such file."""
     path = base.with_name(base.name + ".md")
-    return _parsed(path.read_text(encoding="utf-8", errors="replace") if path.is_file() else "")
+    sound = _is_within(path, base.parents[1])
+    return _parsed(path.read_text(encoding="utf-8", errors="replace") if sound else "")
 
 
 def _parsed(markdown: str) -> dict[str, Any]:

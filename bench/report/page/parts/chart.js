@@ -27,7 +27,8 @@
     const redraw = () => places.forEach((place, number) => drawPanel(plotly, place, spec.panels[number], {off, focus}));
     const looks = new Map(spec.panels.flatMap((panel) => panel.series).map((series) => [series.name, series]));
     const entries = names.map((name) => entry(name, looks.get(name), off, redraw));
-    fill(home, element("div.panels", null, places), names.length > 1 ? element("div.legend", null, entries) : null);
+    fill(home, element("div.panels", null, places), names.length > 1 ? element("div.legend", null, entries) : null,
+      spec.note ? element("p.soft", null, spec.note) : null);
     requestAnimationFrame(redraw);
     bench.onTheme(home, redraw);
   }
@@ -85,14 +86,29 @@
   function layout(panel, place) {
     const style = getComputedStyle(document.documentElement);
     const [text, line, card] = ["--soft", "--line", "--card"].map((name) => style.getPropertyValue(name).trim());
-    const axis = ({title, log, range}) => ({title: {text: plain(title), standoff: 8}, type: log ? "log" : "linear", range, gridcolor: line, zerolinecolor: line,
-      linecolor: line, automargin: true, nticks: place.clientWidth < 460 ? 5 : 8, exponentformat: "power"});
+    const narrow = place.clientWidth < 460;
+    const axis = ({title, log}, letter) => ({...(log ? ticks(panel.series.flatMap((series) => series[letter]), narrow) : {}), title: {text: plain(title), standoff: 8}, type: log ? "log" : "linear", gridcolor: line, zerolinecolor: line,
+      linecolor: line, automargin: true, nticks: narrow ? 5 : 8});
     return {
       title: {text: plain(panel.title || ""), font: {size: 14}, x: 0.02, xanchor: "left"}, height: panel.height || 360, showlegend: false,
-      margin: {l: 56, r: 12, t: panel.title ? 38 : 12, b: 46}, hovermode: "closest", xaxis: axis(panel.x), yaxis: axis(panel.y),
+      margin: {l: 56, r: 12, t: panel.title ? 38 : 12, b: 46}, hovermode: "closest", xaxis: axis(panel.x, "x"), yaxis: axis(panel.y, "y"),
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: {color: text, size: 12, family: style.getPropertyValue("--font")},
       hoverlabel: {bgcolor: card, bordercolor: line, align: "left", font: {color: style.getPropertyValue("--text").trim()}},
     };
+  }
+
+  /* Plain numbers as ticks of a logarithmic axis: powers of ten, and 2 and 5 between them where there are few. */
+  function ticks(values, narrow) {
+    const known = values.map(bench.store.decoded).filter((value) => value > 0 && Number.isFinite(value));
+    if (!known.length) return {};
+    const [low, high] = [Math.log10(Math.min(...known)), Math.log10(Math.max(...known))];
+    const span = high - low;
+    const steps = span > (narrow ? 1.6 : 2.6) ? [1] : span > 0.8 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 6, 8];
+    const stride = span > 7 ? 2 : 1;
+    const tickvals = [];
+    for (let power = Math.floor(low) - 1; power <= Math.ceil(high) + 1; power += stride) for (const step of steps) tickvals.push(step * 10 ** power);
+    const plain = (x) => (x >= 1e4 || x < 1e-3 ? x.toExponential(0).replace("e+", "e") : String(Number(x.toPrecision(2))));
+    return {tickvals, ticktext: tickvals.map((x) => (x >= 1e4 && x < 1e15 ? bench.format.count(x).replace(/\.0+(?=[kMGTP])/, "") : plain(x)))};
   }
 
   bench.chart = chart;

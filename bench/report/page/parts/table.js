@@ -3,6 +3,7 @@
   "use strict";
 
   const {element, fill} = bench.dom;
+  const LONGEST_LINE = 44; // characters of a cell that stays in one line
 
   /* A table of columns {key, label, unit, cell, kind, sortable} over items.
      `order` is {key, down}; `sorted` is called with the key of a heading that is pressed. */
@@ -16,11 +17,11 @@
   function heading(column, order, sorted) {
     const own = order && order.key === column.key;
     const direction = own ? (order.down ? "descending" : "ascending") : null;
-    const label = [column.label, column.unit ? element("small", null, column.unit) : null];
     const shown = column.sortable && sorted
       ? element("button.sort", {type: "button", click: () => sorted(column.key), "data-key": column.key},
-          label, element("span.arrow", {"aria-hidden": "true"}, own ? (order.down ? "▼" : "▲") : ""))
-      : label;
+          column.label, element("span.arrow", {"aria-hidden": "true"}, own ? (order.down ? "▼" : "▲") : ""),
+          column.unit ? element("small", null, column.unit) : null)
+      : [column.label, column.unit ? element("small", null, column.unit) : null];
     return element(`th.${column.kind || "words"}`, {scope: "col", "aria-sort": direction}, shown);
   }
 
@@ -37,7 +38,7 @@
     if (!step || !row || event.target.matches("input, select")) return;
     const rows = [...row.parentElement.children];
     const next = rows[rows.indexOf(row) + step];
-    const link = next && next.querySelector("a");
+    const link = next && next.querySelector("a:not([tabindex])");
     if (!link) return;
     event.preventDefault();
     link.focus();
@@ -45,11 +46,12 @@
 
   /* The table of a page that was written as text: numbers to the right, and sorted by the first number of a cell. */
   function written(header, rows, {link} = {}) {
+    const longest = header.map((_, place) => Math.max(0, ...rows.map((row) => (row[place] || "").length)));
     const numeric = header.map((_, place) => isNumeric(rows.map((row) => row[place] || "")));
     const home = element("div.wide", {tabindex: 0, role: "region", "aria-label": "Table"});
     let order = null;
     const columns = header.map((label, place) => ({
-      key: String(place), label, sortable: true, head: place === 0, kind: numeric[place] ? "number" : "words",
+      key: String(place), label, sortable: true, head: place === 0, kind: numeric[place] ? "number" : longest[place] <= LONGEST_LINE ? "words.line" : "words",
       cell: (row) => (link && link(row, place)) || row[place],
     }));
     const show = () => {

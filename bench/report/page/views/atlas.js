@@ -33,7 +33,7 @@
       for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
       event.currentTarget.setAttribute("aria-pressed", "true");
       open(data, line, place, opened);
-    }}, found.short);
+    }}, found.status === "unsupported" ? "–" : found.short);
     if (found.shade !== null) {
       const step = Math.min(SHADES.length - 1, Math.floor(found.shade * SHADES.length));
       button.style.background = SHADES[step];
@@ -65,9 +65,19 @@
     const parts = [element("h2", null, `${axis.title}, ${row}`), element("p", null, `Breaks: ${found.full}${found.status === "ok" ? ` ${axis.unit}` : ""}. `,
       found.reason || "", run === undefined ? element("span.soft", null, " Its run is not among these results.")
         : element("a", {href: bench.runs.link(run)}, "The run"))];
-    fill(opened, parts, data.curves && data.curves[axis.axis] ? bench.chart({panels: [data.curves[axis.axis]]}, {label: `Share of successes on ${axis.title}`, focus: row}) : null,
-      run === undefined ? null : failure(run));
+    const curve = element("div");
+    fill(opened, parts, curve, run === undefined ? null : failure(run));
+    curves().then((panels) => {
+      const panel = panels.find((each) => each.axis === axis.axis);
+      if (panel) fill(curve, bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}));
+    }, () => {});
     opened.scrollIntoView({block: "nearest"});
+  }
+
+  /* The curves of all axes, which stand in a page of their own. */
+  function curves() {
+    const paper = bench.store.have("list", "papers").find(({name}) => name === "stability_curves");
+    return paper ? bench.store.load("paper", paper.key).then((data) => (data.chart ? data.chart.panels : [])) : Promise.resolve([]);
   }
 
   function failure(run) {

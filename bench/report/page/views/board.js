@@ -48,10 +48,10 @@
       const search = element("input", {type: "search", placeholder: "Search names, scenes, reasons", "aria-label": "Search",
         value: state.q || "", input: (event) => change({q: event.target.value})});
       const selects = Object.entries(bench.filter.FILTERS).map(([column, name]) => element("label.pick", null, name,
-        element("select", {"data-column": column, change: (event) => change({[column]: event.target.value})})));
+        element("select", {"data-column": column, "aria-label": name, change: (event) => change({[column]: event.target.value})})));
       const views = ["methods", "runs"].map((view) => element("button", {type: "button", "data-view": view,
         click: () => change({view, sort: "", order: ""})}, view === "methods" ? "Methods" : "Runs"));
-      const sorts = element("label.pick.narrow", null, "Sort by", element("select", {"data-column": "sort",
+      const sorts = element("label.pick.narrow", null, "Sort by", element("select", {"data-column": "sort", "aria-label": "Sort by",
         change: (event) => change({sort: event.target.value, order: ""})}));
       home.append(element("div.switch", {role: "group", "aria-label": "What a row is"}, views), search,
         element("div.picks", null, selects, sorts), element("div.chips"));
@@ -210,7 +210,7 @@
 
   function named(place) {
     const runs = bench.runs;
-    const about = [runs.text(place, "scene"), `seed ${number(runs.number(place, "seed"))}`, runs.text(place, "experiment")];
+    const about = [runs.text(place, "scene"), `seed ${runs.number(place, "seed") ?? MISSING}`, runs.text(place, "experiment")];
     const task = bench.address.read().query.task === "all" ? runs.text(place, "task") : "";
     return [element("a", {href: runs.link(place)}, runs.text(place, "name")),
       element("small", null, [task, ...about].filter(Boolean).join(" · "))];

@@ -22,7 +22,7 @@
   function heading(place, number) {
     const runs = bench.runs;
     return element("div.side", null, element("p", null, element(`b.${"ab"[number]}`, null, "AB"[number]), element("a", {href: runs.link(place)}, runs.title(place))),
-      element("p", null, bench.badge(runs.text(place, "status")), element("span.soft", null, runs.reason(place) || `seed ${bench.format.number(runs.number(place, "seed"))}`)));
+      element("p", null, bench.badge(runs.text(place, "status")), element("span.soft", null, runs.reason(place) || `seed ${runs.number(place, "seed") ?? "–"}`)));
   }
 
   function parts(places, details) {

@@ -26,11 +26,18 @@
       data.chart ? bench.chart(data.chart, {label: known.title}) : null,
       picture && answers ? element("details", null, element("summary", null, "The figure as in the paper"), picture) : picture,
       element("p.caption", null, data.caption),
-      data.rows.length ? bench.table.written(data.header, data.rows) : null,
+      table(data),
       data.notes.length ? element("details", null, element("summary", null, `Notes and definitions (${data.notes.length})`),
         element("ul", null, data.notes.map((note) => element("li", null, note)))) : null,
       element("p.files", null, "Files: ", Object.entries(data.files).map(([kind, link]) => [element("a", {href: link}, kind), " "])),
     ];
+  }
+
+  /* The table; under an atlas, which shows the same, it is folded. */
+  function table({header, rows, atlas}) {
+    if (!rows.length) return null;
+    const written = bench.table.written(header, rows);
+    return atlas ? element("details", null, element("summary", null, "The table, with intervals"), written) : written;
   }
 
   bench.paper = paper;

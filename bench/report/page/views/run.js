@@ -17,7 +17,7 @@
     fill(home,
       element("p.crumbs", null, element("a", {href: "#/"}, "All results"), " / ", element("a", {href: bench.address.to(["runs"], {task: runs.text(place, "task"), view: "runs"})}, runs.text(place, "task"))),
       element("h1", null, runs.title(place)),
-      element("p.about", null, bench.badge(runs.text(place, "status")), element("span.soft", null, `seed ${number(runs.number(place, "seed"))} · ${date(runs.number(place, "started"))} UTC · `),
+      element("p.about", null, bench.badge(runs.text(place, "status")), element("span.soft", null, `seed ${runs.number(place, "seed") ?? "–"} · ${date(runs.number(place, "started"))} UTC · `),
         element("code.soft", null, runs.folder(place)), pick), body);
     bench.store.load("run", runs.key(place)).then((detail) => fill(body, parts(place, detail)), (error) => fill(body, element("p.note", null, error.message)));
   }
