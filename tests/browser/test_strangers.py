@@ -1,4 +1,4 @@
-"""A results folder of somebody else: no text in it runs, nothing is asked of a network, and nothing leaves the folder."""
+"""A results folder of somebody else: no text in it runs, no network is asked, and nothing leaves the folder."""
 
 import json
 

@@ -45,7 +45,7 @@
   const plural = (n, word) => `${n.toLocaleString("en")} ${word}${n === 1 ? "" : "s"}`;
 
   /* A label's "(x1000)" with the sign of multiplication. */
-  const label = (text) => text.replace("(x1000)", "× 1000");
+  const label = (text) => text[0].toUpperCase() + text.slice(1).replace("(x1000)", "× 1000");
 
   bench.format = {number, count, size, seconds, date, plural, label, MISSING};
 })((window.implicitBench = window.implicitBench || {}));

@@ -71,7 +71,7 @@
       const panel = panels.find((each) => each.axis === axis.axis);
       if (panel) fill(curve, bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}));
     }, () => {});
-    opened.scrollIntoView({block: "nearest"});
+    if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
   }
 
   /* The curves of all axes, which stand in a page of their own. */
