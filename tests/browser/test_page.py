@@ -1,6 +1,8 @@
 """The page in Chromium: tables, filters, links, charts and the 3D view; the address, the keyboard, two runs, phones."""
 
 import json
+import subprocess
+import sys
 import time
 
 import pytest
@@ -335,8 +337,12 @@ def test_one_file_has_all_inside(results, tab, tmp_path):
 def test_ten_thousand_runs_are_a_hundred_rows_at_a_time(tmp_path, tab, capsys):
     """The bounds are on what is there, not on the clock: times are printed, for `pytest -s`."""
     made.write_many(tmp_path, 10_000)
+    code = (
+        f"from pathlib import Path; from bench.report.write.html import write_index; "
+        f"write_index(Path({str(tmp_path)!r}))"
+    )
     started = time.perf_counter()
-    write_index(tmp_path)
+    subprocess.run([sys.executable, "-c", code], check=True)  # of its own: the types that tests check take longer
     written = time.perf_counter() - started
     size = (tmp_path / "page" / "data" / "list" / "runs.js").stat().st_size
     one = tab(tmp_path)

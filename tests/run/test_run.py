@@ -227,6 +227,10 @@ def test_seconds_add_up(finished):
     assert finished.record["gemm_fraction"] == pytest.approx(finished.record["flops"] / loop / peak)
 
 
+def test_the_record_has_what_the_command_line_set(finished):
+    assert finished.record["overrides"] == [*COMMANDS[finished.renderer], f'results_dir="{finished.results}"']
+
+
 def test_the_report_has_the_run(finished):
     page = Page(finished.results)
     assert page.folders == [finished.folder.name] and page.text("thumb") == ["summary.png"]
