@@ -109,6 +109,8 @@ def test_the_command_is_what_was_typed_and_safe_to_paste():
     older, remark = command(record("x", method="dist_mask"), Path("results"))
     assert older == "python -m bench task=completion renderer=dist dataset=sofa +method=dist_mask seed=0"
     assert "config.yaml has all settings" in remark
+    stressed = command(record("x", dataset="wires", config={"stress": {"name": "wires"}}), Path("results"))[0]
+    assert "stress=wires" in stressed and "dataset" not in stressed
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):

@@ -30,6 +30,8 @@
     if (bench.oneFile) document.getElementById("problems").append(element("p.note", null, about.left));
   }
 
+  let shown = false;
+
   const VIEWS = {
     "": (home, {query}) => bench.overview(home, {board: query}),
     runs: (home, {query}) => bench.overview(home, {board: query, alone: true}),
@@ -46,6 +48,8 @@
     const heading = home.querySelector("h1");
     document.title = heading ? `${heading.textContent} – implicit-bench` : "implicit-bench";
     window.scrollTo(0, 0);
+    if (shown) home.focus({preventScroll: true}); // of another view, so that the keyboard goes on from its start
+    shown = true;
   }
 
   start();

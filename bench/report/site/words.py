@@ -53,7 +53,8 @@ def command(record: Record, results_dir: Path) -> tuple[str, str]:
             kept, results_dir
         ), "As it was typed. Configurations are code: read one that is not yours first."
     config = record["config"]
-    known = {"task": record["task"], "renderer": record["renderer"], "dataset": record["dataset"]}
+    seen = "stress" if config.get("stress") else "dataset"  # a stress takes the dataset's place in a record
+    known = {"task": record["task"], "renderer": record["renderer"], seen: record["dataset"]}
     known |= {"scale": setting(config, "scale", "name")}
     known |= {key: config.get(key) for key in ("experiment", "method")}
     known |= {"method": record.get("method")}

@@ -213,13 +213,13 @@
     const about = [runs.text(place, "scene"), `seed ${runs.number(place, "seed") ?? MISSING}`, runs.text(place, "experiment")];
     const task = bench.address.read().query.task === "all" ? runs.text(place, "task") : "";
     return [element("a", {href: runs.link(place)}, runs.text(place, "name")),
-      element("small", null, [task, ...about].filter(Boolean).join(" · "))];
+      element("small", null, [task, ...about].filter(Boolean).join(" · ")),
+      runs.reason(place) ? element("small.reason", {title: runs.reason(place)}, runs.reason(place)) : null];
   }
 
   function status(place) {
     const runs = bench.runs;
-    return [bench.badge(runs.text(place, "status")), runs.reused(place) ? element("small", null, "reused") : null,
-      runs.reason(place) ? element("small.reason", {title: runs.reason(place)}, runs.reason(place)) : null];
+    return [bench.badge(runs.text(place, "status")), runs.reused(place) ? element("small", null, "reused") : null];
   }
 
   /* A word on machines where the times that are shown are of several. */

@@ -67,12 +67,15 @@
     if (!rows.length) return element("p.soft", null, "This run measured nothing.");
     const columns = [
       {label: "Name", head: true, cell: ([name]) => element("code", null, name)},
-      {label: "Before", kind: "number", cell: (row) => number(bench.store.decoded(row[1]))},
-      {label: "After", kind: "number", cell: (row) => number(bench.store.decoded(row[2]))},
+      {label: "Before", kind: "number", cell: (row) => measured(row[1])},
+      {label: "After", kind: "number", cell: (row) => measured(row[2])},
       {label: "Definition", cell: (row) => row[3] || element("span.soft", null, "No definition recorded.")},
     ];
     return element("div.wide", null, bench.table.table(columns, rows, {caption: "Metrics before and after"}));
   }
+
+  /* A metric; a whole number has no decimals. */
+  const measured = (value) => (Number.isInteger(value) && Math.abs(value) < 1e6 ? String(value) : number(bench.store.decoded(value)));
 
   /* A bar per phase, and what was counted. */
   function costs({phases, total, evaluations, flops, gemm_fraction, peak_memory_bytes}) {
