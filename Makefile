@@ -2,7 +2,7 @@
 PYTHON ?=
 BIN := .venv/bin
 
-.PHONY: demo test test-slow benchmark mutants lint setup clean
+.PHONY: demo test test-slow test-browser benchmark mutants lint setup clean
 
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
@@ -12,6 +12,10 @@ test: .venv/ready-dev ## set up once, then the tests (about 4 minutes on 2 cores
 
 test-slow: .venv/ready-dev ## the minutes-long tests
 	$(BIN)/python -m pytest -m slow --ignore tests/benchmarks
+
+test-browser: .venv/ready-dev ## installs Chromium and Playwright where they are missing, then opens the page in it (minutes)
+	@.ci/setup browser
+	$(BIN)/python -m pytest -s -m browser tests/browser
 
 benchmark: .venv/ready-dev ## renderers in turn, then speed and memory against the machine's own limits; on a quiet machine
 	$(BIN)/python -m bench -m +experiment=benchmark

@@ -197,7 +197,7 @@ def test_the_checker_finds_what_is_wrong(module, source):
         ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
         ("bench.run.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
         ("bench.__main__", "from bench.report.write.html import write_index"),
-        ("bench.report.write.html", "import jinja2, os.path\nfrom bench.records import format\nfrom . import caption"),
+        ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
         ("bench", "import os"),
         ("benchmark.report", "import datasets_of_others"),
     ],

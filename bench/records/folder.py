@@ -34,7 +34,7 @@ PASSIVE = (
         "bench/progress.py",
     ),
     *(f"bench/run/{name}.py" for name in ("check", "library", "plan", "summary", "sweep")),
-    *(f"bench/records/{name}.py" for name in ("expected", "format", "metrics", "names", "read")),
+    *(f"bench/records/{name}.py" for name in ("expected", "format", "metrics", "names", "read", "statuses")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"

@@ -1,44 +1,65 @@
 """What is known of metrics by their names: heading, factor of printed numbers, and which direction is better."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 PREFIXES = ("own_", "seen_")  # of the same metric of the renderer's own image, and of what photographs see
+LOWER, HIGHER = "lower", "higher"
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A metric that tables show.
+class Metric(NamedTuple):
+    """A metric as readers see it.
 
     Args:
         label: its heading, with the factor or the unit.
         factor: of the printed number.
-        better: lower or higher.
+        better: lower, higher, or empty where neither is.
     """
 
     label: str
     factor: float = 1.0
-    better: str = "lower"
+    better: str = ""
 
 
 SHOWN = {  # in the order of tables
-    "chamfer_l2": Metric("Chamfer (x1000)", 1000.0),
-    "seen_chamfer_l1": Metric("Chamfer-L1 of what is seen (x1000)", 1000.0),
-    "accuracy": Metric("accuracy (x1000)", 1000.0),
-    "completeness": Metric("completeness (x1000)", 1000.0),
-    "fscore": Metric("F-score", better="higher"),
-    "normal_consistency": Metric("normal consistency", better="higher"),
-    "iou": Metric("IoU of volumes", better="higher"),
-    "fitted_mask_iou": Metric("mask IoU from the best view", better="higher"),
-    "depth_mae": Metric("depth error (x1000)", 1000.0),
-    "mask_iou": Metric("mask IoU", better="higher"),
-    "psnr": Metric("PSNR (dB)", better="higher"),
-    "ssim": Metric("SSIM", better="higher"),
-    "rotation_error_deg": Metric("rotation error (degrees)"),
-    "translation_error": Metric("translation error (x1000)", 1000.0),
+    "chamfer_l2": Metric("Chamfer (x1000)", 1000.0, LOWER),
+    "seen_chamfer_l1": Metric("Chamfer-L1 of what is seen (x1000)", 1000.0, LOWER),
+    "accuracy": Metric("accuracy (x1000)", 1000.0, LOWER),
+    "completeness": Metric("completeness (x1000)", 1000.0, LOWER),
+    "fscore": Metric("F-score", better=HIGHER),
+    "normal_consistency": Metric("normal consistency", better=HIGHER),
+    "iou": Metric("IoU of volumes", better=HIGHER),
+    "fitted_mask_iou": Metric("mask IoU from the best view", better=HIGHER),
+    "depth_mae": Metric("depth error (x1000)", 1000.0, LOWER),
+    "mask_iou": Metric("mask IoU", better=HIGHER),
+    "psnr": Metric("PSNR (dB)", better=HIGHER),
+    "ssim": Metric("SSIM", better=HIGHER),
+    "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
+    "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
+}
+MEASURED = {  # of tasks that optimise nothing
+    "forward_seconds": Metric("forward (s)", better=LOWER),
+    "step_seconds": Metric("step (s)", better=LOWER),
+    "queries": Metric("values of a rendering", better=LOWER),
+    "error_p95": Metric("depth error, 95 % (x1000)", 1000.0, LOWER),
+    "breakdown": Metric("breaks at"),
+    "trials": Metric("trials"),
+    "recommended_error": Metric("error of the chosen field (x1000)", 1000.0, LOWER),
+    "frontal.code_pooled_cosine": Metric("gradient's cosine, frontal", better=HIGHER),
+    "grazing.code_pooled_cosine": Metric("gradient's cosine, grazing", better=HIGHER),
+    "silhouette.image_cosine": Metric("cosine at the outline", better=HIGHER),
 }
 FURTHER = {  # that tables do not show, but whose direction is known
-    **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred", "depth_error_capped"), "lower"),
-    "mask_iou_least": "higher",
+    **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred", "depth_error_capped"), LOWER),
+    **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
+    "mask_iou_least": HIGHER,
+}
+# The metric that a task's runs are sorted by; of a task that is not here the first of these that its runs have.
+FIRST = {
+    "pose": "rotation_error_deg",
+    "pose_icp": "rotation_error_deg",
+    "reconstruction": "seen_chamfer_l1",
+    "single_view": "iou",
+    "ablation": "step_seconds",
 }
 
 

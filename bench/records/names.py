@@ -9,6 +9,7 @@ from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
 
 CHOICES = ("task", "method", "renderer", "dataset")  # fields of a record, whose values are names by themselves
 WORDS = {"index": "shape", "dataset.path": "", "_target_": ""}  # what stands before the value in place of the key
+DEEPEST = 20  # levels of a configuration
 SKIPPED = NEUTRAL_KEYS | {"label", "packages"}
 
 
@@ -56,12 +57,12 @@ def differences(
     return Differences(tuple(keys), tuple(name or other for name, other in zip(names, default, strict=True)))
 
 
-def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested settings by dotted keys."""
+def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
+    """The values of nested settings by dotted keys; what lies deeper than `depth` levels is left out, as "…"."""
     values: dict[str, Any] = {}
     for key, value in node.items():
-        name = f"{prefix}{key}"
-        values |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        name, inner = f"{prefix}{key}", isinstance(value, dict)
+        values |= flat(value, f"{name}.", depth - 1) if inner and depth else {name: "…" if inner else value}
     return values
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import is_plain_name, leads_out, link_out, to_json, write_text
+from bench.records.files import decoded, is_plain_name, leads_out, link_out, to_json, write_text
 from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, started
 
 PLAN = "plan.json"
@@ -139,6 +139,23 @@ def _sound(cell: dict[str, Any]) -> bool:
     """Whether the fields of a planned cell have their types, and its id leads to no other folder."""
     texts = all(isinstance(cell[name], str) for name in TEXTS)
     return texts and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
+
+
+def curve_lines(folder: Path) -> list[dict[str, Any]] | None:
+    """The lines of `curve.jsonl`, empty for those that cannot be read; None where there is no such file."""
+    try:
+        text = (folder / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    return [_line(line) for line in text.splitlines()]
+
+
+def _line(text: str) -> dict[str, Any]:
+    try:
+        found = decoded(json.loads(text))
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:

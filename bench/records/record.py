@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -19,7 +20,8 @@ NEUTRAL_KEYS = frozenset(
     )
 )
 NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
-LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked")  # fields that old records may lack
+# Fields that old records may lack.
+LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
 
 
 class RunStatus(StrEnum):
@@ -77,6 +79,7 @@ class Record:
     asked: str = field(default_factory=now)  # when it was last requested; a reused run ran earlier
     ended: str = ""  # empty while it is under way, and where it was killed before it could write this
     log: list[str] = field(default_factory=list)  # the last lines of log.txt, where the run failed
+    overrides: list[str] = field(default_factory=list)  # what the command line set, as KEY=VALUE
 
     @property
     def name(self) -> str:
@@ -101,13 +104,17 @@ class Record:
 
 def row_name(config: dict[str, Any], renderer: str) -> str:
     """The name of a run's row: that of `renderer_name`, with a silhouette loss that is not the renderer's own."""
-    name, loss = renderer_name(config, renderer), (config.get("silhouette") or {}).get("_label_")
+    name, loss = renderer_name(config, renderer), _labelled(config.get("silhouette"))
     return f"{name}, {loss}" if loss else name
 
 
 def renderer_name(config: dict[str, Any], renderer: str) -> str:
     """The label of a run's configuration, or of its renderer's node, or the name of the renderer's file."""
-    return str(config.get("label") or (config.get("renderer") or {}).get("_label_") or renderer)
+    return str(config.get("label") or _labelled(config.get("renderer")) or renderer)
+
+
+def _labelled(node: Any) -> str:
+    return str(node.get("_label_") or "") if isinstance(node, dict) else ""
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -144,14 +151,20 @@ def started(record: dict[str, Any]) -> datetime:
 
 def _check(record: dict[str, Any]) -> None:
     """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`."""
-    hints = get_type_hints(Record)
-    for item in fields(Record):
-        if item.name not in record:
-            if item.name in LATER:
+    for name, classes in _fields().items():
+        if name not in record:
+            if name in LATER:
                 continue
-            raise ValueError(f"record.json must have the field {item.name!r}, found none")
-        if not isinstance(record[item.name], _classes(hints[item.name])):
-            raise ValueError(f"{item.name} in record.json has the wrong type, found {type(record[item.name]).__name__}")
+            raise ValueError(f"record.json must have the field {name!r}, found none")
+        if not isinstance(record[name], classes):
+            raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
+
+
+@cache
+def _fields() -> dict[str, tuple[type, ...]]:
+    """The classes that each field allows."""
+    hints = get_type_hints(Record)
+    return {item.name: _classes(hints[item.name]) for item in fields(Record)}
 
 
 def _classes(hint: Any) -> tuple[type, ...]:

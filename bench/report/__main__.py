@@ -1,15 +1,22 @@
-"""`python -m bench.report [results_dir=PATH]`: writes all tables, figures and `index.html`, and prints their paths."""
+"""`python -m bench.report [KEY=VALUE ...]`: writes all tables, figures and `index.html`, and prints their paths."""
 
 import sys
 from pathlib import Path
 
+from bench.records.format import size
 from bench.records.read import read_records
 from bench.report.data.frame import NO_PARQUET, write_frame
-from bench.report.write.html import write_index
+from bench.report.write.answer import write_answers
+from bench.report.write.html import MOST_MESHES, write_index
+from bench.report.write.one_file import write_one_file
 from bench.report.write.paper import write_paper, write_readme
 from bench.report.write.sweeps import write_sweeps
 
-USAGE = "usage: python -m bench.report [results_dir=PATH]   (results_dir is `results` unless given)"
+USAGE = """usage: python -m bench.report [results_dir=PATH] [meshes=all] [one_file=true]
+  results_dir   the folder with the runs; `results` unless given
+  meshes        of how many runs, the newest first, the mesh turns on the page; 500 unless given, or all
+  one_file      true: also writes report.html, the page in one file to send, with small pictures and without meshes"""
+KEYS = ("results_dir", "meshes", "one_file")
 
 
 def main(arguments: list[str]) -> None:
@@ -20,23 +27,56 @@ def main(arguments: list[str]) -> None:
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
         return
-    results_dir = Path("results")
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key != "results_dir" or not value:
-            sys.exit(f"argument must be results_dir=PATH, found {argument!r}\n{USAGE}")
-        results_dir = Path(value)
     try:
+        given = parsed(arguments)
+        results_dir = Path(given.get("results_dir", "results"))
+        meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
         records = read_records(results_dir)[0]
         frames = write_frame(records, results_dir)
         if len(frames) == 1:
             print(f"note: {NO_PARQUET}", file=sys.stderr)
         for path in (*frames, *write_paper(records, results_dir), *write_sweeps(records, results_dir)):
             print(path)
+        for problem in write_answers(results_dir):
+            print(problem, file=sys.stderr)
         write_readme(results_dir)
-        print(write_index(results_dir))
+        if _one_file(given.get("one_file", "false")):
+            sent = write_one_file(results_dir)
+            print(f"{sent} ({size(sent.stat().st_size)})")
+        print(write_index(results_dir, meshes=meshes))
     except ValueError as error:
         sys.exit(str(error))
+
+
+def parsed(arguments: list[str]) -> dict[str, str]:
+    """The arguments by their keys.
+
+    Raises:
+        ValueError: where one has no known key, or no value.
+    """
+    given = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key not in KEYS or not value:
+            raise ValueError(
+                f"argument must be one of {', '.join(f'{k}=VALUE' for k in KEYS)}, found {argument!r}\n{USAGE}"
+            )
+        given[key] = value
+    return given
+
+
+def _meshes(text: str) -> int | None:
+    if text == "all":
+        return None
+    if not text.isdecimal():
+        raise ValueError(f"meshes must be a number of runs or all, found {text!r}\n{USAGE}")
+    return int(text)
+
+
+def _one_file(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise ValueError(f"one_file must be true or false, found {text!r}\n{USAGE}")
+    return text == "true"
 
 
 if __name__ == "__main__":

@@ -201,6 +201,7 @@ def _new_record(identity: Identity, claim: Claim) -> Record:
         config=identity.config,
         config_hash=identity.config_hash,
         code=identity.code,
+        overrides=list(HydraConfig.get().overrides.task),
     )
 
 

@@ -34,7 +34,7 @@ def content(results: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(results)): path.read_bytes()
         for path in results.rglob("*")
-        if path.is_file() and path.name != "index.html" and ".locks" not in path.parts
+        if path.is_file() and path.name != "index.html" and not {".locks", "page"} & set(path.parts)
     }
 
 

@@ -28,6 +28,7 @@ from bench.solve import solve
 from bench.solve.optimise import History
 from bench.solve.problem import OptimiserSettings, Unsupported
 from datasets.scene import Scene
+from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome, command
 from tests.solve.test_optimise import POINTS, Toy
 from tests.tiny import ball_prior, silent
@@ -226,10 +227,15 @@ def test_seconds_add_up(finished):
     assert finished.record["gemm_fraction"] == pytest.approx(finished.record["flops"] / loop / peak)
 
 
+def test_the_record_has_what_the_command_line_set(finished):
+    assert finished.record["overrides"] == [*COMMANDS[finished.renderer], f'results_dir="{finished.results}"']
+
+
 def test_the_report_has_the_run(finished):
-    page = (finished.results / "index.html").read_text(encoding="utf-8")
-    assert finished.folder.name in page
-    assert f"runs/{finished.folder.name}/summary.png" in page
+    page = Page(finished.results)
+    assert page.folders == [finished.folder.name] and page.text("thumb") == ["summary.png"]
+    assert page.run(finished.folder.name)["files"]["mesh.ply"] == f"runs/{finished.folder.name}/mesh.ply"
+    assert page.read("mesh", page.runs["key"][0])["shown"][0] > 0
     (record,), problems = read_records(finished.results)
     assert problems == []
     assert record["metrics"] == finished.record["metrics"]
@@ -296,7 +302,7 @@ def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, 
     assert "Traceback" not in out + err
     assert len(err.strip().splitlines()) == 1
     assert record["reason"] in err
-    assert folder.name in (tmp_path / "results" / "index.html").read_text()
+    assert folder.name in Page(tmp_path / "results").folders
     assert status in (folder / "log.txt").read_text()
     assert ("Traceback" in (folder / "log.txt").read_text()) is isinstance(error, RuntimeError)
 

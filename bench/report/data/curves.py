@@ -1,6 +1,5 @@
 """Reads the curves of runs from their folders, and gives the median of several runs of one row."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import spearmanr
 
-from bench.records.files import decoded
+from bench.records.read import curve_lines as lines
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, measured
 
@@ -29,23 +28,6 @@ def read(folder: Path) -> tuple[pd.DataFrame, str]:
     else:
         warning = "" if found else "curve.jsonl is empty"
     return pd.DataFrame(known, columns=COLUMNS, dtype=float).drop_duplicates("iteration", keep="last"), warning
-
-
-def lines(folder: Path) -> list[dict[str, Any]] | None:
-    """The lines of `curve.jsonl`, empty for those that cannot be read; None where there is no such file."""
-    try:
-        text = (folder / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return None
-    return [_line(line) for line in text.splitlines()]
-
-
-def _line(text: str) -> dict[str, Any]:
-    try:
-        found = decoded(json.loads(text))
-    except (ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:

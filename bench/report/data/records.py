@@ -61,7 +61,7 @@ def base_renderer(record: Record) -> str:
 def family(record: Record) -> str:
     """The name of the record's dataset: the family, or the end of the path of a mesh file or folder."""
     path = setting(record["config"], "dataset", "path")
-    return "/".join(Path(path).absolute().parts[-2:]) if path else record["dataset"]
+    return "/".join(Path(str(path)).absolute().parts[-2:]) if path else record["dataset"]
 
 
 def iterations_of(record: Record) -> int | None:
@@ -130,7 +130,7 @@ def view(record: Record) -> Any:
 
 def _is_view(record: Record) -> bool:
     path, strength = (setting(record["config"], "dataset", key) for key in ("path", "strength"))
-    return bool(path) and bool(Path(path).suffix) and strength == 0
+    return bool(path) and bool(Path(str(path)).suffix) and strength == 0
 
 
 def run_key(record: Record) -> RunKey:

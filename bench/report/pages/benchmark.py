@@ -3,9 +3,12 @@
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
+
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, definitions, measured, setting
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, to_data, to_table, together, whole
 
@@ -110,3 +113,19 @@ COLUMNS = (
     *(Column(key) for key in ("depth_error_median", "depth_error_p99", "depth_error_max")),
     shown("Depth error median / p99", together(dict.get, format.number, "depth_error_median", "depth_error_p99")),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The least ratio of a step at the largest size."""
+    question = "Which renderer is fastest, timed in turn in one process?"
+    large = data[(data["size"] == data["size"].max()) & (data["status"] == "ok")].dropna(subset="step_ratio")
+    others = large[large["renderer"] != large["renderer"].iloc[0]] if len(large) else large
+    if not len(others):
+        return Answer(question)
+    best = others.loc[others["step_ratio"].idxmin()]
+    ends = f"({format.number(best['step_ratio_low'])} to {format.number(best['step_ratio_high'])})"
+    said = (
+        f"At {best['size']:.0f} × {best['size']:.0f} pixels a step of {best['renderer']} takes "
+        f"*{format.number(best['step_ratio'])}* {ends}"
+    )
+    return Answer(question, f"{said} of the time of {large['renderer'].iloc[0]}.")

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,8 +14,9 @@ from bench.report.data import statistics
 from bench.report.data.completions import ERROR, EVERY, FAILURE, heading
 from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import by_shape
+from bench.report.data.records import SCALE, by_shape
 from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, ranked, series
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
 
@@ -153,3 +155,29 @@ def draw_front(crossed: Crossed, lines: list[dict[str, Any]]) -> Figure:
     style.log_axis(axes[0], "y", [line["error"].value for line in finite])
     style.legend_below(figure, *axes)
     return figure
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The best pair of renderer and loss at the fewest points."""
+    fewest = list(dict.fromkeys(data["points"].astype(str)))[-1]
+    found = ranked(data[data["points"].astype(str) == fewest], "chamfer_l2")
+    verdict = found.said(f"error from {fewest} points (Chamfer × 1000)", scale=SCALE)
+    return Answer("Which renderer is best under which loss of the mask?", verdict)
+
+
+def answer_front(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The renderers that are on the front under most losses."""
+    front = data[data["front"] == "yes"]
+    losses, counts = data["loss"].nunique(), front["renderer"].value_counts()
+    said = "; ".join(f"{name} under *{n} of {losses}*" for name, n in counts.items())
+    panels = []
+    for loss, found in data.groupby("loss", sort=False):
+        points = [
+            series(
+                name, name, own["evaluations"], own["error"], low=own["low"].tolist(), high=own["high"].tolist(), size=9
+            )
+            for name, own in found.groupby("renderer", sort=False)
+        ]
+        panels.append(chart_panel(loss, "field values of a run", "error × 1000", points))
+    question = "Under one loss, does a renderer with fewer field values pay with a larger error?"
+    return Answer(question, f"On the front of error over field values: {said} losses.", {"panels": panels})

@@ -2,9 +2,13 @@
 
 from typing import Any
 
+import pandas as pd
+
+from bench.records import format
 from bench.report.data.completions import ERROR, EVERY, FAILURE
 from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
+from bench.report.write.answer import Answer, excluding
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data, to_table, whole
 
@@ -129,3 +133,30 @@ def _verdicts(lines: list[Line], losses: dict[str, str]) -> list[str]:
         f"Under one loss, the interval excludes 1 for {len(sure)} of {len(under_one)} ratios over all families{named}."
     )
     return [*own, said] if under_one else own
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The largest gap over all families, and its parts."""
+    whole = data[data["family"] == "all families"]
+    gap = whole.loc[whole["own"].idxmax()]
+    said = (
+        f"{gap['compared']}: *{format.number(gap['own'])}* {format.interval(gap['own_low'], gap['own_high'])} "
+        f"times the error; of it "
+    )
+    parts = f"the renderer {format.number(gap['renderer'])}, the loss {format.number(gap['loss'])}."
+    return Answer("Which part of a gap between two methods is the renderer, and which their loss?", said + parts)
+
+
+def answer_losses(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """How many ratios of losses exclude 1 over all families."""
+    whole = data[data["family"] == "all families"]
+    names = [name for name in data.columns[3:] if f"{name}_low" in data]
+    sure, known = excluding(whole, names)
+    largest = max((row[name], name, row["compared"]) for _, row in whole.iterrows() for name in names)
+    said = (
+        f"The interval excludes 1 for *{sure} of {known}* ratios over all families; the largest is "
+        f"{format.number(largest[0])} "
+    )
+    return Answer(
+        "What does another loss of the mask change, with the same renderer?", f"{said}({largest[1]}: {largest[2]})."
+    )

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -12,6 +13,7 @@ from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, RunKey, by_shape, error, measured, median_of_known, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
 from bench.report.write import chart
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import lines_of
 from bench.report.write.table import (
@@ -28,6 +30,7 @@ from bench.report.write.table import (
 )
 
 PLACE = 41
+TRAINED = ("RGB", "Depth", "RGB and depth", "Masks, hull", "Occupancy")  # rows of a network, by what taught it
 READS = (
     Selection("dvr_table1", ("single_view",), ("dataset", "task", "supervision", "silhouette"), setup=("machine",)),
 )
@@ -141,3 +144,18 @@ def draw(experiment: Experiment) -> Figure:
         axis.set(title=name, ylim=(0, 1))
     axes[0, 0].set_ylabel("IoU of each shape, and the median")
     return figure
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The best training by the Chamfer-L1, in each family."""
+    said = []
+    for family, found in data.groupby("family", sort=False):
+        rows = [(name, value) for name, value in ranked(found, "chamfer_l1").rows if name in TRAINED]
+        if rows:
+            said.append(
+                f"{family}: {rows[0][0]} *{thousandfold(rows[0][1])}*, RGB alone {thousandfold(dict(rows).get('RGB'))}"
+            )
+    return Answer(
+        "How much must a training know, so that one image gives a shape?",
+        f"Least median Chamfer-L1 × 1000 of the trainings: {'; '.join(said)}." if said else "",
+    )

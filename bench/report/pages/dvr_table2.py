@@ -1,7 +1,10 @@
 """Table 2 of DVR: shape and colour from rendered photographs, measured and published."""
 
+import pandas as pd
+
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import definitions, grouped
+from bench.report.data.records import SCALE, definitions, grouped
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_curves, lines_of, scene_of
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, thousandfold, to_data, to_table
@@ -60,3 +63,9 @@ def make(experiment: Experiment) -> Result:
         table=to_table(COLUMNS, [*lines_of(experiment, NAMES), *published]),
         figure=draw_curves(experiment, "seen_chamfer_l1", "Chamfer-L1 × 1000\n(scene units)", 1000.0),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row with the lowest Chamfer-L1 of what is seen."""
+    verdict = ranked(data, "seen_chamfer_l1").said("Chamfer-L1 of what the photographs see, × 1000", scale=SCALE)
+    return Answer("Which method finds shape and colour from photographs?", verdict)

@@ -1,8 +1,13 @@
 """Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
 
+import numpy as np
+import pandas as pd
+
+from bench.records import format
 from bench.report.data.conditions import Condition, cells, middle
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import ONE_WAY
+from bench.report.write.answer import Answer
 from bench.report.write.conditions import draw
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, shown, text, to_data, to_table
@@ -48,3 +53,17 @@ def make(experiment: Experiment) -> Result:
         table=to_table(COLUMNS, lines),
         figure=draw(errors, CONDITIONS),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The conditions of a row between which its median error changes most."""
+    keys = [one.key for one in CONDITIONS]
+    errors = data["chamfer_gt_to_pred"].where(data["status"] == "ok", np.inf)
+    medians = errors.groupby([data["row"], data["family"], *(data[key] for key in keys)], sort=False).median()
+    spread = (medians.groupby(level=[0, 1]).max() / medians.groupby(level=[0, 1]).min()).sort_values()
+    if not len(spread):
+        return Answer("Does another focal length or start change the shape that is found?")
+    row, family = spread.index[-1]
+    ratio = "∞" if np.isinf(spread.iloc[-1]) else format.number(spread.iloc[-1])
+    said = f"Over all conditions the median error changes by a factor of up to *{ratio}* ({row}, {family})."
+    return Answer("Does another focal length or start change the shape that is found?", said)

@@ -2,10 +2,13 @@
 
 from collections.abc import Sequence
 
+import pandas as pd
+
 from bench.report.data.conditions import Condition, cells, middle
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import ONE_WAY, SCALE, Record, error, grouped, solid
 from bench.report.data.statistics import Interval, share
+from bench.report.write.answer import Answer
 from bench.report.write.conditions import draw
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -78,3 +81,11 @@ def _successes(records: Sequence[Record]) -> str:
 
 def _succeeded(record: Record) -> bool:
     return record["status"] == "ok" and SCALE * error(record, ONE_WAY) < SUCCESS
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The shares of successes of each row, over all conditions."""
+    right = (data["status"] == "ok") & (SCALE * data[ONE_WAY] < SUCCESS)
+    counts = right.groupby(data["row"], sort=False).agg(["sum", "count"])
+    said = "; ".join(f"{row} *{int(own['sum'])} of {own['count']}*" for row, own in counts.iterrows())
+    return Answer("Is a shape found from a wrong similarity?", f"Runs with an error below {SUCCESS:g}: {said}.")

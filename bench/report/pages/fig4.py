@@ -1,10 +1,12 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.write import pictures
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
 
@@ -47,3 +49,16 @@ def draw(cells: list[pictures.Cell]) -> Figure:
     figure.get_layout_engine().set(**pictures.CLOSE)
     pictures.draw(figure, cells, columns)
     return figure
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The rows with most and least wrong pixels."""
+    wrong = (data["lost"] + data["false"]).dropna()
+    if not len(wrong):
+        return Answer("Which pixels does each strategy get wrong?")
+    most, least = data.loc[wrong.idxmax()], data.loc[wrong.idxmin()]
+    said = (
+        f"Missed and spurious pixels: *{wrong.min():.0f}* ({least['row']}) to {wrong.max():.0f} ({most['row']}) "
+        f"of {most['hits']:,.0f}."
+    )
+    return Answer("Which pixels does each strategy get wrong?", said)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from itertools import chain
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -24,6 +25,7 @@ from bench.report.data.records import (
 )
 from bench.report.data.statistics import Interval, share
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import (
     FAMILY,
@@ -137,3 +139,22 @@ def _rate(records: list[Record]) -> Interval:
 
 def _median(records: list[Record], value: Callable[[Record], float | None]) -> float | None:
     return median_of_known(map(value, records))
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row that finds most cameras from the largest angle."""
+    question = "From how far off is the camera of a known shape found?"
+    far = data[data["degrees"] == data["degrees"].max()]
+    success = (
+        far["success"]
+        .where(far["status"] == "ok", 0.0)
+        .fillna(0.0)
+        .groupby(far["row"], sort=False)
+        .agg(["sum", "count"])
+    )
+    best, least = success.loc[success["sum"].idxmax()], success.loc[success["sum"].idxmin()]
+    said = (
+        f"From {far['degrees'].iloc[0]:g} degrees {best.name} finds *{best['sum']:.0f} of {best['count']:.0f}* "
+        f"cameras, "
+    )
+    return Answer(question, f"{said}{least.name} {least['sum']:.0f} of {least['count']:.0f}.")

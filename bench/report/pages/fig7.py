@@ -12,6 +12,7 @@ from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, measured, setting
 from bench.report.write import chart, pictures
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
 
@@ -122,3 +123,16 @@ COLUMNS = (  # of a record and its counts
     *through(lambda line: line[1], *map(Column, (*pictures.COUNTED, "lost_share", "false_share"))),
     *through(lambda line: line[0], metric("depth_error_median")),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The threshold with the fewest wrong pixels."""
+    wrong = (data["lost_share"] + data["false_share"]).where(data["status"] == "ok").dropna()
+    if not len(wrong):
+        return Answer("Which threshold of convergence shows the true outline?")
+    best, worst = data.loc[wrong.idxmin()], data.loc[wrong.idxmax()]
+    said = (
+        f"Missed and spurious pixels together are fewest at epsilon = {best['epsilon']:g}: "
+        f"*{100 * wrong.min():.2g} %* of the hits; at {worst['epsilon']:g} they are {100 * wrong.max():.2g} %."
+    )
+    return Answer("Which threshold of convergence shows the true outline?", said)

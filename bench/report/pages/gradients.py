@@ -12,6 +12,7 @@ from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions, measured, row_of
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table, whole
 
@@ -138,3 +139,17 @@ COLUMNS = (  # of a record and a band
     *(_column(name, _heading(name)) for name in NUMBERS),
     shown("Status", lambda line: line[0]["status"]),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """How many renderers have a pooled cosine of 0.99 in every band of hits."""
+    hits = data[data["band"].isin(["frontal", "oblique", "grazing"])]
+    cosine = hits["code_pooled_cosine"].where(hits["status"] == "ok").fillna(-1.0)
+    least = cosine.groupby(hits["row"], sort=False).min()
+    worst = least.idxmin()
+    said = (
+        f"*{int((least >= 0.99).sum())} of {len(least)}* renderers have a pooled cosine of at least 0.99 with "
+        f"the true gradient in every band of hits"
+    )
+    rest = f"; the least is {least[worst]:.2f}, of {worst}" if least[worst] >= 0 else f"; {worst} has none"
+    return Answer("Are the gradients true?", f"{said}{rest}.")

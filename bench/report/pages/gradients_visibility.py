@@ -13,6 +13,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, measured, row_of
 from bench.report.pages.gradients import READS as READS
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, shown, text, through, to_data, to_table
 
@@ -114,3 +115,22 @@ COLUMNS = (  # of a record and a blur
     *(_number(name, heading) for name, heading in zip(NUMBERS, HEADINGS, strict=True)),
     shown("Status", lambda line: line[0]["status"]),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The best cosine at the outline, and the best of the renderers that differentiate hits alone."""
+    known = data[data["status"] == "ok"].dropna(subset="image_cosine")
+    blurred, sharp = known.dropna(subset="blur"), known[known["blur"].isna()]
+    said = []
+    if len(blurred):
+        best = blurred.loc[blurred["image_cosine"].idxmax()]
+        said.append(
+            f"{best['row']} has a cosine of *{best['image_cosine']:.2f}* and a scale of {best['image_scale']:.2f} "
+            f"at a blur of {best['blur']:g}"
+        )
+    if len(sharp):
+        said.append(
+            f"renderers that differentiate hits alone have at most {sharp['image_cosine'].max():.2f} and "
+            f"{sharp['image_scale'].max():.2f}"
+        )
+    return Answer("Does what comes into view have a gradient?", f"{'; '.join(said)}." if said else "")

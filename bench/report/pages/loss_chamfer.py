@@ -12,6 +12,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, by_shape, run_key
 from bench.report.data.speed import COMPLETION, SEED, Setting, main_settings, settings, sizes
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, to_data, to_table
 
@@ -70,3 +71,16 @@ def draw(rows: list[Setting], clouds: dict[Row, pd.DataFrame]) -> Figure:
     axis.set(xlabel="weighted loss", ylabel=COMPLETION.heading)
     figure.legend(loc="outside right upper")
     return figure
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The rows whose loss follows the error most and least."""
+    known = data.dropna(subset="within").sort_values("within")
+    if not len(known):
+        return Answer("Does a falling loss mean a falling error?")
+    least, most = known.iloc[0], known.iloc[-1]
+    said = (
+        f"Within a run loss and error correlate with ρ = *{least['within']:.2f}* ({least['row']}) to "
+        f"{most['within']:.2f} ({most['row']})."
+    )
+    return Answer("Does a falling loss mean a falling error?", said)

@@ -31,6 +31,7 @@ from bench.report.data.parsimony import (
 )
 from bench.report.data.records import grouped
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, percent, shown, text, thousandfold, through, to_data, to_table
 
@@ -309,3 +310,16 @@ NEEDS = (  # of a run and its need
     Column("share_of_papers_network_stored", value=lambda line: over(1.0, line[0].number("saved_stored"))),
     Column("share_of_papers_network_free", value=lambda line: over(1.0, line[0].number("saved_free"))),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """What suffices for how many scenes."""
+    chosen = data[data["recommended"].astype(str) == "True"]
+    if not len(chosen):
+        return Answer("How little model does a shape need?")
+    simple, large = int(chosen["kind"].eq("one part").sum()), chosen.loc[chosen["stored"].idxmax()]
+    said = (
+        f"A single part suffices for *{simple} of {len(chosen)}* scenes; the most is {large['rung']} of "
+        f"{large['stored']:,.0f} stored numbers, for {large['scene']}."
+    )
+    return Answer("How little model does a shape need?", said)

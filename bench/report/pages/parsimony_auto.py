@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -24,6 +25,7 @@ from bench.report.data.parsimony import (
 )
 from bench.report.pages.parsimony import SCENE, scene_table
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import Column, percent, text, thousandfold, to_data
 
@@ -204,3 +206,21 @@ COLUMNS = (  # of a run
     Column("precision.gained", "Hits gained", show=format.count),
     Column("precision.hits", "Hits", show=format.count),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The overhead of the choice, and what pixel precision saves."""
+    known = data["auto.overhead"].dropna()
+    if not len(known):
+        return Answer("What does field=auto cost?")
+    said = (
+        f"field=auto takes *{format.number(float(known.median()))}* times the seconds of its final fit (median; "
+        f"at most {format.number(float(known.max()))})"
+    )
+    saved = data["frugal_over_plain.evaluations"].dropna()
+    rest = (
+        f"; pixel precision needs {format.number(float(saved.median()))} times the field values of a plain fit"
+        if len(saved)
+        else ""
+    )
+    return Answer("What does field=auto cost, and what does pixel precision save?", f"{said}{rest}.")

@@ -1,8 +1,11 @@
 """Shape and colour from real photographs: the rows of DVR's Table 2 that need no true shape."""
 
+import pandas as pd
+
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions
 from bench.report.pages.dvr_table2 import TASKS
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_curves, lines_of
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, to_data, to_table
@@ -32,3 +35,9 @@ def make(experiment: Experiment) -> Result:
         table=to_table(COLUMNS, lines_of(experiment, NAMES)),
         figure=draw_curves(experiment, "psnr", "PSNR (dB)", 1.0),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row with the highest PSNR of held-out photographs."""
+    verdict = ranked(data, "psnr", better="higher").said("PSNR of held-out photographs in dB", most="highest")
+    return Answer("Which method is best on real photographs?", verdict)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -14,6 +15,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import PRIORS
 from bench.report.data.records import Record, definitions, measured
 from bench.report.write import chart, pictures
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, text, thousandfold, to_data, to_table
 
@@ -117,3 +119,16 @@ def _histogram(axis: Axes, experiment: Experiment, records: list[Record]) -> Non
         axis.hist(lengths.clip(0, 2), bins=np.linspace(0, 2, 41), color="#0072b2", density=True)
     axis.axvline(1.0, color="#777777", lw=0.8, ls=":")
     axis.set(yticks=[], xlim=(0, 2))
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """How far the fits are from the floor."""
+    ratio = data["ratio"].where(data["status"] == "ok", np.inf).fillna(np.inf)
+    said = (
+        f"The best fit has *{format.number(float(ratio.median()))}* times the least error that can be measured "
+        f"(median), "
+    )
+    return Answer(
+        "How well can a prior show an unseen shape?",
+        f"{said}at most {format.number(float(ratio.max()))} times (n = {len(data)} shapes).",
+    )

@@ -4,18 +4,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
+from bench.records import format
 from bench.records.record import RunStatus
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import ONE_WAY, SCALE, Record, error, family, grouped, index, setting
 from bench.report.data.statistics import geometric_mean, median
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
 
 PLACE = 48
+QUESTION = "Do depths that a scanner measured complete a shape as exact ones do?"
 EXACT, MEASURED = "exact", "measured"  # values of task.depths
 READS = (Selection("scans", ("completion",), ("dataset", "task"), ("depths",), setup=("scenes", "pixels", "machine")),)
 METRICS = {"depth_mae": "depth error", ONE_WAY: "truth to prediction", "chamfer_l2": "Chamfer"}
@@ -103,3 +107,21 @@ def draw(found: dict[tuple[str, str], Pairs]) -> Figure:
     axes[0, 0].set_ylabel("measured depths")
     style.legend_below(figure, *axes.flat)
     return figure
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The ratios of the depth error with measured depths to that with exact ones, over the scans that both have."""
+    errors = data.assign(depth_mae=data["depth_mae"].where(data["status"] == "ok", np.inf))
+    both = errors.pivot_table("depth_mae", ["row", "index", "seed"], "depths", sort=False).dropna()
+    with np.errstate(invalid="ignore"):  # where both failed neither is better
+        logs = (np.log(both["measured"]) - np.log(both["exact"])).fillna(0.0).groupby("row", sort=False).mean()
+    ratios = np.exp(logs).sort_values()
+    if not len(ratios):
+        return Answer(QUESTION)
+    ends = (
+        f"*{format.number(ratios.iloc[0])}* ({ratios.index[0]}) to *{format.number(ratios.iloc[-1])}* "
+        f"({ratios.index[-1]})"
+    )
+    return Answer(
+        QUESTION, f"The error of depths that a scanner measured is {ends} times that of exact ones at the same pixels."
+    )

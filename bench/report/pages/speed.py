@@ -4,6 +4,7 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,7 +14,8 @@ from bench.report.data import statistics
 from bench.report.data.experiments import Experiment, together
 from bench.report.data.records import grouped
 from bench.report.data.speed import SEED, TRIALS, Placed, Setting, front_line, left_out, resolution, sizes, trials
-from bench.report.write import chart, interactive
+from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, runs_of, series
 from bench.report.write.caption import undefined
 from bench.report.write.result import Result
 from bench.report.write.table import Column, defined, shown, text, to_data, to_table
@@ -21,6 +23,7 @@ from bench.report.write.table import Column, defined, shown, text, to_data, to_t
 PLACE_FRONT = 80
 PLACE_VOLUME = 100
 READS = tuple(trial.selection for trial in TRIALS)
+NOTE = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
 NOTES = (
     "Final error of a completion over the seconds of its loop, and depth error of one rendering (95th percentile over "
     "pixels, missed and spurious ones count as infinite) over its seconds. A run that did not end ok is infinite in "
@@ -50,7 +53,6 @@ def make_front(completion: Experiment | None, rendering: Experiment | None) -> R
         data=to_data([*columns, text("resolution", value=lambda point: resolution(point.row.records[0]))], points),
         table=to_table(columns, points),
         figure=draw(panels),
-        page=interactive.front(panels),
     )
 
 
@@ -182,3 +184,54 @@ VOLUME = (
     shown("95 % interval", itemgetter("ends")),
     *(Column("reference_seconds"), Column("reference_error")),
 )
+
+
+def answer_front(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The front of each trial, and its chart."""
+    said, panels = [], []
+    for title, found in data.groupby("trial", sort=False):
+        front = found[~found["dominated"].astype(bool) & np.isfinite(found["seconds"])].sort_values("seconds")
+        if len(front):
+            ends = [
+                f"{row['setting']} (*{format.seconds(row['seconds'])}*, error × 1000 {format.number(row['error'])})"
+                for _, row in front.iterrows()
+            ]
+            rest = f" to {ends[-1]}" if len(ends) > 1 else ""
+            said.append(f"{title}: {len(front)} of {len(found)} settings, {ends[0]}{rest}")
+        heading = next((trial.heading for trial in TRIALS if trial.title == title), "error × 1000")
+        panels.append(chart_panel(title, "time (seconds)", heading, _points(found, front), height=440))
+    verdict = f"On the front of {said[0]}." if said else ""
+    return Answer("What does accuracy cost in time?", verdict, {"panels": panels, "note": NOTE})
+
+
+def _points(found: pd.DataFrame, front: pd.DataFrame) -> list[dict[str, Any]]:
+    """A series per renderer of what is on the front, one of what is dominated, and the line of the front."""
+    drawn = []
+    finite = found[np.isfinite(found["seconds"]) & np.isfinite(found["error"])]
+    for (renderer, dominated), own in finite.groupby(["renderer", "dominated"], sort=False):
+        lines = [_hover(row) for _, row in own.iterrows()]
+        links = [runs_of(str(row["setting"])) for _, row in own.iterrows()]
+        hollow = {"hollow": True} if bool(dominated) else {}
+        drawn.append(
+            series(renderer, renderer, own["seconds"], own["error"], text=lines, link=links, size=11, **hollow)
+        )
+    line = {"colour": "#888888", "symbol": "", "dash": "-", "step": True, "quiet": True}
+    return [*drawn, series("front", "", front["seconds"], front["error"], **line)]
+
+
+def _hover(row: pd.Series) -> list[str]:
+    """What the mouse is told of a setting."""
+    failed = f"failed {row['failed']:.0f} of {row['runs']:.0f}"
+    chance = "" if pd.isna(row["on_front"]) else f"on the front with probability {row['on_front']:.2f}"
+    costs = f"{format.seconds(row['seconds'])}, error × 1000 {format.number(row['error'])}"
+    return list(filter(None, [str(row["setting"]), costs, failed, chance]))
+
+
+def answer_volume(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The renderer with the largest area in each trial."""
+    best = data.loc[data.groupby("trial", sort=False)["hypervolume"].idxmax()]
+    said = "; ".join(
+        f"{row['trial']}: {row['renderer']} *{format.number(row['hypervolume'])}* (settings: {row['settings']:.0f})"
+        for _, row in best.iterrows()
+    )
+    return Answer("Which renderer dominates most of the plane of error and time?", f"The largest area: {said}.")

@@ -15,7 +15,8 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, Row, loop_seconds
 from bench.report.data.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
 from bench.report.data.statistics import FEWEST_SHAPES, kaplan_meier
-from bench.report.write import chart, interactive
+from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, series
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, text, through, to_data, to_table
 
@@ -62,7 +63,6 @@ def make(experiment: Experiment) -> Result:
         data=to_data(POINTS, points),
         table=to_table(COLUMNS, [_line(row, of_row) for row, of_row in times.items()]),
         figure=draw(main_settings(rows), shown, times),
-        page=interactive.curves(rows, shown),
     )
 
 
@@ -160,3 +160,52 @@ def time_to(history: pd.DataFrame, record: Record) -> Reached:
     if len(below):
         return float(below["seconds"].iloc[0]), True
     return loop_seconds(record) or 0.0, False
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row that reaches the target first, and the curves of its runs."""
+    keys = ["row", "family", "index", "seed"]
+    reached = data[data["status"].eq("ok") & (data["error"] <= SCALE * TARGET)].groupby(keys)["seconds"].min()
+    times = {
+        row: [
+            float(reached.get((row, *key), math.inf)) for key in own[keys[1:]].drop_duplicates().itertuples(index=False)
+        ]
+        for row, own in data.groupby("row", sort=False)
+    }
+    first = sorted((float(np.median(found)), row) for row, found in times.items())
+    finite = [(seconds, row) for seconds, row in first if math.isfinite(seconds)]
+    said = (
+        f"{finite[0][1]} reaches an error of {SCALE * TARGET:g} (Chamfer × 1000) first, in "
+        f"*{format.seconds(finite[0][0])}* (median)"
+        if finite
+        else ""
+    )
+    last = (
+        f"; {len(first) - len(finite)} of {len(first)} settings do not reach it on most shapes"
+        if len(finite) < len(first)
+        else ""
+    )
+    return Answer(
+        "How fast does the error fall?",
+        f"{said}{last}." if said else "",
+        {"panels": _panels(data), "note": "A line is a run, which a click opens."},
+    )
+
+
+def _panels(data: pd.DataFrame) -> list[dict[str, Any]]:
+    """A line per run, over seconds and over field values; of the first setting of each renderer at first."""
+    first = set(data.drop_duplicates("renderer")["row"])
+    panels = []
+    for along, label in (("seconds", "time in the loop (seconds)"), ("value_evaluations", "field values")):
+        lines = []
+        for (row, folder), own in data.groupby(["row", "folder"], sort=False):
+            one = own[own[along] > 0]
+            scene = f"{own['family'].iloc[0]} {own['index'].iloc[0]}, seed {own['seed'].iloc[0]}"
+            words = [
+                [scene, f"{format.seconds(r.seconds)}, error × 1000 {format.number(r.error)}"] for r in one.itertuples()
+            ]
+            off = {} if row in first else {"off": True}
+            look = {"text": words, "link": [f"#/run/{folder}"] * len(one), "dash": "-", "size": 4, **off}
+            lines.append(series(row, str(own["renderer"].iloc[0]), one[along], one["error"], **look))
+        panels.append(chart_panel("", label, "Chamfer × 1000", lines, height=420))
+    return panels

@@ -8,6 +8,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -17,6 +18,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
 from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, series
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, defined, shown, text, through, to_data, to_table
 
@@ -233,3 +235,75 @@ def _cost(grid: Atlas, row: Row, axes: list[str]) -> dict[str, Any]:
     cost = median_of_known(cell.number("evaluations_per_ray") for cell in right)
     ends = {"at_once": sum(cell.at_once for cell in cells), "never": sum(cell.never for cell in cells)}
     return {"row": row.name, "axes": len(cells), **ends, "cost": math.nan if cost is None else cost}
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """How often each renderer does not break, and the atlas as cells."""
+    level = data["level"].where(data["status"] == "ok")
+    never, known = (
+        (level > 1).groupby(data["row"], sort=False).sum(),
+        level.notna().groupby(data["row"], sort=False).sum(),
+    )
+    best, least = never.idxmax(), never.idxmin()
+    said = (
+        f"{best} does not break on *{never[best]} of {known[best]}* axes, {least} on {never[least]} of {known[least]}"
+    )
+    told = next((note for note in notes if "predictions lie outside" in note), "")
+    theory = f"; {told.split(' predictions')[0]} predictions of theory lie outside of what was measured" if told else ""
+    return Answer("Where does each renderer break?", f"{said}{theory}.", atlas=_cells(data))
+
+
+def _cells(data: pd.DataFrame) -> dict[str, Any]:
+    """The grid for the page: axes, rows, and of each cell its breakdown as text, its shade and its run."""
+    axes = [
+        {"axis": a, "title": title(a), "group": str(g), "unit": str(u)}
+        for a, g, u in data[["axis", "group", "unit"]].drop_duplicates().itertuples(index=False)
+    ]
+    rows = list(dict.fromkeys(data["row"]))
+    found = {(r["axis"], r["row"]): _cell(r) for _, r in data.iterrows()}
+    return {"axes": axes, "rows": rows, "cells": [[found.get((axis["axis"], row)) for row in rows] for axis in axes]}
+
+
+def _cell(run: pd.Series) -> dict[str, Any]:
+    status, level = str(run["status"]), run["level"]
+    known = status == "ok" and pd.notna(level)
+    low, high = (
+        format.number(None if pd.isna(run[f"breakdown_{end}"]) else run[f"breakdown_{end}"]) for end in ("low", "high")
+    )
+    short = ("at once" if level < 0 else "none" if level > 1 else format.number(run["breakdown"])) if known else status
+    words = {"at once": "at once, at the mildest severity", "none": "not at the severest"}
+    full = words.get(short, f"{short} ({low} to {high})" if known and "–" not in (low, high) else short)
+    reason = "" if pd.isna(run["reason"]) else str(run["reason"])
+    shade = min(max(float(level), 0.0), 1.0) if known else None
+    return {
+        "short": short,
+        "full": full,
+        "shade": shade,
+        "status": status,
+        "reason": reason,
+        "folder": str(run["folder"]),
+    }
+
+
+def answer_cost(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The most robust renderer and the cheapest."""
+    best, cheap = data.loc[data["rank"].idxmin()], data.loc[data["cost"].idxmin()]
+    said = (
+        f"{best['row']} has the best mean rank, *{format.number(best['rank'])}* of {len(data)}, for "
+        f"{format.number(best['cost'])} field values per ray; "
+    )
+    same = best["row"] == cheap["row"]
+    rest = (
+        "no renderer is cheaper"
+        if same
+        else f"{cheap['row']} is the cheapest: rank {format.number(cheap['rank'])} for {format.number(cheap['cost'])}"
+    )
+    points = [series(row["row"], row["row"], [row["cost"]], [row["rank"]], size=11) for _, row in data.iterrows()]
+    chart = {
+        "panels": [
+            chart_panel(
+                "", "field values per ray at the mild end", "mean rank over axes (1 is best)", points, height=420
+            )
+        ]
+    }
+    return Answer("Is a robust renderer an expensive one?", f"{said}{rest}.", chart)

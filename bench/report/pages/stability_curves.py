@@ -8,12 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
+from bench.records import format
 from bench.report.data import curves
 from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, grouped
 from bench.report.data.statistics import clopper_pearson
 from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, series
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data
 
@@ -120,3 +122,19 @@ def _shares(experiment: Experiment, cell: Cell) -> pd.DataFrame:
             ends = [math.nan, math.nan] if cell.one_trial else [rate.low, rate.high]
             rows.append([level, severity, successes, len(tried), rate.value, *ends])
     return pd.DataFrame(rows, columns=SHARES)
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The shares of successes over the severity, a panel per axis."""
+    panels = []
+    for axis, found in data.groupby("axis", sort=False):
+        lines = [
+            series(row, row, own["severity"], 100 * own["share"], dash="-", size=5, text=_said(own))
+            for row, own in found.sort_values("level").groupby("row", sort=False)
+        ]
+        panels.append(chart_panel(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
+    return Answer("", chart={"panels": panels})
+
+
+def _said(shares: pd.DataFrame) -> list[str]:
+    return [f"{s.successes:.0f} of {s.trials:.0f} succeed at {format.number(s.severity)}" for s in shares.itertuples()]

@@ -4,9 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
+
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, definitions, measured, repeated, row_of, setting
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, configured, shown, to_data, to_table, together, whole
 
@@ -146,3 +149,19 @@ COLUMNS = (
     *(_otherwise(name) for name in _FINISHED),
     *(_otherwise(f"{name}_seconds", f"{name}_s") for name in _TIMES),
 )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """Which strategy costs least, of those that finish."""
+    question = "What does one rendering and its gradient cost, and what does each strategy save?"
+    found = data[data["status"] == "ok"].dropna(subset="step_s").sort_values("step_s")
+    if len(found) < 2:
+        return Answer(question)
+    first, last = found.iloc[0], found.iloc[-1]
+    said = (
+        f"A step takes *{format.seconds(first['step_s'])}* with {first['row']} and "
+        f"{format.seconds(last['step_s'])} with "
+    )
+    return Answer(
+        question, f"{said}{last['row']}; {len(data) - len(found)} of {len(data)} rows reach a limit at this size."
+    )

@@ -18,8 +18,9 @@ from bench.report.data import statistics, wins
 from bench.report.data.completions import ERROR, EVERY, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import LABEL, NOTE, oracles
-from bench.report.data.records import Row, RunKey, by_shape, grouped, iterations_of, row_of
+from bench.report.data.records import SCALE, Row, RunKey, by_shape, grouped, iterations_of, row_of
 from bench.report.write import chart
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.caption import undefined
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -283,3 +284,39 @@ def make_wins(experiment: Experiment) -> Result:
         data=pd.DataFrame(lines, dtype=object),
         table=wins.table(pooled),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The best row at the fewest points."""
+    fewest = list(dict.fromkeys(data["points"].astype(str)))[-1]
+    found = ranked(data[data["points"].astype(str) == fewest], "chamfer_l2")
+    verdict = found.said(f"error from {fewest} points, over all families (Chamfer × 1000)", scale=SCALE)
+    return Answer("Which method completes a shape best from sparse depth?", verdict)
+
+
+def answer_intervals(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row that is best in most cells."""
+    question = "How sure are the errors of completion?"
+    best = data.loc[data.groupby(["family", "points"])["iqm"].idxmin().dropna(), "row"].value_counts()
+    cells, known = data.groupby(["family", "points"]).ngroups, int(data["iqm_low"].notna().sum())
+    said = (
+        f"{best.index[0]} has the lowest interquartile mean in *{best.iloc[0]} of {cells}* cells of family and points"
+    )
+    few = "" if known else "; with so few shapes none has an interval"
+    return Answer(question, f"{said}{few}.")
+
+
+def answer_wins(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row whose least share of wins against another is largest."""
+    whole = data[data["family"] == "all families"]
+    least = whole.loc[whole.groupby("row")["probability"].idxmin().dropna()].sort_values("probability")
+    best = least.iloc[-1]
+    share = f"*{100 * best['probability']:.0f} %*"
+    beats = best["probability"] > 0.5
+    said = (
+        f"{best['row']} has the lower error than every other on most pairs; at least {share}, against {best['other']}"
+        if beats
+        else f"No method has the lower error than every other on most pairs: {best['row']} has {share} against "
+        f"{best['other']}"
+    )
+    return Answer("Which method wins against which?", f"{said} (n = {best['shapes']:.0f} shapes).")

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -26,6 +27,7 @@ from bench.report.data.records import (
 )
 from bench.report.data.statistics import Interval, bootstrap, interquartile_mean, median, share
 from bench.report.write import chart
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, counted, metrics, text, to_data, to_table
 
@@ -170,3 +172,9 @@ def _row(axis: Axes, place: int, preset: str, records: list[Record]) -> None:
     chart.points(axis, preset, ends, spread, ms=3.5)
     lost = [where for where, end in zip(spread, ends, strict=True) if np.isnan(end)]
     chart.points(axis, preset, [0.99] * len(lost), lost, marker="x", transform=axis.get_yaxis_transform())
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The row with the lowest error from truth to prediction."""
+    verdict = ranked(data, ONE_WAY).said("error, from truth to prediction × 1000", scale=SCALE)
+    return Answer("Which method finds a shape by photographs from many views, without a mask?", verdict)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -11,6 +12,7 @@ from bench.report.data.records import Row, median_of_known, value_evaluations
 from bench.report.data.statistics import geometric_mean
 from bench.report.data.wins import Gap, gap
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
 
@@ -109,3 +111,11 @@ def default_of(preset: str) -> str:
     """The preset of which another is the tuned or the paper's setting."""
     name = preset.removeprefix(FOLDER)
     return next((name.removesuffix(end) for end in PAPERS if name.endswith(end)), name)
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """How many tuned settings differ from the defaults, as the notes have it."""
+    said = next((note for note in notes if note.startswith("The interval excludes 1 for ")), "")
+    head, _, rest = said.removeprefix("The interval excludes 1 for ").partition(" ratios")
+    verdict = f"The interval excludes 1 for *{head}* ratios{rest}" if said else ""
+    return Answer("Are our defaults as good as tuned settings?", verdict)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -11,6 +12,7 @@ from bench.report.data.completions import CHAMFER
 from bench.report.data.experiments import Experiment
 from bench.report.data.tuning import TUNING, Tuning, left_out, tunings, unfinished
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import (
     FAMILY,
@@ -159,3 +161,28 @@ def make_settings(experiment: Experiment) -> Result:
         data=to_data(EFFECTS, lines),
         table=to_table(EFFECTS, lines),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """What the best draw is worth, as the notes have it of each method."""
+    gains = [note for note in notes if ": the best of " in note and "times the error of one draw" in note]
+    factors = [(float(note.split(" has ")[1].split()[0]), note.split(":")[0]) for note in gains]
+    if not factors:
+        return Answer("What is tuning worth?")
+    (least, first), (most, last) = min(factors), max(factors)
+    draws = gains[0].split("the best of ")[1].split()[0]
+    said = (
+        f"The best of {draws} draws has *{format.number(least)}* ({first}) to *{format.number(most)}* ({last}) "
+        f"times the error of one"
+    )
+    return Answer("What is tuning worth?", f"{said}.")
+
+
+def answer_settings(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The setting that goes most with the error."""
+    best = data.loc[data["rho"].abs().idxmax()]
+    said = (
+        f"{best['setting']} of {best['method']} goes most with the validation error: ρ = *{best['rho']:.2f}* "
+        f"over {best['n']:.0f} draws."
+    )
+    return Answer("Which settings matter?", said)

@@ -10,12 +10,12 @@ from typing import Any
 from bench.report.data.experiments import Experiment, shared_loss
 from bench.report.data.records import Record, setting, solid, view
 from bench.report.data.statistics import Interval
+from bench.report.write.paper import SMOKE
 
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 MOST_FAILURES = 4  # most failed runs that a caption lists one by one
 OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
 FEWEST_COUNTED = 4  # rows that are named one by one in a warning; more are counted
-SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."
 FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
 

@@ -1,111 +1,163 @@
-"""Writes `index.html`: the tables and figures of the experiments, then a row and details for every run."""
+"""Writes `index.html`, and beside it in the folder `page` its scripts and the data that they show."""
 
-from collections import Counter
+import json
+import os
+import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-from bench.records import format
+from bench.records.files import write_text
 from bench.records.read import read_records
-from bench.records.record import row_name
-from bench.report.write.paper import find_paper, link
+from bench.report.site.columns import columns
+from bench.report.site.detail import detail
+from bench.report.site.files import Folder
+from bench.report.site.papers import papers
+from bench.report.site.script import to_script, write_script
 
-# Colours of statuses; a status that is not listed is shown as bad.
-TONES = {"ok": "good", "not_reached": "warn", "timeout": "warn", "unsupported": "mute", "not_run": "mute"}
-FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
-THUMBS = ("summary.png", "strip.png", "failure.png")
-# Metrics with a column, and variants of `chamfer_l2`: these are listed in the details only.
-COLUMNS = ("accuracy", "completeness", "fscore", "normal_consistency", "depth_mae", "mask_iou")
-_NOT_OTHERS = ("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", *COLUMNS)
+ASSETS = Path(__file__).parents[1] / "page"
+FOLDER = "page"  # of the results folder
+LIBRARY = "plotly.min.js"
+STYLES = ("style.css",)
+SCRIPTS = (  # in the order in which they need each other
+    *("base/dom.js", "base/format.js", "base/store.js", "base/address.js", "base/runs.js"),
+    *("parts/theme.js", "parts/status.js", "parts/filter.js", "parts/table.js", "parts/picks.js"),
+    *("parts/chart.js", "parts/curve.js", "parts/mesh.js"),
+    *("views/overview.js", "views/board.js", "views/paper.js", "views/atlas.js", "views/run.js", "views/compare.js"),
+)
+START = "app.js"  # after the data
+LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
+DATA = tuple(f"data/{kind}" for kind in ("list", "run", "mesh", "paper"))
+KEY = re.compile(r"[0-9a-f]{16}\.js")  # of the files with details
+MOST_MESHES = 500  # of the newest runs; `bench.report meshes=all` makes all
+# Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
+POLICY = (
+    "default-src 'none'; script-src {scripts}; style-src {styles}; img-src {pictures}; "
+    "base-uri 'none'; form-action 'none'"
+)
 
 
-def write_index(results_dir: Path) -> Path:
-    """Writes `results_dir/index.html` from all run folders in `results_dir/runs` and gives its path.
+def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
+    """Writes `index.html` and the folder `page` beside it from all run folders in `results_dir/runs`; gives the page.
+
+    Args:
+        results_dir: the results folder.
+        meshes: of how many runs, the newest first, the mesh is made ready for the page; None for all.
 
     Raises:
         ValueError: if `results_dir` is not a folder.
     """
     records, problems = read_records(results_dir)
+    data = results_dir / FOLDER / "data"
+    folders = [Folder(results_dir, record["folder"]) for record in records]
+    entries, wholes = papers(results_dir)
+    lists = {
+        "about": {"problems": problems, "oneFile": False},
+        "papers": entries,
+        "runs": columns(records, results_dir),
+    }
+    _refuse_links(results_dir)
+    _copy_assets(results_dir / FOLDER)
+    for name, content in lists.items():
+        write_script(data / "list" / f"{name}.js", to_script("list", name, content))
+    for key, whole in wholes.items():
+        write_script(data / "paper" / f"{key}.js", to_script("paper", key, whole))
+    _remove_others(data / "paper", set(wholes))
+    for record, folder in zip(records, folders, strict=True):
+        details = detail(record, folder, results_dir)
+        write_script(data / "run" / f"{folder.key}.js", to_script("run", folder.key, details))
+    _remove_others(data / "run", {folder.key for folder in folders})
+    _write_meshes(data / "mesh", [folder for folder in folders if folder.has("mesh.ply")], meshes)
     page = results_dir / "index.html"
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parents[1]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    filters = (format.number, format.count, format.size, format.seconds)
-    environment.filters |= {function.__name__: function for function in filters}
-    text = environment.get_template("page.html").render(
-        runs=[_run(record, results_dir / "runs" / record["folder"]) for record in records],
-        papers=find_paper(results_dir),
-        problems=problems,
-        statuses=Counter(record["status"] for record in records),
-        machines=Counter(_machine(record) for record in records if record["environment"].get("cpu")),
-        tones=TONES,
-    )
-    # Names and reasons may contain bytes that are not text; the page must be written all the same.
-    page.write_bytes(text.encode("utf-8", "backslashreplace"))
+    write_text(page, shell())
     return page
 
 
-def _run(record: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The values that the template shows for one run; links are relative to the page and lead to files that exist."""
-    found = [path for suffix in ("png", "gif", "webp") for path in folder.glob(f"*.{suffix}")]
-    pictures = sorted(found, key=lambda picture: (picture.name != "summary.png", picture.name))
-    names = sorted({*record["metrics"], *record["metrics_start"]}, key=lambda name: (name in _NOT_OTHERS, name))
-    machine, threads = _machine(record)
-    return {
-        **{name: record[name] for name in ("folder", "task", "dataset", "seed", "status", "reason")},
-        **{name: record[name] for name in ("started", "environment", "reused", "notes")},
-        "definitions": {name: text for name in names if (text := _definition(record["definitions"], name))},
-        **{name: _number(record, name) for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
-        "name": row_name(record["config"], record["renderer"]),
-        "scene": record.get("scene") or record["dataset"],  # a run that failed early has no scene
-        "metrics": {name: _value(record["metrics"], name) for name in names},
-        "start": {name: _number(record["metrics_start"], name) for name in names},
-        "others": [name for name in names if name not in _NOT_OTHERS],
-        "seconds": {name: _number(record["seconds"], name) for name in ("total", *record["seconds"])},
-        "evaluations": {name: _number(record["evaluations"], name) for name in ("value", "gradient", "per_ray")},
-        "machine": machine,
-        "threads": threads,
-        "files": {name: link("runs", folder.name, name) for name in FILES if (folder / name).is_file()},
-        "thumb": next((link("runs", folder.name, path.name) for path in pictures if path.name in THUMBS), None),
-        "pictures": {picture.name: link("runs", folder.name, picture.name) for picture in pictures},
-    }
+def _refuse_links(results_dir: Path) -> None:
+    """Raises ValueError where a folder that the page is written to is a link, which may lead anywhere."""
+    for name in (FOLDER, *(f"{FOLDER}/{inner}" for inner in ("base", "parts", "views", "data", *DATA))):
+        if (results_dir / name).is_symlink():
+            raise ValueError(f"{results_dir / name} is a link, and the page is not written through it: remove it")
 
 
-def _machine(record: dict[str, Any]) -> tuple[str, str]:
-    """The machine that the run's times depend on: processor with accelerator, and threads."""
-    environment = record["environment"]
-    parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
-    label = " + ".join(part for part in parts if part and part != "cpu")
-    return label or format.MISSING, str(environment.get("threads") or format.MISSING)
+def shell() -> str:
+    """The page without its data."""
+    beside = "'self' file:"
+    policy = POLICY.format(scripts=beside, styles=f"{beside} 'unsafe-inline'", pictures=f"{beside} data:")
+    names = [*SCRIPTS, *(f"data/list/{name}.js" for name in LISTS), START]
+    return filled(
+        policy,
+        "\n".join(f'<link rel="stylesheet" href="{FOLDER}/{name}">' for name in STYLES),
+        "\n".join(f'<script src="{FOLDER}/{name}"></script>' for name in names),
+    )
 
 
-def _definition(definitions: dict[str, str], name: str) -> str:
-    """The definition of a metric. A key is a list of names; `saved_...` matches a prefix, `NAME.error` a suffix."""
-    keys = [([part.strip() for part in key.split(",")], text) for key, text in definitions.items()]
-    last = name.rsplit(".", 1)[-1] if "." in name else None
-    for fits in (
-        lambda part: part == name,
-        lambda part: part.endswith("...") and name.startswith(part[:-3]),
-        lambda part: "." in part and part.rsplit(".", 1)[-1] == last,
-    ):
-        for parts, text in keys:
-            if any(fits(part) for part in parts):
-                return text
-    return ""
+def filled(policy: str, styles: str, scripts: str) -> str:
+    """The text of `index.html` with these parts."""
+    text = (ASSETS / "index.html").read_text(encoding="utf-8")
+    for name, part in {"policy": policy, "styles": styles, "scripts": scripts}.items():
+        text = text.replace(f"{{{{ {name} }}}}", part)
+    return text
 
 
-def _value(values: dict[str, Any], name: str) -> int | float | str | None:
-    """The number or text of that name."""
-    value = values.get(name)
-    return value if isinstance(value, str) else _number(values, name)
+def library() -> Path:
+    """Plotly's script, of the package that is installed."""
+    return Path(find_spec("plotly").origin).parent / "package_data" / LIBRARY
 
 
-def _number(values: dict[str, Any], name: str) -> int | float | None:
-    """The number of that name; None, shown as missing, where there is none."""
-    value = values.get(name)
-    return value if isinstance(value, int | float) else None
+def _copy_assets(folder: Path) -> None:
+    for name in (*STYLES, *SCRIPTS, START):
+        _copy(ASSETS / name, folder / name)
+    _copy(library(), folder / LIBRARY)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copies a file, unless the target has that content already."""
+    content = source.read_bytes()
+    if target.is_file() and target.read_bytes() == content:
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{os.getpid()}")
+    scratch.write_bytes(content)
+    scratch.replace(target)
+
+
+def _remove_others(folder: Path, keys: set[str]) -> None:
+    """Removes the scripts of what is gone."""
+    for path in folder.glob("*.js") if folder.is_dir() else ():
+        if KEY.fullmatch(path.name) and path.stem not in keys:
+            path.unlink(missing_ok=True)
+
+
+def _write_meshes(folder: Path, found: list[Folder], most: int | None) -> None:
+    """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
+    from bench.report.site.meshes import mesh_data
+
+    for number, run in enumerate(found):
+        path, source = folder / f"{run.key}.js", run.path / "mesh.ply"
+        if _is_newer(path, source, run.key):
+            continue
+        if most is not None and number >= most:
+            data: dict[str, Any] = {
+                "none": f"Made for the newest {most} runs: `python -m bench.report meshes=all` makes all."
+            }
+        else:
+            try:
+                data = mesh_data(source)
+            except (OSError, ValueError) as error:
+                data = {"none": f"The mesh cannot be shown: {error}."}
+        write_script(path, to_script("mesh", run.key, data))
+    _remove_others(folder, {run.key for run in found})
+
+
+def _is_newer(path: Path, source: Path, key: str) -> bool:
+    """Whether a mesh was made after its source, and the script holds a mesh and nothing else."""
+    try:
+        if path.stat().st_mtime_ns <= source.stat().st_mtime_ns:
+            return False
+        head, tail = to_script("mesh", key, 0).split("0);")
+        text = path.read_text(encoding="ascii")
+        data = json.loads(text.removeprefix(head).removesuffix(f");{tail}"))
+        return isinstance(data, dict) and "vertices" in data and text == to_script("mesh", key, data)
+    except (OSError, ValueError, RecursionError):
+        return False

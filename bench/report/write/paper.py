@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from bench.records.files import write_text
+from bench.records.files import leads_out, write_text
 
 FOLDER = "paper"
-SUFFIXES = (".html", ".pdf", ".csv", ".md", ".tex")
+SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
+SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 PAGES = Path(__file__).parents[1] / "pages"
 PLACE = re.compile(r"^PLACE(_[A-Z_]+)? = (\d+)$", re.MULTILINE)
 
@@ -65,7 +66,12 @@ def find_paper(results_dir: Path) -> list[dict[str, Any]]:
     Each has a name, title, caption, notes, the table's header and rows, and links to the picture and the files.
     """
     folder = results_dir / FOLDER
-    seen = {path.stem for path in folder.glob("*") if path.suffix in (*SUFFIXES, ".png") and path.is_file()}
+    kinds = (*SUFFIXES, ".png")
+    seen = {
+        path.stem
+        for path in folder.glob("*")
+        if path.suffix in kinds and path.is_file() and not leads_out(path, results_dir)
+    }
     names = [*(name for name in page_names() if name in seen), *sorted(seen - {*page_names()})]
     return [found(folder, name, (FOLDER,)) for name in names if not name.startswith(".")]
 
@@ -88,12 +94,20 @@ def write_readme(results_dir: Path) -> Path | None:
 def found(folder: Path, name: str, place: tuple[str, ...]) -> dict[str, Any]:
     """The contents of the table or figure of that name, whose folder is at a place in the results folder."""
     files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
-    links = {suffix: link(*place, path.name) for suffix, path in files.items() if path.is_file()}
-    text = files[".md"].read_text(encoding="utf-8", errors="replace") if ".md" in links else ""
+    root = folder.parents[len(place) - 1]
+    within = {suffix: path for suffix, path in files.items() if path.is_file() and not leads_out(path, root)}
+    links = {suffix: link(*place, path.name) for suffix, path in within.items()}
     picture = links.get(".png")
     links.pop(".png", None)
     named = {suffix[1:].upper(): link for suffix, link in links.items()}
-    return {"name": name, "picture": picture, "files": named, **_parsed(text)}
+    return {"name": name, "picture": picture, "files": named, **read_page(folder / name)}
+
+
+def read_page(base: Path) -> dict[str, Any]:
+    """The title, caption, table and notes of `base.md`; empty ones where there is no such file."""
+    path = base.with_name(base.name + ".md")
+    sound = path.is_file() and not leads_out(path, base.parents[1])
+    return _parsed(path.read_text(encoding="utf-8", errors="replace") if sound else "")
 
 
 def _parsed(markdown: str) -> dict[str, Any]:

@@ -1,11 +1,10 @@
-"""The result of a page, and its output as CSV, Markdown, LaTeX, PNG, PDF and HTML."""
+"""The result of a page, and its output as CSV, Markdown, LaTeX, PNG and PDF."""
 
 import html
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib import rc_context
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 from bench.pictures.style import RC
 from bench.report.data.experiments import Experiment
 from bench.report.data.statistics import Interval
-from bench.report.write import caption, interactive
+from bench.report.write import caption
 
 # Special characters of LaTeX, and characters that its standard fonts lack.
 _LATEX = {
@@ -61,7 +60,6 @@ class Result:
         data: the raw numbers, including those that the figure plots.
         table: the numbers as text for readers.
         figure: the figure.
-        page: the same as an interactive figure of Plotly.
     """
 
     experiment: Experiment
@@ -74,7 +72,6 @@ class Result:
     remarks: Iterable[str] = ()
     table: pd.DataFrame | None = None
     figure: Figure | None = None
-    page: Any = None
 
     @cached_property
     def caption(self) -> str:
@@ -90,7 +87,7 @@ class Result:
 
 
 def write(result: Result, base: Path, *, name: str = "") -> list[Path]:
-    """Writes `base.csv` and `.md`, and where there is content `.tex`, `.png`, `.pdf`, `.html`; gives the paths.
+    """Writes `base.csv` and `.md`, and where there is content `.tex`, `.png`, `.pdf`; gives the paths.
 
     LaTeX has the label `tab:NAME`, by default that of the files.
     """
@@ -105,11 +102,7 @@ def write(result: Result, base: Path, *, name: str = "") -> list[Path]:
         for path in drawn:
             # Without a date, so that the same records give the same file.
             result.figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
-    written = [base.with_suffix(suffix) for suffix in texts] + drawn
-    if result.page is not None:
-        written.append(base.with_suffix(".html"))
-        interactive.write(result.page, written[-1])
-    return written
+    return [base.with_suffix(suffix) for suffix in texts] + drawn
 
 
 def markdown(result: Result, name: str) -> str:

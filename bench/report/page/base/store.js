@@ -1,0 +1,58 @@
+/* Keeps the data that scripts hand over, and loads more by a script element: a page from a file has no other way. */
+(function (bench) {
+  "use strict";
+
+  const FOLDER = "page/data";
+  const NON_FINITE = {inf: Infinity, "-inf": -Infinity, nan: NaN};
+  const received = new Map();
+  const waiting = new Map();
+
+  /* Called by the scripts of data. */
+  function receive(kind, key, data) {
+    received.set(`${kind}/${key}`, data);
+    const waits = waiting.get(`${kind}/${key}`);
+    if (waits) waits.resolve(data);
+  }
+
+  const have = (kind, key) => received.get(`${kind}/${key}`);
+
+  /* A promise of data of that kind and key; rejected with a sentence where its file is not there. */
+  function load(kind, key) {
+    const name = `${kind}/${key}`;
+    if (received.has(name)) return Promise.resolve(received.get(name));
+    if (!/^[a-z]+\/[A-Za-z0-9_-]+$/.test(name) || bench.oneFile) return Promise.reject(new Error("It is not in this file."));
+    if (!waiting.has(name)) {
+      const waits = {};
+      waits.promise = new Promise((resolve, reject) => Object.assign(waits, {resolve, reject}));
+      waiting.set(name, waits);
+      script(`${FOLDER}/${name}.js`).catch(() => {
+        waiting.delete(name);
+        waits.reject(new Error(`${FOLDER}/${name}.js is not there: python -m bench.report writes it.`));
+      });
+    }
+    return waiting.get(name).promise;
+  }
+
+  function script(address) {
+    return new Promise((resolve, reject) => {
+      const made = document.createElement("script");
+      Object.assign(made, {src: address, onload: resolve, onerror: reject});
+      document.head.append(made);
+    });
+  }
+
+  let library = null;
+
+  /* A promise of Plotly, which lies beside the page and is loaded when a chart first needs it. */
+  function plotly() {
+    if (window.Plotly) return Promise.resolve(window.Plotly);
+    if (bench.oneFile) return Promise.reject(new Error("Charts that answer the mouse are left out of a page in one file."));
+    library = library || script("page/plotly.min.js").then(() => window.Plotly);
+    return library;
+  }
+
+  /* A number, of which the scripts write those that are not finite as words; null for a missing one. */
+  const decoded = (value) => (typeof value === "string" && value in NON_FINITE ? NON_FINITE[value] : value);
+
+  Object.assign(bench, {receive, store: {have, load, plotly, decoded}});
+})((window.implicitBench = window.implicitBench || {}));

@@ -1,0 +1,135 @@
+"""The list of all runs as columns, which the page filters, sorts and searches."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from bench.records.files import digest
+from bench.records.metrics import FIRST, MEASURED, SHOWN
+from bench.records.record import started
+from bench.report.data.names import base_name, names
+from bench.report.data.records import Record, family, loop_seconds, run_key, setting, value_evaluations
+from bench.report.site.files import Folder
+
+DIGITS = 5  # of numbers in the list; a run's own page has all of them
+LONGEST_REASON = 300
+GIVEN = ("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest")
+METRICS = SHOWN | MEASURED
+
+
+def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
+    """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
+    folders = [Folder(results_dir, record["folder"]) for record in records]
+    texts = {
+        "task": [record["task"] for record in records],
+        "name": names(records),
+        "row": [base_name(record) for record in records],
+        "family": [_safely(family, record, record["dataset"]) for record in records],
+        "scene": [record.get("scene") or record["dataset"] for record in records],
+        "renderer": [record["renderer"] for record in records],
+        "status": [record["status"] for record in records],
+        "machine": [machine(record) for record in records],
+        "experiment": [str(record["config"].get("experiment") or "") for record in records],
+        "cell": [_safely(_cell, record, record["folder"]) for record in records],
+        "thumb": [folder.thumb() for folder in folders],
+    }
+    return {
+        "count": len(records),
+        "folder": [folder.name for folder in folders],
+        "address": [folder.link("") for folder in folders],
+        "key": [folder.key for folder in folders],
+        "texts": {name: _coded(values) for name, values in texts.items()},
+        "numbers": {name: [_rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
+        "metrics": _metrics(records),
+        "reason": [_reason(record) for record in records],
+        "reused": [place for place, record in enumerate(records) if record["reused"]],
+        "tasks": _tasks(records),
+    }
+
+
+def machine(record: Record) -> str:
+    """The machine that the run's times depend on, with its threads; empty where the run ended before it knew."""
+    environment = record["environment"]
+    parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
+    label, threads = " + ".join(part for part in parts if part and part != "cpu"), environment.get("threads")
+    return f"{label}, {threads} thread{'s' if threads != 1 else ''}" if label and threads else ""
+
+
+def number(value: Any) -> int | float | None:
+    """The value, if it is a number that fits into a float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        float(value)
+    except OverflowError:
+        return None
+    return value
+
+
+NUMBERS = {
+    "seed": lambda record: record["seed"],
+    "started": lambda record: int(started(record).timestamp()),
+    "loop": lambda record: _safely(loop_seconds, record, None),
+    "total": lambda record: record["seconds"].get("total"),
+    "values": lambda record: _safely(value_evaluations, record, None),
+    "gradients": lambda record: record["evaluations"].get("gradient"),
+}
+
+
+def _metrics(records: list[Record]) -> dict[str, Any]:
+    """The metrics that some run has: before and after, in scene units, with their names and factors."""
+    found = {}
+    for key, metric in METRICS.items():
+        after, before = (
+            [_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
+        )
+        if any(value is not None for value in after):
+            start = before if any(value is not None for value in before) else None
+            found[key] = {"key": key, **metric._asdict(), "after": after, "before": start}
+    return found
+
+
+def _tasks(records: list[Record]) -> list[dict[str, Any]]:
+    """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
+    found = []
+    for task, count in Counter(record["task"] for record in records).most_common():
+        of_task = [record for record in records if record["task"] == task]
+        keys = [key for key in METRICS if any(number(r["metrics"].get(key)) is not None for r in of_task)]
+        keys.sort(key=lambda key, task=task: key != FIRST.get(task))
+        found.append({"task": task, "count": count, "metrics": keys})
+    return found
+
+
+def _cell(record: Record) -> str:
+    """What must be alike for two runs to be compared: shape, view, seed, and what the task is given."""
+    task = setting(record["config"], "task")
+    given = {key: task[key] for key in GIVEN if key in task} if isinstance(task, dict) else {}
+    about = [record["task"], record["dataset"], run_key(record), given, setting(record["config"], "view", "resolution")]
+    return digest([about, record["config"].get("split")])
+
+
+def _coded(values: list[str]) -> dict[str, list]:
+    """Each value once, the most frequent first, and the number of the value at each place."""
+    counts = Counter(values)
+    numbers = {value: place for place, (value, _) in enumerate(counts.most_common())}
+    return {"values": list(numbers), "codes": [numbers[value] for value in values]}
+
+
+def _reason(record: Record) -> str:
+    reason = " ".join(record["reason"].split())
+    if record["status"] == "ok":
+        return ""
+    return (reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + " …") or "no reason recorded"
+
+
+def _rounded(value: Any) -> int | float | None:
+    known = number(value)
+    return float(f"{known:.{DIGITS}g}") if isinstance(known, float) else known
+
+
+def _safely(of: Any, record: Record, otherwise: Any) -> Any:
+    """What a function says of a record; something else where a record from elsewhere holds what it cannot read."""
+    try:
+        return of(record)
+    except (AttributeError, TypeError, ValueError, RecursionError):
+        return otherwise

@@ -1,0 +1,143 @@
+"""What a run's own page shows: what was asked, what happened, numbers, costs, settings, curve and pictures."""
+
+from pathlib import Path
+from typing import Any
+
+from bench.records.names import flat
+from bench.records.read import curve_lines
+from bench.records.statuses import said
+from bench.report.data.records import Record
+from bench.report.site.columns import number
+from bench.report.site.files import ALT, Folder
+from bench.report.site.words import asked, command, python
+
+MOST_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
+PHASES = {
+    "warmup": "warm-up, off the clock",
+    "forward": "loop: forward",
+    "backward": "loop: backward and step",
+    "evaluation": "evaluation and pictures",
+}
+NOT_LINES = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "chamfer_l2")
+MOST_LINES = 8  # terms of a loss
+TOP = ("label", "field", "split", "index", "seed", "device", "threads", "experiment", "draw")
+
+
+def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
+    """The data of a run's page; the list has its name, scene and status."""
+    files = folder.links()
+    typed, remark = command(record, results_dir)
+    return {
+        "asked": asked(record),
+        "reason": record["reason"],
+        "said": said(record["status"])._asdict(),
+        "notes": [text(note) for note in record["notes"]],
+        "log": [text(line) for line in record.get("log") or []],
+        "metrics": _metrics(record),
+        "costs": _costs(record),
+        "environment": [[text(key), text(value)] for key, value in record["environment"].items()],
+        "settings": settings(record),
+        "files": files,
+        "pictures": [[name, folder.link(name), ALT.get(name, "")] for name in folder.pictures()],
+        "curve": curve(folder),
+        "command": typed,
+        "remark": remark,
+        "python": python(record, results_dir / "runs" / folder.name, files),
+    }
+
+
+def settings(record: Record) -> list[list[str]]:
+    """All settings of the run by dotted keys, what decides it first."""
+    known = flat({key: value for key, value in record["config"].items() if key != "results_dir"})
+    place = {key: number for number, key in enumerate(("task", "renderer", "dataset", *TOP))}
+    keys = sorted(known, key=lambda key: (place.get(key.split(".")[0], len(place)), key))
+    return [[key, text(known[key])] for key in keys]
+
+
+def text(value: Any) -> str:
+    """A value as text."""
+    try:
+        return "null" if value is None else str(value)
+    except (RecursionError, ValueError):  # nested too deep; an integer of too many digits
+        return "…"
+
+
+def curve(folder: Folder) -> dict[str, Any] | None:
+    """The lines of `curve.jsonl` as columns, thinned; None without one."""
+    lines = curve_lines(folder.path) if folder.has("curve.jsonl") else None
+    sound = [line for line in lines or [] if number(line.get("iteration")) is not None]
+    if not sound:
+        return None
+    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in NOT_LINES]
+    terms = [key for key in terms if any(number(line.get(key)) is not None for line in sound)][:MOST_LINES]
+    kept = [sound[place] for place in _kept(sound)]
+    names = [*NOT_LINES, *terms]
+    return {"terms": terms, **{name: [_short(number(line.get(name))) for line in kept] for name in names}}
+
+
+def _kept(lines: list[dict[str, Any]]) -> list[int]:
+    """The places of the lines that a thinned curve keeps."""
+    step = max(1, -(-len(lines) // MOST_POINTS))
+    every = {0, len(lines) - 1, *range(0, len(lines), step)}
+    checkpoints = [place for place, line in enumerate(lines) if number(line.get("chamfer_l2")) is not None]
+    thinned = checkpoints[:: max(1, -(-len(checkpoints) // MOST_POINTS))]
+    return sorted(every | set(thinned) | set(checkpoints[-1:]))
+
+
+def _metrics(record: Record) -> list[list[Any]]:
+    """Name, before, after and definition of each metric."""
+    names = dict.fromkeys([*record["metrics"], *record["metrics_start"]])
+    return [
+        [
+            name,
+            _value(record["metrics_start"].get(name)),
+            _value(record["metrics"].get(name)),
+            definition(record["definitions"], name),
+        ]
+        for name in names
+    ]
+
+
+def _value(value: Any) -> int | float | str | None:
+    known = number(value)
+    return known if known is not None or value is None else text(value)
+
+
+def definition(definitions: dict[str, Any], name: str) -> str:
+    """The definition of a metric. A key is a list of names; `saved_...` matches a prefix, `NAME.error` a suffix."""
+    if name in definitions:
+        return text(definitions[name])
+    keys = [([part.strip() for part in key.split(",")], words) for key, words in definitions.items()]
+    last = name.rsplit(".", 1)[-1] if "." in name else None
+    for fits in (
+        lambda part: part == name,
+        lambda part: part.endswith("...") and name.startswith(part[:-3]),
+        lambda part: "." in part and part.rsplit(".", 1)[-1] == last,
+    ):
+        for parts, words in keys:
+            if any(fits(part) for part in parts):
+                return text(words)
+    return ""
+
+
+def _costs(record: Record) -> dict[str, Any]:
+    """Seconds by phase, evaluations, operations and memory."""
+    seconds, evaluations = record["seconds"], record["evaluations"]
+    total = number(seconds.get("total"))
+    phases = [[label, number(seconds.get(key)), key in ("forward", "backward")] for key, label in PHASES.items()]
+    known = [phase for phase in phases if phase[1] is not None]
+    rest = None if total is None else total - sum(phase[1] for phase in known)
+    if rest is not None and known and rest > 0:
+        known.append(["start, set-up and the rest", rest, False])
+    return {
+        "phases": known,
+        "total": total,
+        "evaluations": [[name, number(evaluations.get(name))] for name in evaluations],
+        "flops": number(record["flops"]),
+        "gemm_fraction": number(record["gemm_fraction"]),
+        "peak_memory_bytes": number(record["peak_memory_bytes"]),
+    }
+
+
+def _short(value: int | float | None) -> int | float | None:
+    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -1,0 +1,64 @@
+"""The files of a run that the page links to: those that are there, and lie within the results folder."""
+
+import hashlib
+from pathlib import Path
+
+from bench.report.write.paper import link
+
+FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
+PICTURES = (".png", ".gif", ".webp")
+THUMBS = ("summary.png", "strip.png", "failure.png")  # the first that a run has stands for it
+ALT = {  # what the pictures of a run show
+    "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",
+    "strip.png": "The way from the start to the end, in frames",
+    "strip.gif": "The way from the start to the end, moving",
+    "strip.webp": "The way from the start to the end, moving",
+    "curve.png": "Loss and error over the iterations",
+    "depth.png": "Depth: before, after, truth",
+    "normals.png": "Normals: before, after, truth",
+    "silhouette.png": "Pixels of the silhouette that are missed or spurious",
+    "input.png": "What was given",
+    "failure.png": "The first failure: kinds of pixels, beside the true distance",
+}
+
+
+class Folder:
+    """A run's folder as the page sees it, with links relative to `index.html`."""
+
+    def __init__(self, results_dir: Path, name: str) -> None:
+        self.name, self.path = name, results_dir / "runs" / name
+        self.results_dir = results_dir
+        self.linked = self.path.is_symlink() or self.path.parent.is_symlink()
+
+    @property
+    def key(self) -> str:
+        """The name of the run's files among those of the page: letters and digits, whatever the folder is called."""
+        return hashlib.sha256(self.name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+    def has(self, name: str) -> bool:
+        """Whether it has this file, and not a link to something outside of the results folder."""
+        path = self.path / name
+        if not path.is_file():
+            return False
+        linked = self.linked or path.is_symlink()
+        return not linked or path.resolve().is_relative_to(self.results_dir.resolve())
+
+    def thumb(self) -> str:
+        """The picture that stands for the run; empty without one."""
+        return next((name for name in THUMBS if self.has(name)), "")
+
+    def pictures(self) -> list[str]:
+        """The names of its pictures, the one that stands for the run first."""
+        try:
+            found = sorted(p.name for p in self.path.iterdir() if p.suffix in PICTURES and self.has(p.name))
+        except OSError:
+            return []
+        return sorted(found, key=lambda name: THUMBS.index(name) if name in THUMBS else len(THUMBS))
+
+    def link(self, name: str) -> str:
+        """The address of one of its files."""
+        return link("runs", self.name, name)
+
+    def links(self) -> dict[str, str]:
+        """The addresses of the files that every run may have, by their names."""
+        return {name: self.link(name) for name in FILES if self.has(name)}

@@ -1,0 +1,152 @@
+"""The question that a table or figure answers, its verdict in a sentence and its chart, from its CSV alone."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import numpy as np
+import pandas as pd
+
+from bench.pictures import style
+from bench.records.files import plain, write_text
+from bench.records.format import number
+from bench.report.data.records import FORMER
+from bench.report.data.statistics import median
+from bench.report.write.paper import FOLDER, page_names, read_page
+
+# What a CSV that is not of this version, or not of this program, makes a page's `answer` raise.
+UNREADABLE = (OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the first screen says of a page.
+
+    Args:
+        question: as a reader would ask it.
+        verdict: one sentence with its number between asterisks; empty where the data do not say.
+        chart: panels of series, as `chart_panel` makes them.
+        atlas: a grid of cells, as the page `stability` makes it.
+    """
+
+    question: str
+    verdict: str = ""
+    chart: dict[str, Any] | None = None
+    atlas: dict[str, Any] | None = None
+
+
+def write_answers(results_dir: Path) -> list[str]:
+    """Writes `paper/NAME.json` beside the CSV of each page that has an `answer`.
+
+    A page's `answer`, with the suffix of its `make`, takes the CSV as a frame and the page's notes.
+
+    Returns:
+        A line for each CSV that cannot be read.
+    """
+    problems = []
+    for name, (module, function) in page_names().items():
+        base = results_dir / FOLDER / name
+        answer = getattr(import_module(f"bench.report.pages.{module}"), function.replace("make", "answer"), None)
+        if answer is None or not base.with_suffix(".csv").is_file():
+            continue
+        try:
+            found = answered(answer, base)
+        except UNREADABLE as error:
+            problems.append(f"{FOLDER}/{name}.csv gives no verdict ({type(error).__name__}: {error})")
+            base.with_suffix(".json").unlink(missing_ok=True)
+            continue
+        kept = {key: value for key, value in asdict(found).items() if value}
+        write_text(base.with_suffix(".json"), json.dumps(plain(kept), separators=(",", ":")) + "\n")
+    return problems
+
+
+def answered(answer: Callable[[pd.DataFrame, list[str]], Answer], base: Path) -> Answer:
+    """What a page answers, from its files."""
+    data = pd.read_csv(base.with_suffix(".csv"), low_memory=False)
+    found = answer(data, read_page(base)["notes"])
+    json.dumps(asdict(found), default=str)  # a chart that cannot be written is found here
+    return found
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Rows with their medians, the best first; `n` is the number of shapes."""
+
+    rows: list[tuple[str, float]]
+    n: int
+
+    def said(self, what: str, *, scale: float = 1.0, unit: str = "", most: str = "lowest") -> str:
+        """The median of the best row, the next and the last, in a sentence; empty without two rows."""
+        if len(self.rows) < 2 or not math.isfinite(self.rows[0][1]):
+            return ""
+        shown = [f"{_short(value, scale)}{unit} ({name})" for name, value in self.rows]
+        best = re.sub(r"^(\S+)", r"*\1*", shown[0])
+        rest = f", and at the other end {shown[-1]}" if len(shown) > 2 else ""
+        return f"The {most} median {what}: {best}, then {shown[1]}{rest}; {self.sample}."
+
+    @property
+    def sample(self) -> str:
+        """The number of shapes as text."""
+        return f"n = {self.n} shape{'s' if self.n != 1 else ''}"
+
+
+def ranked(data: pd.DataFrame, metric: str, *, better: str = "lower", by: str = "row") -> Ranked:
+    """The rows of runs by the median of a metric, in which a run that did not end ok is the worst.
+
+    Rows with fewer runs than the others are left out: they are not of the same shapes.
+    """
+    sign = 1.0 if better == "lower" else -1.0
+    values = (sign * data[metric]).where(data["status"] == "ok", math.inf).fillna(math.inf)
+    groups = {name: own.to_numpy(float) for name, own in values.groupby(data[by], sort=False)}
+    most = max(map(len, groups.values()), default=0)
+    found = [(str(name), sign * float(median(own))) for name, own in groups.items() if len(own) == most]
+    return Ranked(sorted(found, key=lambda item: sign * item[1]), shapes(data))
+
+
+def shapes(data: pd.DataFrame) -> int:
+    """The number of shapes of the runs."""
+    keys = [key for key in ("family", "index") if key in data]
+    return len(data[keys].drop_duplicates()) if keys else 1
+
+
+def excluding(data: pd.DataFrame, names: list[str]) -> tuple[int, int]:
+    """How many ratios of these columns have intervals (`_low`, `_high`) that exclude 1, and how many have one."""
+    ends = [(row[f"{name}_low"], row[f"{name}_high"]) for _, row in data.iterrows() for name in names]
+    known = [(low, high) for low, high in ends if not (math.isnan(low) or math.isnan(high))]
+    return sum(not low <= 1 <= high for low, high in known), len(known)
+
+
+def chart_panel(title: str, x: str, y: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """A panel of a chart; an axis is logarithmic where its values are positive and span more than a factor of 3."""
+    axes = {}
+    for letter, name in (("x", x), ("y", y)):
+        values = [v for each in series for v in each[letter] if isinstance(v, int | float) and math.isfinite(v)]
+        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
+        axes[letter] = {"title": name, "log": log}
+    return {"title": title, **axes, "series": series, **more}
+
+
+def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any]:
+    """A series of a chart with the colour and marker that its preset has in every figure."""
+    look = style.look(FORMER.get(preset, preset))
+    marks = {"colour": look.colour, "symbol": look.marker} | more
+    return {"name": name, "x": _rounded(x), "y": _rounded(y), **marks}
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.5g}") for value in np.asarray(values, float)]
+
+
+def runs_of(row: str) -> str:
+    """The address of the runs of a row in the page's list."""
+    return "#/runs?" + urlencode({"task": "all", "view": "runs", "q": row})
+
+
+def _short(value: float, scale: float) -> str:
+    return "∞" if not math.isfinite(value) else number(value, scale)

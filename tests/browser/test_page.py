@@ -1,0 +1,377 @@
+"""The page in Chromium: tables, filters, links, charts and the 3D view; the address, the keyboard, two runs, phones."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from bench.records import format
+from bench.report.write.html import write_index
+from bench.report.write.one_file import write_one_file
+from tests.browser import made
+from tests.report.test_report import crashed
+
+pytestmark = pytest.mark.browser
+
+RUNS = 7
+NUMBERS = (
+    0.0123456,
+    0.5,
+    9.996,
+    99.96,
+    1234.5,
+    -12.34,
+    0.00001234,
+    1.5e9,
+    0,
+    999.6,
+    1_430_000,
+    3e12,
+    7201,
+    0.0123,
+    None,
+)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """Seven runs of one task, one of them without a place among the machines; a table with a chart, and an atlas."""
+    folder = tmp_path_factory.mktemp("browser")
+    for number in range(RUNS):
+        made.write(folder, number)
+    empty = crashed("broken", scene="sofa test 3", seed=0)
+    made.write(
+        folder, 90, folder="broken", **{key: empty[key] for key in ("status", "metrics", "environment", "seconds")}
+    )
+    write_tables(folder)
+    write_index(folder)
+    return folder
+
+
+def write_tables(results):
+    """`speed_front` with a chart, and the atlas with its curves, one cell of which leads to a run."""
+    paper = results / "paper"
+    paper.mkdir()
+    table = [["Setting", "Time", "Words"], ["---"] * 3]
+    table += [["slow", "12.0 s", "b"], ["fast", "300 ms", "a"], ["none", "–", "c"]]
+    rows = "\n".join(f"| {' | '.join(row)} |" for row in table)
+    text = f"**Error over time.** What is plotted.\n\n{rows}\n\n- A note.\n"
+    (paper / "speed_front.md").write_text(text)
+    points = {"name": "dist", "colour": "#0072b2", "symbol": "s", "x": [1.0, 10.0], "y": [2.0, 0.5]}
+    points |= {"text": [["slow"], ["fast"]], "link": ["#/run/completion-0000", "#/run/completion-0001"]}
+    other = {"name": "dvr", "colour": "#d1495b", "symbol": "^", "x": [3.0], "y": [1.0]}
+    panel = {"title": "one", "x": {"title": "time", "log": True}, "y": {"title": "error", "log": True}}
+    chart = {"panels": [panel | {"series": [points, other]}]}
+    front = {"question": "What does accuracy cost?", "verdict": "The least error is *0.5*.", "chart": chart}
+    (paper / "speed_front.json").write_text(json.dumps(front))
+    (paper / "stability.md").write_text(
+        "**Where it breaks.** Severities.\n\n| Axis | dist |\n| --- | ---: |\n| wires | 0.1 |\n"
+    )
+    axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
+    cell = {
+        "short": "0.1",
+        "full": "0.1 (0.05 to 0.2)",
+        "shade": 0.4,
+        "status": "ok",
+        "reason": "",
+        "folder": "completion-0002",
+    }
+    lost = cell | {
+        "short": "unsupported",
+        "shade": None,
+        "status": "unsupported",
+        "folder": "gone",
+        "reason": "no alpha",
+    }
+    atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
+    (paper / "stability.json").write_text(json.dumps({"question": "Where?", "verdict": "At *0.1*.", "atlas": atlas}))
+    (paper / "stability_curves.md").write_text("**Curves.** Shares.\n")
+    curves = {"panels": [panel | {"title": "wires", "axis": "wires", "series": [points, other]}]}
+    (paper / "stability_curves.json").write_text(json.dumps({"chart": curves}))
+
+
+def rows_of(page):
+    return page.locator("#board-list tbody tr")
+
+
+def names_of(page):
+    return page.locator("#board-list tbody th a").all_inner_texts()
+
+
+def test_the_first_screen_has_questions_verdicts_and_leaderboards(results, tab):
+    page = tab(results).open()
+    assert page.locator(".verdict .question").all_inner_texts() == ["What does accuracy cost?", "Where?"]
+    assert page.locator(".verdict strong").first.inner_text() == "0.5"
+    assert page.locator("#counts").inner_text().startswith(f"{RUNS + 1} runs")
+    assert set(names_of(page)) == {"DIST", "DVR", "IDR", "NEWTON", "NAIVE"}
+    page.locator(".verdict").first.click()
+    assert page.locator("h1").inner_text() == "Error over time"
+
+
+def test_methods_count_failures_as_worst_and_are_ranked_on_the_same_scenes_alone(results, tab):
+    page = tab(results).open("#/runs?renderer=dist")
+    row = rows_of(page).first
+    assert "1 of 3" in row.inner_text()  # completion-0000, -0005, and broken
+    page = tab(results).open("#/runs")
+    assert "only methods with all" in page.locator(".count").inner_text()
+    assert set(page.locator("#board-list .rank").all_inner_texts()[1:]) == {"–"}
+
+
+def test_filters_sorting_and_search_stand_in_the_address_and_come_back(results, tab):
+    one = tab(results)
+    page = one.open("#/runs?view=runs")
+    assert rows_of(page).count() == RUNS + 1
+    page.get_by_label("Shapes", exact=True).select_option("plane")
+    assert rows_of(page).count() == 2
+    page.locator('#board-list [data-key="loop"]').click()
+    page.locator('#board-list [data-key="loop"]').click()
+    assert names_of(page) == ["NAIVE", "DVR"]
+    assert page.locator('th[aria-sort="descending"]').inner_text().startswith("Loop")
+    page.get_by_label("Search", exact=True).fill("NAI")
+    assert names_of(page) == ["NAIVE"]
+    address = page.evaluate("location.hash")
+    again = one.open(address)
+    assert names_of(again) == ["NAIVE"] and again.get_by_label("Search", exact=True).input_value() == "NAI"
+    assert again.get_by_label("Shapes", exact=True).input_value() == "plane"
+    again.get_by_role("button", name="Clear all").click()
+    assert rows_of(again).count() == RUNS + 1
+
+
+def test_a_failed_run_stands_last_with_its_status_in_words(results, tab):
+    page = tab(results).open("#/runs?view=runs")
+    last = rows_of(page).last.inner_text()
+    assert "crashed" in last and "no reason recorded" in last
+    page.get_by_label("Status", exact=True).select_option("crashed")
+    assert rows_of(page).count() == 1
+    assert page.locator("#machines").count() == 0  # it has no machine, which is not another one
+
+
+def test_times_of_several_machines_are_flagged(tmp_path, tab):
+    for number, threads in enumerate((1, 2)):
+        made.write(tmp_path, number, environment={"cpu": "Some CPU", "threads": threads, "device": "cpu"})
+    write_index(tmp_path)
+    page = tab(tmp_path).open("#/runs?view=runs")
+    assert "Some CPU, 1 thread: 1 run" in page.locator("#machines").inner_text()
+    page.get_by_label("Machine", exact=True).select_option("Some CPU, 2 threads")
+    assert page.locator("#machines").count() == 0 and rows_of(page).count() == 1
+
+
+def test_a_run_has_its_page(results, tab):
+    page = tab(results).open("#/runs?view=runs")
+    page.locator("#board-list tbody th a").first.press("Enter")
+    page.get_by_role("heading", name="Make it again").wait_for()
+    text = page.locator("main").inner_text()
+    for words in (
+        "It ended as planned.",
+        "Sum of two means.",
+        "python -m bench task=completion",
+        "read_record(folder)",
+        "in the loop",
+    ):
+        assert words in text
+    assert page.locator(".pictures img").count() == len(made.PICTURES)
+    assert all(page.locator(".pictures img").evaluate_all("all => all.map((each) => each.alt.length > 5)"))
+    page.locator(".chart .scatterlayer .trace").first.wait_for()
+    assert page.locator(".chart .panel").count() == 2
+    page.get_by_role("button", name="Seconds").click()
+    page.get_by_text("time in the loop (seconds)").first.wait_for()
+
+
+def test_a_failed_run_says_what_helps(results, tab):
+    page = tab(results).open("#/run/broken")
+    page.get_by_text("What helps:").wait_for()
+    assert "An error ended it." in page.locator(".happened").inner_text()
+
+
+def test_the_mesh_turns_under_the_mouse_and_the_keys(results, tab):
+    page = tab(results).open("#/run/completion-0000")
+    canvas = page.locator(".mesh canvas")
+    canvas.scroll_into_view_if_needed()
+    page.wait_for_function("document.querySelector('.mesh canvas').width > 300")
+    page.wait_for_timeout(300)
+    before = canvas.screenshot()
+    page.get_by_role("button", name="Normals").click()
+    page.wait_for_timeout(300)
+    normals = canvas.screenshot()
+    assert before != normals
+    box = canvas.bounding_box()
+    page.mouse.move(box["x"] + 200, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 300, box["y"] + 160, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    turned = canvas.screenshot()
+    assert turned != normals
+    canvas.press("ArrowLeft")
+    canvas.press("+")
+    page.wait_for_timeout(300)
+    assert canvas.screenshot() != turned
+    canvas.press("Home")
+    canvas.evaluate("(canvas) => canvas.blur()")  # whose outline is part of the picture
+    page.wait_for_timeout(300)
+    assert canvas.screenshot() == normals
+    assert "642 vertices, 1,280 triangles" in page.locator(".mesh").inner_text()
+
+
+def test_a_table_sorts_and_its_chart_answers_the_mouse(results, tab):
+    page = tab(results).open("#/table/speed_front")
+    first = page.locator("table.list tbody th")
+    assert first.all_inner_texts() == ["slow", "fast", "none"]
+    page.locator('table.list [data-key="1"]').click()
+    assert first.all_inner_texts() == ["fast", "slow", "none"]  # 300 ms, 12.0 s, missing last
+    page.locator(".scatterlayer .point").first.wait_for()
+    assert page.locator(".scatterlayer .trace").count() == 2
+    page.get_by_role("button", name="dvr").click()
+    page.wait_for_function("document.querySelectorAll('.scatterlayer .trace').length === 1")
+    point = page.locator(".scatterlayer .point").first.bounding_box()
+    page.mouse.move(point["x"] + 4, point["y"] + 4)
+    page.locator(".hoverlayer .hovertext").wait_for()
+    assert "slow" in page.locator(".hoverlayer").text_content()
+    page.mouse.click(point["x"] + 4, point["y"] + 4)
+    page.get_by_role("heading", name="DIST, sofa test 0").wait_for()
+
+
+def test_a_cell_of_the_atlas_opens_its_curve_and_its_run(results, tab):
+    page = tab(results).open("#/table/stability")
+    page.get_by_role("button", name="wires, dist: 0.1 (0.05 to 0.2)").click()
+    page.locator(".opened .scatterlayer .trace").first.wait_for()
+    assert "Breaks: 0.1 (0.05 to 0.2) units" in page.locator(".opened").inner_text()
+    assert page.locator(".opened a").get_attribute("href") == "#/run/completion-0002"
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    assert "no alpha Its run is not among these results." in page.locator(".opened").inner_text()
+
+
+def test_two_runs_are_compared(results, tab):
+    page = tab(results).open("#/runs?view=runs")
+    page.get_by_label("Compare DIST, sofa test 0").check()
+    assert "Pick another run" in page.locator("#picks").inner_text()
+    page.get_by_label("Compare DVR, plane test 1").check()
+    page.locator("#picks a").click()
+    page.get_by_role("heading", name="Settings that differ").wait_for()
+    text = page.locator("main").inner_text()
+    assert "renderer._label_" in text and "index" in text
+    row = page.get_by_role("row").filter(has=page.get_by_text("chamfer_l2", exact=True))
+    assert row.locator("td").all_inner_texts() == ["0.00100", "0.00200", "2.00", "A"]
+    assert page.locator(".mesh canvas").count() == 2
+    address = page.evaluate("location.hash")
+    page.get_by_role("link", name="Swap").click()
+    page.get_by_role("heading", name="Settings that differ").wait_for()
+    assert page.evaluate("location.hash") != address
+
+
+def test_the_keyboard_reaches_all_and_the_focus_is_seen(results, tab):
+    page = tab(results).open("#/runs?view=runs")
+    seen = set()
+    for _ in range(45):
+        page.keyboard.press("Tab")
+        seen.add(page.evaluate("document.activeElement.tagName + '.' + (document.activeElement.type || '')"))
+        outline = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
+        assert outline != "none" or page.evaluate("document.activeElement === document.body")  # after the last one
+    assert {"A.", "BUTTON.button", "SELECT.select-one", "INPUT.search", "INPUT.checkbox"} <= seen
+    links = page.locator("#board-list tbody th a")
+    links.nth(0).focus()
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate("document.activeElement.textContent") == links.nth(1).inner_text()
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Make it again").wait_for()
+
+
+def test_the_colours_are_chosen_and_kept(results, tab):
+    page = tab(results, dark=True).open()
+    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+    page.get_by_role("button", name="Colours: as the system").click()
+    assert page.evaluate("document.documentElement.dataset.theme") == "light"
+
+
+@pytest.mark.parametrize(
+    "address", ["", "#/runs?view=runs", "#/run/completion-0000", "#/table/speed_front", "#/table/stability"]
+)
+def test_a_phone_shows_all_without_scrolling_sideways(results, tab, address):
+    page = tab(results, width=420, height=800).open(address)
+    page.wait_for_timeout(800)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 420
+
+
+def test_every_link_leads_somewhere(results, tab):
+    one = tab(results)
+    page = one.open()
+    for address in ("", "#/runs?view=runs", "#/run/completion-0001", "#/table/speed_front", "#/table/stability"):
+        page = one.open(address)
+        page.wait_for_timeout(400)
+        links = page.locator("a[href]").evaluate_all("all => all.map((each) => each.getAttribute('href'))")
+        assert links
+        for link in links:
+            assert link.startswith("#/") or link == "#main" or (results / link).is_file(), link
+
+
+def test_numbers_are_written_as_in_tables(results, tab):
+    page = tab(results).open()
+    whole = [value for value in NUMBERS if value is None or float(value).is_integer()]
+    for name, values in {"number": NUMBERS, "seconds": NUMBERS, "count": whole, "size": whole}.items():
+        wanted = [getattr(format, name)(value) for value in values]
+        shown = page.evaluate(f"values => values.map((value) => implicitBench.format.{name}(value))", list(values))
+        assert shown == wanted
+    assert page.evaluate("[Infinity, -Infinity, NaN].map((x) => implicitBench.format.number(x))") == ["∞", "-∞", "nan"]
+
+
+def test_one_file_has_all_inside(results, tab, tmp_path):
+    sent = write_one_file(results)
+    alone = tmp_path / "sent" / sent.name
+    alone.parent.mkdir()
+    alone.write_bytes(sent.read_bytes())
+    sent.unlink()
+    one = tab(alone.parent)
+    page = one.open("", alone.name)
+    assert "made to be sent" in page.locator("#problems").inner_text()
+    page = one.open("#/run/completion-0000", alone.name)
+    page.locator(".scatterlayer .trace").first.wait_for()
+    assert page.locator(".pictures img").count() == 1
+    assert page.locator(".pictures img").evaluate("(image) => image.naturalWidth") == 40
+    page = one.open("#/table/speed_front", alone.name)
+    page.locator(".scatterlayer .trace").first.wait_for()
+
+
+def test_ten_thousand_runs_are_a_hundred_rows_at_a_time(tmp_path, tab, capsys):
+    """The bounds are on what is there, not on the clock: times are printed, for `pytest -s`."""
+    made.write_many(tmp_path, 10_000)
+    code = (
+        f"from pathlib import Path; from bench.report.write.html import write_index; "
+        f"write_index(Path({str(tmp_path)!r}))"
+    )
+    started = time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], check=True)  # of its own: the types that tests check take longer
+    written = time.perf_counter() - started
+    size = (tmp_path / "page" / "data" / "list" / "runs.js").stat().st_size
+    one = tab(tmp_path)
+    started = time.perf_counter()
+    page = one.open("#/runs?task=all&view=runs")
+    rows_of(page).first.wait_for()
+    opened = time.perf_counter() - started
+    assert rows_of(page).count() == 100
+    assert page.evaluate("document.getElementsByTagName('*').length") < 6000
+    assert size < 5_000_000 and (tmp_path / "index.html").stat().st_size < 10_000
+    filtered = page.evaluate(FILTER)
+    assert rows_of(page).count() == 100 and "of 10,000" in page.locator(".count").inner_text()
+    page.get_by_role("button", name="Last »").click()
+    assert 0 < rows_of(page).count() <= 100
+    with capsys.disabled():
+        print(
+            f"\n10,000 runs: written in {written:.1f} s, a list of {size / 1e6:.2f} MB, opened in {opened:.2f} s, "
+            f"filtered in {filtered:.0f} ms"
+        )
+
+
+FILTER = """() => {
+  const select = document.querySelector('[data-column="renderer"]'), times = [];
+  for (const value of ["dist", "dvr", "idr"]) {
+    const started = performance.now();
+    select.value = value;
+    select.dispatchEvent(new Event("change"));
+    document.body.getBoundingClientRect();  // with the layout
+    times.push(performance.now() - started);
+  }
+  return times.sort((a, b) => a - b)[1];
+}"""

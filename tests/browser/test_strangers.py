@@ -1,0 +1,217 @@
+"""A results folder of somebody else: no text in it runs, no network is asked, and nothing leaves the folder."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.report.write.answer import write_answers
+from bench.report.write.html import write_index
+from bench.report.write.one_file import write_one_file
+from tests.browser import made
+
+pytestmark = pytest.mark.browser
+
+ATTACKS = (
+    "<script>window.hacked = 1; alert(1)</script>",
+    "</script><script>window.hacked = 1</script>",
+    '"><img src=x onerror="window.hacked = 1">',
+    "<svg/onload=window.hacked=1>",
+    "javascript:window.hacked=1",
+    '<a href="javascript:window.hacked=1">click</a>',
+    "../../../../etc/passwd",
+    "http://127.0.0.1:9/asked.png",
+    "');window.hacked=1;('",
+    "${window.hacked=1}`",
+    "\u2028window.hacked=1\u2029",
+    "<!--<script>",
+    "*<b onmouseover=window.hacked=1>*",
+    "__proto__",
+)
+FOLDERS = (
+    '"><img src=x onerror="window.hacked=1">',
+    "javascript:window.hacked=1",
+    "a\u2028b\nc",
+    "%2e%2e%2f%2e%2e%2fetc",
+    "<!--",
+    "__proto__",
+)
+MALICE = " ".join(ATTACKS)
+
+
+def hostile(number: int) -> str:
+    return ATTACKS[number % len(ATTACKS)]
+
+
+@pytest.fixture(scope="module")
+def strange(tmp_path_factory):
+    """Runs in which every text is an attack, with pictures, curves, meshes and tables whose texts are, too."""
+    results = tmp_path_factory.mktemp("strange") / "results"
+    for number, attack in enumerate(ATTACKS):
+        folder = FOLDERS[number] if number < len(FOLDERS) else f"run-{number}"
+        path = made.write(
+            results,
+            number,
+            folder=folder,
+            **{
+                field: attack
+                for field in ("id", "task", "renderer", "dataset", "scene", "reason", "method", "code", "config_hash")
+            },
+            status="ok" if number % 2 else attack,
+            notes=[attack, MALICE],
+            log=[attack],
+            overrides=[f"task={attack}", attack],
+            config={attack: attack, "label": attack, "experiment": attack, "task": {attack: {attack: [attack]}}},
+            metrics={attack: 1.0, "chamfer_l2": 0.1, "words": attack},
+            metrics_start={attack: 2.0},
+            definitions={attack: attack, "chamfer_l2": attack},
+            evaluations={attack: 3, "value": attack},
+            seconds={attack: 1.0, "total": 2.0, "forward": attack},
+            environment={attack: attack, "cpu": attack, "device": attack, "threads": attack},
+        )
+        line = {"iteration": 0, "seconds": 0, "total": 1.0, attack: 2.0}
+        (path / "curve.jsonl").write_text(json.dumps(line) + "\n" + json.dumps(line | {"iteration": 1}) + "\n")
+        (path / f"{'<img src=x onerror=window.hacked=1>'[: 20 + number % 5]}.png").write_bytes(
+            (path / "curve.png").read_bytes()
+        )
+        content = (path / "mesh.ply").read_bytes()
+        if number == 1:
+            (path / "mesh.ply").write_bytes(
+                content.replace(b"element vertex", f"comment {MALICE}\nelement vertex".encode())
+            )
+        if number == 2:
+            (path / "mesh.ply").write_bytes(content[:-40])
+    write_tables(results)
+    write_answers(results)  # of a page's own CSV, which is not one
+    write_tables(results)
+    write_index(results)
+    return results
+
+
+def write_tables(results):
+    """Tables and figures whose names, captions, cells, questions, charts and atlas are attacks."""
+    paper = results / "paper"
+    paper.mkdir(exist_ok=True)
+    series = {"name": MALICE, "colour": MALICE, "symbol": MALICE, "x": [1, 2], "y": [1, 2]}
+    series |= {"text": [[MALICE], [MALICE]], "link": ["javascript:window.hacked=1", MALICE]}
+    axis = {"title": MALICE, "log": False}
+    chart = {
+        "panels": [{"title": MALICE, "x": axis, "y": axis, "series": [series], "images": [{"source": ATTACKS[7]}]}]
+    }
+    cell = {"short": MALICE, "full": MALICE, "shade": 0.5, "status": MALICE, "reason": MALICE, "folder": MALICE}
+    atlas = {
+        "axes": [{name: MALICE for name in ("axis", "title", "group", "unit")}],
+        "rows": [MALICE],
+        "cells": [[cell]],
+    }
+    for name in ("table1", "stability", "stability_curves", '"><img src=x onerror=window.hacked=1>', "javascript:1"):
+        (paper / f"{name}.md").write_text(
+            f"**{MALICE}** {MALICE}\n\n| {MALICE} | b |\n|---|---|\n| {MALICE} | 1 |\n\n- {MALICE}\n"
+        )
+        (paper / f"{name}.csv").write_text(f"{MALICE!r},status\n{MALICE!r},ok\n")
+        shown = {"question": MALICE, "verdict": MALICE, "chart": chart} | (
+            {"atlas": atlas} if name == "stability" else {}
+        )
+        (paper / f"{name}.json").write_text(json.dumps(shown))
+
+
+def addresses(page) -> list[str]:
+    runs, papers = (
+        page.evaluate(f"implicitBench.{what}")
+        for what in (
+            "runs.count && [...Array(implicitBench.runs.count).keys()].map((place) => implicitBench.runs.link(place))",
+            "store.have('list', 'papers').map((paper) => implicitBench.address.to(['table', paper.name]))",
+        )
+    )
+    pair = page.evaluate(
+        "implicitBench.address.to(['compare', implicitBench.runs.name(0), implicitBench.runs.name(1)])"
+    )
+    return ["", "#/runs?task=all&view=runs", "#/runs?task=all", *runs, *papers, pair]
+
+
+def test_no_text_of_a_stranger_runs_or_leads_away(strange, tab):
+    one = tab(strange)
+    page = one.open()
+    for address in addresses(page):
+        page = one.open(address)
+        page.wait_for_timeout(250)
+        assert page.evaluate("window.hacked") is None, address
+        assert page.evaluate("({}).polluted") is None
+        assert (
+            page.locator("main script, main iframe, main svg[onload], main [onerror], main [onmouseover]").count() == 0
+        )
+        for link in page.locator("main a[href], main img[src]").evaluate_all(
+            "all => all.map((each) => each.getAttribute('href') ?? each.getAttribute('src'))"
+        ):
+            inside = (strange / link).resolve().is_relative_to(strange.resolve())
+            assert link.startswith("#/") or (link.startswith(("runs/", "paper/")) and inside), link
+    page.evaluate(
+        "document.querySelectorAll('main a, main button').forEach((each) => each.dispatchEvent(new Event('mouseover')))"
+    )
+    assert page.evaluate("window.hacked") is None
+
+
+def test_each_run_of_a_stranger_is_shown_as_text(strange, tab):
+    one = tab(strange)
+    page = one.open("#/runs?task=all&view=runs")
+    assert page.locator("#board-list tbody tr").count() == len(ATTACKS)
+    text = page.locator("#board-list").text_content()
+    for attack in ATTACKS:
+        assert attack in text
+    page = one.open(page.evaluate("implicitBench.runs.link(0)"))
+    page.get_by_role("heading", name="Make it again").wait_for()
+    assert "hacked" in page.locator("main").text_content()
+
+
+def test_a_file_of_a_stranger_that_is_sent_runs_nothing(strange, tab):
+    one = tab(strange)
+    sent = write_one_file(strange)
+    page = one.open("", sent.name)
+    for address in addresses(page):
+        page = one.open(address, sent.name)
+        page.wait_for_timeout(150)
+        assert page.evaluate("window.hacked") is None, address
+
+
+def test_scripts_that_a_stranger_left_among_ours_are_gone(tmp_path, tab):
+    made.write(tmp_path, 0)
+    write_index(tmp_path)
+    evil = "window.hacked = 1;"
+    scripts = [path for path in (tmp_path / "page").rglob("*.js") if path.name != "plotly.min.js"]
+    for path in scripts:
+        path.write_text(evil)
+    (tmp_path / "page" / "data" / "run" / f"{'0' * 16}.js").write_text(evil)
+    write_index(tmp_path)
+    assert not any(path.read_text(encoding="utf-8") == evil for path in (tmp_path / "page").rglob("*.js"))
+    page = tab(tmp_path).open("#/run/completion-0000")
+    page.locator(".mesh canvas").wait_for()
+    assert page.evaluate("window.hacked") is None
+
+
+def test_a_script_within_the_page_is_refused_by_its_policy(tmp_path, tab):
+    """The second lock: were markup to come through after all, the browser would not run it."""
+    made.write(tmp_path, 0)
+    write_index(tmp_path)
+    one = tab(tmp_path)
+    page = one.open()
+    page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hacked=1\">')")
+    page.evaluate(
+        "const made = document.createElement('script'); made.textContent = 'window.hacked = 1'; "
+        "document.body.append(made)"
+    )
+    page.evaluate("document.body.append(Object.assign(new Image(), {src: 'http://127.0.0.1:9/asked.png'}))")
+    page.wait_for_timeout(300)
+    assert page.evaluate("window.hacked") is None
+    refused = [said for said in one.wrong if "Content Security Policy" in said]
+    assert len(refused) >= 3  # the handler, the script and the picture
+    one.wrong.clear()
+
+
+def test_numbers_beyond_a_float_and_odd_meshes_are_words(tmp_path, tab):
+    made.write(tmp_path, 0, metrics={"chamfer_l2": 10**400, "fscore": True, "depth_mae": "nan"}, flops=10**400)
+    path = made.write(tmp_path, 1) / "mesh.ply"
+    path.write_bytes(path.read_bytes().replace(b"element vertex 642", b"element vertex 4000000000"))
+    np.savez(tmp_path / "runs" / "completion-0001" / "images.npz", hit=np.zeros(2))
+    write_index(tmp_path)
+    page = tab(tmp_path).open("#/run/completion-0001")
+    page.get_by_text("shorter than its header says").wait_for()

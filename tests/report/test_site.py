@@ -1,0 +1,240 @@
+"""What the page is made of: names by what differs, safe scripts, meshes, words of a run, one file."""
+
+import base64
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.records.record import NOT_RUN, RunStatus
+from bench.records.statuses import STATUSES, said
+from bench.report.data.names import names
+from bench.report.site.detail import curve, detail
+from bench.report.site.files import Folder
+from bench.report.site.meshes import Surface, mesh_data, read_ply, simplified
+from bench.report.site.script import safe_json, to_script
+from bench.report.site.words import TASKS, asked, command
+from bench.report.write import html
+from bench.report.write.html import write_index
+from bench.report.write.one_file import small_picture, write_one_file
+from tests.browser import made
+from tests.report.page_data import Page
+from tests.report.test_report import record, write_run
+
+ROOT = Path(__file__).parents[2]
+
+
+def renderer(**settings) -> dict:
+    return {"config": {"renderer": settings}}
+
+
+def test_runs_are_named_by_what_differs():
+    swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
+    assert names(swept) == ["DIST, steps=20", "DIST, steps=50"]
+    same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
+    assert names(same) == ["DIST", "DIST"]
+
+
+def test_a_setting_that_follows_from_another_is_not_named():
+    configs = [{"scale": {"name": name}, "view": {"resolution": size}} for name, size in (("smoke", 32), ("desk", 64))]
+    assert names([record("x", config=config) for config in configs]) == ["dist, name=smoke", "dist, name=desk"]
+
+
+def test_own_renderers_are_named_by_their_class():
+    own = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
+    assert names(own) == ["Mine", "Other"]
+    labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
+    assert names([labelled]) == ["Ours"]
+
+
+def test_at_most_three_settings_are_named_and_equal_ends_in_full():
+    configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
+    assert max(name.count("=") for name in names([record("x", config=config) for config in configs])) == 3
+    alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
+    assert names([record("x", config=config) for config in alike])[3] == "dist, renderer.weight=2, task.weight=1"
+
+
+@pytest.mark.parametrize(
+    "config", [{"renderer": "odd", "silhouette": 3}, {"label": {"a": 1}}, {"dataset": {"path": 5}}]
+)
+def test_an_odd_configuration_is_shown_all_the_same(tmp_path, config):
+    write_run(tmp_path, record("odd", config=config), "odd")
+    write_index(tmp_path)
+    assert Page(tmp_path).folders == ["odd"]
+
+
+def test_a_configuration_that_is_nested_without_end_is_cut_off(tmp_path):
+    nested: dict = {}
+    for _ in range(300):
+        nested = {"a": nested}
+    write_run(tmp_path, record("deep", config=nested), "deep")
+    write_index(tmp_path)
+    ((key, value),) = Page(tmp_path).run("deep")["settings"]
+    assert value == "…" and key.count(".") == 20
+
+
+def test_no_text_can_end_a_script_or_a_line():
+    text = "</script><!-- & \u2028\u2029 \ud800 ü"
+    made_of = to_script("run", text, {"a": [text, float("inf"), float("nan")]})
+    assert made_of.isascii() and not set("<>&") & set(made_of) and made_of.count("\n") == 1
+    assert json.loads(safe_json(text)) == text
+    assert json.loads(safe_json({"a": float("-inf")})) == {"a": "-inf"}
+
+
+def test_each_status_has_words_and_all_but_ok_a_remedy():
+    assert set(STATUSES) == {*RunStatus, NOT_RUN}
+    assert [status for status, words in STATUSES.items() if not words.remedy] == [RunStatus.OK]
+    assert said("a later one").meaning == "This status is not known here."
+
+
+def test_each_task_has_words():
+    assert set(TASKS) == {path.stem for path in (ROOT / "conf" / "task").glob("*.yaml")}
+
+
+def test_what_was_asked_is_a_sentence():
+    config = {"task": {"points": "100"}, "view": {"resolution": 32}, "scale": {"name": "smoke"}}
+    sentence = asked(record("x", config=config, scene="sofa test 0"))
+    assert sentence == (
+        "Complete a shape from sparse depth and its mask: sofa test 0, 100 depth points, 32 × 32 pixels, seed 0, "
+        "scale=smoke."
+    )
+
+
+def test_the_command_is_what_was_typed_and_safe_to_paste():
+    typed = ["task=completion", "renderer.steps=40", "results_dir=elsewhere", "label=$(rm -rf ~)"]
+    line, _ = command(record("x", overrides=typed), Path("my results"))
+    assert shlex.split(line) == ["python", "-m", "bench", *typed[:2], typed[3], "results_dir=my results"]
+    older, remark = command(record("x", method="dist_mask"), Path("results"))
+    assert older == "python -m bench task=completion renderer=dist dataset=sofa +method=dist_mask seed=0"
+    assert "config.yaml has all settings" in remark
+    stressed = command(record("x", dataset="wires", config={"stress": {"name": "wires"}}), Path("results"))[0]
+    assert "stress=wires" in stressed and "dataset" not in stressed
+
+
+def test_the_lines_for_python_open_the_run(tmp_path):
+    made.write(tmp_path, 0)
+    write_index(tmp_path)
+    found: dict = {}
+    exec(Page(tmp_path).run("completion-0000")["python"], found)  # as a reader would paste them
+    assert found["record"]["status"] == "ok" and len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+
+
+def test_costs_are_by_phase_and_add_up(tmp_path):
+    write_run(tmp_path, record("one"), "one")
+    costs = detail(record("one", notes=[]), Folder(tmp_path, "one"), tmp_path)["costs"]
+    assert sum(spent for _, spent, _ in costs["phases"]) == costs["total"] == 31.5
+    assert [label for label, _, loop in costs["phases"] if loop] == ["loop: forward", "loop: backward and step"]
+
+
+def test_a_long_curve_is_thinned_but_keeps_its_ends_and_checkpoints(tmp_path):
+    folder = write_run(tmp_path, record("one"), "one")
+    lines = [{"iteration": n, "total": 1.0} | ({"chamfer_l2": 0.1} if n == 1001 else {}) for n in range(5000)]
+    (folder / "curve.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    kept = curve(Folder(tmp_path, "one"))["iteration"]
+    assert len(kept) < 250 and {0, 1001, 4999} <= set(kept)
+
+
+def positions(data: dict, name: str, width: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(data[name]), "<u2").reshape(-1, width)
+
+
+def test_a_mesh_is_given_as_numbers_of_sixteen_bits(tmp_path):
+    made.write_mesh(tmp_path / "mesh.ply")
+    whole, data = read_ply(tmp_path / "mesh.ply"), mesh_data(tmp_path / "mesh.ply")
+    low, high = np.array(data["low"]), np.array(data["high"])
+    found = low + positions(data, "vertices", 3) / 65_535 * (high - low)
+    assert np.abs(found - whole.vertices).max() < 1e-5
+    assert (positions(data, "faces", 3) == whole.faces).all()
+
+
+def test_a_large_mesh_is_merged_to_few_vertices_near_the_surface():
+    turn = np.linspace(0, 2 * np.pi, 300)
+    u, v = (grid.ravel() for grid in np.meshgrid(turn, turn))
+    vertices = np.stack([(1 + 0.3 * np.cos(v)) * np.cos(u), 0.3 * np.sin(v), (1 + 0.3 * np.cos(v)) * np.sin(u)], axis=1)
+    faces = np.stack([np.arange(len(u) - 301) + shift for shift in (0, 1, 300)], axis=1)
+    small = simplified(Surface(vertices, faces, np.full((len(u), 3), 40.0)), 5000)
+    assert 1000 < len(small.vertices) <= 5000 and small.faces.max() < len(small.vertices)
+    around = np.hypot(np.hypot(small.vertices[:, 0], small.vertices[:, 2]) - 1, small.vertices[:, 1])
+    assert np.abs(around - 0.3).max() < 0.02 and np.allclose(small.colours, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda content: content[:-40], "shorter"),
+        (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "shorter"),
+        (lambda content: content.replace(b"binary_little", b"binary_big"), "not a binary PLY"),
+        (lambda content: content.replace(b"double x", b"double u"), "x, y and z"),
+        (lambda content: content.replace(b"double x", b"double y"), "x, y and z"),
+        (lambda content: b"", "not a binary PLY"),
+        (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "no triangles of its vertices"),
+    ],
+)
+def test_a_mesh_that_cannot_be_read_is_said_to_be(tmp_path, change, why):
+    folder = write_run(tmp_path, record("one"), "one")
+    made.write_mesh(folder / "mesh.ply")
+    (folder / "mesh.ply").write_bytes(change((folder / "mesh.ply").read_bytes()))
+    write_index(tmp_path)
+    page = Page(tmp_path)
+    assert why in page.read("mesh", page.runs["key"][0])["none"]
+
+
+def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
+    for number in range(3):
+        made.write(tmp_path, number)
+    write_index(tmp_path, meshes=2)
+    page = Page(tmp_path)
+    shown = ["vertices" in page.read("mesh", key) for key in page.runs["key"]]
+    assert page.folders[-1] == "completion-0000" and shown == [True, True, False]
+    monkeypatch.setattr("bench.report.site.meshes.read_ply", lambda path: pytest.fail("was made already"))
+    write_index(tmp_path, meshes=2)
+    monkeypatch.undo()
+    write_index(tmp_path, meshes=None)
+    assert all("vertices" in Page(tmp_path).read("mesh", key) for key in page.runs["key"])
+
+
+def test_what_is_gone_leaves_the_page(tmp_path):
+    for number in range(2):
+        made.write(tmp_path, number)
+    write_index(tmp_path)
+    for path in (folder := tmp_path / "runs" / "completion-0001").iterdir():
+        path.unlink()
+    folder.rmdir()
+    write_index(tmp_path)
+    for kind in ("run", "mesh"):
+        assert len(list((tmp_path / "page" / "data" / kind).iterdir())) == 1
+
+
+def test_the_page_is_not_written_through_a_link(tmp_path):
+    results, outside = tmp_path / "results", tmp_path / "outside"
+    write_run(results, record("one"), "one")
+    outside.mkdir()
+    (results / "page").symlink_to(outside)
+    with pytest.raises(ValueError, match="is a link"):
+        write_index(results)
+    assert not list(outside.iterdir())
+
+
+def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):
+    write_run(tmp_path, record("one"), "one")
+    write_index(tmp_path)
+    shipped = {path.relative_to(html.ASSETS).as_posix() for path in html.ASSETS.rglob("*") if path.is_file()}
+    assert shipped == {*html.SCRIPTS, *html.STYLES, html.START, "index.html"}
+    links = [link.removeprefix("page/") for link in Page(tmp_path).shell.links if link.startswith("page/")]
+    assert set(links) >= shipped - {"index.html"} and links[-1] == html.START
+    assert all(len((html.ASSETS / name).read_text(encoding="utf-8").splitlines()) <= 300 for name in html.SCRIPTS)
+
+
+def test_one_file_names_the_hash_of_each_of_its_scripts_and_links_to_nothing(tmp_path):
+    made.write(tmp_path, 0)
+    text = write_one_file(tmp_path).read_text(encoding="utf-8")
+    assert text.count("<script>") == text.count("</script>") == text.count("'sha256-")
+    assert "src=" not in text.split("<script>")[0] and "page/" not in text.split("<body>")[0]
+    assert "data:image/webp;base64," in text and len(text) < 8_000_000
+
+
+def test_a_picture_that_cannot_be_read_is_left_out(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    assert small_picture(tmp_path / "a.png", 100) == small_picture(tmp_path / "none.png", 100) == ""
