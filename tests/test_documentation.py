@@ -46,6 +46,10 @@ QUICK = (  # with all sizes of scale=smoke that make a run last
 SHIPPED = (  # of networks that are shipped for scale=desk alone
     "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200", "evaluation.picture=null",
 )  # fmt: skip
+FITTED = (  # of experiments on a network that is fitted to one shape: a small one
+    *QUICK, "prior.network.layers=2", "prior.network.width=16", "prior.network.code_length=4", "prior.network.skip=0",
+    "prior.steps=20", "prior.samples=500", "view.resolution=16",
+)  # fmt: skip
 ENDED = ("ok", "not_reached", "empty", "diverged", "timeout", "oom", "unsupported")  # a run that did what it can
 
 
@@ -206,7 +210,8 @@ def cell_of(command: Command, made: dict[str, str]) -> list[str]:
 def test_every_command_runs(made, tmp_path, command):
     if "+method=stereo" in command.words:
         pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
-    small = SHIPPED if "+method=single_view" in command.words else QUICK
+    fitted = {"+experiment=table1", "+experiment=gradients"} & set(command.words)
+    small = SHIPPED if "+method=single_view" in command.words else FITTED if fitted else QUICK
     done = typed(*cell_of(command, made), *small, f"results_dir={tmp_path}")
     assert done.out, done.err
     record = bench.load(tmp_path).iloc[0]
