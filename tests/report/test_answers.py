@@ -21,7 +21,10 @@ WITHOUT = {
     "stability_failures",
     "parsimony_flops",
     "parsimony_needs",
-    "single_view_budget",
+    "completion_gallery",
+    "misplaced_gallery",
+    "multiview_gallery",
+    "rerendering",
 }
 CHARTS = {"stability_curves"}  # pages whose answer is a chart alone
 

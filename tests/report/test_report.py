@@ -102,16 +102,16 @@ def test_links_lead_to_existing_files_and_nowhere_else(results):
     assert not {"iframe", "object", "embed", "base"} & set(page.shell.tags)
 
 
-def test_files_outside_of_the_folder_are_not_linked(tmp_path):
+@pytest.mark.parametrize(("name", "target"), [("summary.png", "{}/secret.png"), ("log.txt", "../../../secret.png")])
+def test_a_run_with_a_link_out_of_the_folder_is_left_out_and_named(tmp_path, name, target):
     results, secret = tmp_path / "results", tmp_path / "secret.png"
     secret.write_bytes(b"")
-    folder = write_run(results, record("plain"), "plain", ("curve.png",))
-    (folder / "summary.png").symlink_to(secret)
-    (folder / "log.txt").symlink_to("../../../secret.png")
+    (write_run(results, record("plain"), "plain", ("curve.png",)) / name).symlink_to(target.format(tmp_path))
+    write_run(results, record("sound"), "sound", ("curve.png",))
     page = page_of(results)
-    assert [name for name, *_ in page.run("plain")["pictures"]] == ["curve.png"]
-    assert set(page.run("plain")["files"]) == {"record.json"}
-    assert page.text("thumb") == [""]
+    assert page.folders == ["sound"]
+    assert page.about["problems"] == [f"plain: not read, since {name} is a link out of the results folder"]
+    assert not any("secret" in path.read_text() for path in (results / "page" / "data").rglob("*.js"))
 
 
 def test_rows_are_newest_first_and_show_the_numbers(results):

@@ -69,6 +69,8 @@ def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_pa
     assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
     assert table["Over Newton"].tolist() == ["", "∞ (n = 3)", "0.500 (n = 3)"]
     assert table.loc["IDR", "Failed"] == "1 of 3"
+    data = single_view_renderers.make(experiment).data
+    assert single_view_renderers.answer(data, []).verdict.endswith("*20.0* (Newton), then 30.0 (IDR); n = 3 shapes.")
 
 
 def test_a_line_has_the_seconds_of_the_training_and_of_the_inference(tmp_path):
@@ -117,6 +119,10 @@ def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
     drawn = [axis.containers[0].lines[0].get_xydata().tolist() for axis in (left, right)]
     assert drawn == [[[1, 80], [4, 40], [24, 20]], [[12, 60], [96, 20]]]
     assert "96 training shapes" in left.get_xlabel() and "24 images" in right.get_xlabel()
+    verdict = (
+        "Median Chamfer-L1 × 1000: *20.0* from 96 shapes with 24 images each; 80.0 from 96 shapes with 1 image each; "
+    )
+    assert single_view_budget.answer(result.data, []).verdict == f"{verdict}60.0 from 12 shapes with 24 images each."
 
 
 @pytest.mark.parametrize("status", ["crashed", "empty"])

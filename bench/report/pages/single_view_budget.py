@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -11,6 +12,7 @@ from bench.report.data.records import SCALE, Record, Row, by_shape, grouped, set
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.pages.dvr_table1 import errors_of, over
 from bench.report.write import chart
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.shapes import middle
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, text, to_data, to_table
@@ -111,3 +113,21 @@ def _curve(axis: Axes, row: Row, runs: dict[int, list[Record]]) -> None:
     axis.set_xscale("log", base=2)
     axis.set_xticks(sizes, [str(size) for size in sizes])
     axis.minorticks_off()
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The medians of the fewest images of each shape, of the fewest shapes, and of the largest training."""
+    worst = data["chamfer_l1"].where(data["status"] == "ok", float("inf"))
+    medians = worst.groupby([data["shapes"], data["views"]]).median()
+    shapes, views = (medians.index.get_level_values(level) for level in (0, 1))
+    ends = [(shapes.max(), views.max()), (shapes.max(), views.min()), (shapes.min(), views.max())]
+    said = [
+        f"{SCALE * medians[end]:.1f} from {end[0]} shapes with {_images(int(end[1]))} each" for end in dict.fromkeys(ends)
+    ]
+    first, _, rest = "; ".join(said).partition(" ")
+    verdict = f"Median Chamfer-L1 × 1000: *{first}* {rest}." if len(said) > 1 else ""
+    return Answer("How many shapes, and images of each, does a training need?", verdict)
+
+
+def _images(count: int) -> str:
+    return f"{count} image{'s' if count != 1 else ''}"

@@ -3,14 +3,19 @@
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
+
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import SCALE
 from bench.report.pages.dvr_table1 import COMPARED, INTERVAL, RATIOS, RUNS, compared_lines, draw
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, thousandfold, to_data, to_table
 
 PLACE = 39
 READS = (Selection("single_view_renderers", ("single_view",), ("dataset", "task", "supervision"), setup=("machine",)),)
+BASELINES = ("Mean shape", "Nearest image")  # labels of rows without a training
 FIRST = "single_view_by_newton"  # the row that the other renderers are compared with
 NOTES = (
     "The same network, shapes, images, rays, number of steps and losses, IDR's cross entropy of the mask included; no "
@@ -48,3 +53,10 @@ def make(experiment: Experiment) -> Result:
         table=to_table(COLUMNS, lines),
         figure=draw(experiment),
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The renderers by the Chamfer-L1 of the shapes that their networks give."""
+    taught = data[~data["row"].isin(BASELINES)]
+    verdict = ranked(taught, "chamfer_l1").said("Chamfer-L1 × 1000 of unseen shapes", scale=SCALE)
+    return Answer("Does it matter which renderer teaches a network of one image?", verdict)

@@ -1,7 +1,10 @@
 """Photographs from one side: what renderers make of the side that none of them shows, and where their weights lie."""
 
+import pandas as pd
+
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions, grouped
+from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_pictures, lines_of, scene_of
 from bench.report.write.table import (
@@ -57,3 +60,9 @@ def make(experiment: Experiment) -> Result:
         table=to_table(COLUMNS, lines_of(experiment, NAMES)),
         figure=figure,
     )
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The rows by how much bumpier than the truth their unseen sides are."""
+    verdict = ranked(data, "unseen_roughness").said("roughness over the truth's where no photograph looks", unit="°")
+    return Answer("Who leaves bumps on the side that no photograph shows?", verdict)
