@@ -176,10 +176,10 @@ def test_the_page_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
     paper.page_names.cache_clear()
     try:
         report([f"results_dir={own_task}"])
-    finally:
+        (page,) = paper.find_paper(own_task)
+    finally:  # after the last use of the pages of this test
         paper.page_names.cache_clear()
         sys.modules.pop("bench.report.pages.coverage", None)
-    (page,) = paper.find_paper(own_task)
     assert page["header"][0] == "Run" and len(page["rows"]) == 2
     assert not list((own_task / "sweeps").glob("*/table.csv"))  # a page shows it
 
