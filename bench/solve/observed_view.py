@@ -42,6 +42,18 @@ def slopes_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"
         return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
 
 
+def slopes_over(field: Field, points: Float[Tensor, "n 3"], width: float) -> Float[Tensor, "n 3"]:
+    """The field's differences along the axes between points that are `width` apart, about the given ones, over it.
+
+    The gradient at a point of a ReLU network is the same for all codes that open the same ReLUs, so that it has no
+    derivative towards the code; these slopes have one, by the ReLUs that lie between.
+    """
+    moves = width / 2 * torch.eye(3, dtype=points.dtype, device=points.device)
+    around = points[:, None, None] + torch.stack([moves, -moves])
+    ahead, behind = field(around).unbind(dim=1)
+    return (ahead - behind) / width
+
+
 @runtime_checkable
 class Weights(Protocol):
     """The terms of a view's loss and their weights."""
@@ -72,6 +84,7 @@ class GivenView:
     mask: Bool[Tensor, "*rays"] | None
     normals: Float[Tensor, "*rays 3"] | None = None  # unit, in world coordinates; None where they are not given
     normal_weight: float = 0.0  # of 1 less their cosine with those of the rendered surface
+    normal_width: float = 0.0  # scene units, see `slopes_over`
 
     @staticmethod
     def of(
@@ -94,9 +107,15 @@ class GivenView:
             mask=mask,
         ).to(device)
 
-    def with_normals(self, normals: Float[Tensor, "*rays 3"], weight: float) -> "GivenView":
-        """The same with normals that are given as well, and compared at pixels that are observed and hit."""
-        return replace(self, normals=normals.to(self.depth.device), normal_weight=weight)
+    def with_normals(self, normals: Float[Tensor, "*rays 3"], weight: float, *, width: float) -> "GivenView":
+        """The same with normals that are given as well, and compared at pixels that are observed and hit.
+
+        Args:
+            normals: unit, in world coordinates.
+            weight: of 1 less their cosine with those of the rendered surface.
+            width: of these, see `slopes_over`.
+        """
+        return replace(self, normals=normals.to(self.depth.device), normal_weight=weight, normal_width=width)
 
     def to(self, device: torch.device) -> "GivenView":
         """The same on a device."""
@@ -115,7 +134,7 @@ class GivenView:
         error = depth_error(self.settings.depth_loss, found, self.depth, self.depth_of_distance)
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
         if self.normals is not None:
-            slopes = slopes_at(field, rendering.points[compared])
+            slopes = slopes_over(field, rendering.points[compared], self.normal_width)
             off = normal_error(torch.nn.functional.normalize(slopes, dim=-1), self.normals[compared])
             terms["normals"] = self.normal_weight * off
         if self.mask is not None:

@@ -19,7 +19,7 @@ from bench.solve.problem import OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
 from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene
-from renderers.checks import check_at_least, check_choice
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
@@ -40,6 +40,8 @@ class Completion:
         depth_weight: of that mean.
         normal_weight: of 1 less the cosine between the normals of the rendered surface and the true ones, the mean over
             the same pixels (DIST, B.3); beyond 0 the normals of these pixels are given as well.
+        normal_width: scene units over which the rendered surface's normals are taken; see
+            `bench.solve.observed_view.slopes_over`.
         silhouette: loss of the mask.
         silhouette_weight: of that loss.
         code: penalty on the code.
@@ -52,6 +54,7 @@ class Completion:
     depth_loss: str
     depth_weight: float
     normal_weight: float
+    normal_width: float
     silhouette: SilhouetteLoss
     silhouette_weight: float
     code: CodePenalty
@@ -65,6 +68,8 @@ class Completion:
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "normal_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
+
+        check_positive("task.normal_width", self.normal_width, "0.02 is two thirds of a pixel at 64 x 64")
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
@@ -99,4 +104,6 @@ class Completion:
         observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
         given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
-        return given.with_normals(view.normals, self.normal_weight) if self.normal_weight else given, observed
+        if self.normal_weight:
+            given = given.with_normals(view.normals, self.normal_weight, width=self.normal_width)
+        return given, observed

@@ -477,6 +477,22 @@ def completions(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        (
+            {"normal_weight": 1.0, "normal_width": 0.02},
+            "depths, normals over 0.02 scene units (weight 1) and the silhou",
+        ),
+        ({"normal_weight": 0.0, "normal_width": 0.02}, "The loss has depths and the silhouette; the paper's Fig. 5"),
+        ({}, "The loss has depths and the silhouette; the paper's Fig. 5"),  # of older runs
+    ],
+)
+def test_fig5_says_whether_its_loss_has_normals(tmp_path, task, said):
+    write_curve(write_run(tmp_path, "fig5", PARALLEL, settings={"task": task}), [4, 3, 2, 1], {0: 0.4, 2: 0.1, 3: 0.2})
+    assert said in told(fig5.make(chosen(tmp_path, "fig5")))
+
+
 def test_fig5_data_holds_runs_medians_and_correlation(completions):
     data = fig5.make(chosen(completions, "fig5")).data
     runs = data[(data["kind"] == "run") & (data["row"] == PARALLEL)]

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from bench.config import load
 from bench.models.observations import together
-from bench.solve.observed_view import GivenView, normal_error
+from bench.solve.observed_view import GivenView, normal_error, slopes_at, slopes_over
 from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
+from renderers.fields.mlp import Decoder
 from renderers.silhouette import Own
 from tests.tiny import CPU, camera_of
 
@@ -20,6 +21,7 @@ RENDERERS = {
     "newton": load("renderer", "newton", warm=False, march_epsilon=1e-6),
 }
 CAMERA = camera_of(6, field_of_view=18.0).double()  # all rays hit, away from the outline, so that all go on to do so
+WIDTH = 1e-4  # scene units: its square is about the error of the slopes
 FACTORS, OFFSET = torch.tensor([0.7, 0.5, 0.6]).double(), torch.tensor([0.03, -0.02, 0.05]).double()
 
 
@@ -43,7 +45,7 @@ def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: floa
     blank = torch.zeros(6, 6, dtype=torch.float64)
     view = View(CAMERA, blank, blank[..., None].expand(-1, -1, 3), torch.ones(6, 6, dtype=torch.bool))
     seen = GivenView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
-    return seen.with_normals(normals, weight)
+    return seen.with_normals(normals, weight, width=WIDTH)
 
 
 ALL = torch.ones(6, 6, dtype=torch.bool)
@@ -57,9 +59,13 @@ def test_the_term_is_one_less_the_cosine_over_observed_pixels(observed):
     expected = 2.0 * (1 - (found * OTHER).sum(-1))[observed].mean()
     assert expected > 0.01
     terms = given(OTHER, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
-    torch.testing.assert_close(terms["normals"], expected, rtol=1e-7, atol=0)
+    torch.testing.assert_close(terms["normals"], expected, rtol=1e-5, atol=0)
     exact = given(found, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
     assert abs(exact["normals"].item()) < 1e-9
+    shape, points = ellipsoid(FACTORS, OFFSET), hits(FACTORS, OFFSET).view(-1, 3)
+    at_points = torch.nn.functional.normalize(slopes_at(shape, points).detach(), dim=-1)  # as reconstruction has it
+    same = normal_error(at_points, OTHER.view(-1, 3))
+    torch.testing.assert_close(same, (1 - (found * OTHER).sum(-1)).mean(), rtol=1e-9, atol=0)
 
 
 def test_rays_without_a_hit_have_no_part_and_none_at_all_costs_nothing():
@@ -73,7 +79,7 @@ def test_rays_without_a_hit_have_no_part_and_none_at_all_costs_nothing():
     assert 6 <= int(hit.sum()) <= 30
     expected = 2.0 * (1 - (normals_of(points, FACTORS, half) * OTHER).sum(-1))[hit].mean()
     found = given(OTHER, ALL).compare(ellipsoid(FACTORS, half), 0)["normals"]
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -93,6 +99,21 @@ def test_the_gradient_is_that_of_differences(renderer):
     expected = torch.stack([(up - down) / (2 * step) for up, down in ends])
     assert expected.abs().min() > 1e-3
     torch.testing.assert_close(found, expected, rtol=1e-4 if renderer == "newton" else 1e-6, atol=1e-8)
+
+
+def test_slopes_over_a_width_move_a_code_that_those_at_a_point_do_not():
+    """The gradient of a ReLU network is piecewise constant."""
+    torch.manual_seed(0)
+    decoder = Decoder(layers=3, width=64, code_length=8, skip=1, narrow=False).double()
+    code = torch.zeros(8, dtype=torch.float64, requires_grad=True)
+    points, given_normals = 0.3 * torch.randn(40, 3).double(), torch.nn.functional.normalize(torch.randn(40, 3), dim=1)
+
+    def error(slopes: Tensor) -> Tensor:
+        return normal_error(torch.nn.functional.normalize(slopes, dim=-1), given_normals.double())
+
+    (at_a_point,) = torch.autograd.grad(error(slopes_at(decoder.at(code), points)), code)
+    (over_a_width,) = torch.autograd.grad(error(slopes_over(decoder.at(code), points, 0.05)), code)
+    assert not at_a_point.any() and over_a_width.norm() > 1e-4
 
 
 def test_views_without_normals_have_no_such_term_and_parts_keep_theirs():

@@ -31,6 +31,7 @@ SETTINGS = Completion(
     depth_loss="depth",
     depth_weight=10.0,
     normal_weight=0.0,
+    normal_width=0.02,
     silhouette=Own(),
     silhouette_weight=4.0,
     code=CodePenalty(0.1, "sum"),
@@ -114,7 +115,7 @@ def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     problem = problem_of(normal_weight=3.0)
     assert 0 <= values(problem)["normals"] <= 2 * 3.0
     given = problem.compare.__self__
-    assert given.normal_weight == 3.0 and torch.equal(given.normals, scene.view.normals)
+    assert (given.normal_weight, given.normal_width) == (3.0, 0.02) and torch.equal(given.normals, scene.view.normals)
     terms = problem.loss(0)
     assert terms["total"].item() == pytest.approx(sum(terms[name].item() for name in terms if name != "total"))
 
@@ -276,6 +277,7 @@ def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(problem_of, 
         ({"depth_loss": "normals"}, "task.depth_loss must be one of depth, points, not 'normals'"),
         ({"depth_weight": -1.0}, "task.depth_weight must be at least 0, not -1"),
         ({"normal_weight": -1.0}, "task.normal_weight must be at least 0, not -1"),
+        ({"normal_width": 0.0}, "task.normal_width must be positive, not 0"),
         ({"silhouette_weight": float("inf")}, "task.silhouette_weight must be at least 0, not inf"),
         ({"code.weight": -0.1}, "task.code.weight must be at least 0, not -0.1"),
     ],

@@ -68,7 +68,9 @@ def _loss(experiment: Experiment) -> str:
     """A note on the terms of the loss."""
     weight = setting(experiment.requested(), "task", "normal_weight")
     if weight:
-        return f"The loss has depths, normals (weight {weight:g}) and the silhouette, as the paper's Fig. 5 has it."
+        width = setting(experiment.requested(), "task", "normal_width")
+        terms = f"depths, normals over {width} scene units (weight {weight:g}) and the silhouette"
+        return f"The loss has {terms}, as the paper's Fig. 5; at a point, normals of a ReLU network would move no code."
     return "The loss has depths and the silhouette; the paper's Fig. 5 has normals as well."
 
 
