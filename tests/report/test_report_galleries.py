@@ -193,6 +193,12 @@ def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
     assert "1 of 2 runs did not end ok" in result.caption and "by DIST, RGB" in told(result)
 
 
+def test_without_any_picture_the_page_says_so(tmp_path):
+    rendered(tmp_path, "DIST, RGB", "rgb_dist", size=0)
+    result = made(tmp_path, rerendering)
+    assert notes(result.figure) == ["no picture"] and "no images.npz" in told(result)
+
+
 def test_a_tile_is_the_part_in_the_window_with_its_pixels_as_they_are():
     picture = np.arange(16.0).reshape(4, 4, 1).repeat(3, axis=2)
     found = tile(picture, (0.25, 0.5, 0.5))

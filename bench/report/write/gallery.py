@@ -129,7 +129,7 @@ def draw(blocks: Sequence[Block], across: int) -> Figure:
         blocks: of as many columns each.
         across: pictures side by side in a cell.
     """
-    columns = max([1, *(len(block.columns) for block in blocks)])  # without pictures there are no columns
+    columns = max([1, *(len(block.columns) for block in blocks)])
     inches = min((style.WIDTH - NAMES) / (columns * across), LARGEST)  # of a picture
     wide = max(round(inches * across * LETTERS_PER_INCH), 6)
     blocks = [replace(block, columns=[_wrapped(name, wide) for name in block.columns]) for block in blocks]
