@@ -69,7 +69,9 @@
     fill(opened, parts, curve, run === undefined ? null : failure(run));
     curves().then((panels) => {
       const panel = panels.find((each) => each.axis === axis.axis);
-      if (panel) fill(curve, bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}));
+      const looks = new Map(Object.entries(data.looks || {}));
+      const series = panel && panel.series.map((each) => ({...each, ...looks.get(each.name)}));
+      if (panel) fill(curve, bench.chart({panels: [{...panel, series}]}, {label: `Share of successes on ${axis.title}`, focus: row}));
     }, () => {});
     if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
   }
