@@ -18,15 +18,44 @@
 
   function header(about) {
     const runs = bench.runs;
-    const statuses = runs.count ? runs.values("status").map((status, code) => [status, runs.codes("status").filter((each) => each === code).length]) : [];
-    fill(document.getElementById("counts"), bench.format.plural(runs.count, "run"), statuses.map(([status, n]) =>
-      element("a.counted", {href: bench.address.to(["runs"], {task: "all", view: "runs", status})}, n.toLocaleString("en"), " ", bench.badge(status))));
+    const statuses = runs.count
+      ? runs
+          .values("status")
+          .map((status, code) => [status, runs.codes("status").filter((each) => each === code).length])
+      : [];
+    fill(
+      document.getElementById("counts"),
+      bench.format.plural(runs.count, "run"),
+      statuses.map(([status, n]) =>
+        element(
+          "a.counted",
+          {href: bench.address.to(["runs"], {task: "all", view: "runs", status})},
+          n.toLocaleString("en"),
+          " ",
+          bench.badge(status),
+        ),
+      ),
+    );
     document.getElementById("tools").append(bench.themeButton());
     const problems = about.problems;
     if (problems.length)
-      fill(document.getElementById("problems"), element("details.note.error", {id: "not-read", open: problems.length < 4},
-        element("summary", null, `Not read: ${bench.format.plural(problems.length, "run folder")}. Nothing below includes ${problems.length > 1 ? "them" : "it"}.`),
-        element("ul", null, problems.map((problem) => element("li", null, problem)))));
+      fill(
+        document.getElementById("problems"),
+        element(
+          "details.note.error",
+          {id: "not-read", open: problems.length < 4},
+          element(
+            "summary",
+            null,
+            `Not read: ${bench.format.plural(problems.length, "run folder")}. Nothing below includes ${problems.length > 1 ? "them" : "it"}.`,
+          ),
+          element(
+            "ul",
+            null,
+            problems.map((problem) => element("li", null, problem)),
+          ),
+        ),
+      );
     if (bench.oneFile) document.getElementById("problems").append(element("p.note", null, about.left));
   }
 

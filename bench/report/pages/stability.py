@@ -260,8 +260,11 @@ def _cells(data: pd.DataFrame) -> dict[str, Any]:
         for a, g, u in data[["axis", "group", "unit"]].drop_duplicates().itertuples(index=False)
     ]
     rows = list(dict.fromkeys(data["row"]))
+    looks = {row: style.look(preset) for row, preset in zip(data["row"], data["renderer"], strict=True)}
     found = {(r["axis"], r["row"]): _cell(r) for _, r in data.iterrows()}
-    return {"axes": axes, "rows": rows, "cells": [[found.get((axis["axis"], row)) for row in rows] for axis in axes]}
+    cells = [[found.get((axis["axis"], row)) for row in rows] for axis in axes]
+    shown = {row: {"colour": look.colour, "symbol": look.marker} for row, look in looks.items()}
+    return {"axes": axes, "rows": rows, "looks": shown, "cells": cells}
 
 
 def _cell(run: pd.Series) -> dict[str, Any]:

@@ -23,7 +23,15 @@ SCRIPTS = (  # in the order in which they need each other
     *("base/dom.js", "base/format.js", "base/store.js", "base/address.js", "base/runs.js"),
     *("parts/theme.js", "parts/status.js", "parts/filter.js", "parts/table.js", "parts/picks.js"),
     *("parts/chart.js", "parts/curve.js", "parts/mesh.js"),
-    *("views/overview.js", "views/board.js", "views/paper.js", "views/atlas.js", "views/run.js", "views/compare.js"),
+    *(
+        "views/overview.js",
+        "views/columns.js",
+        "views/board.js",
+        "views/paper.js",
+        "views/atlas.js",
+        "views/run.js",
+        "views/compare.js",
+    ),
 )
 START = "app.js"  # after the data
 LISTS = ("about", "papers", "runs")  # the data that are loaded at the start

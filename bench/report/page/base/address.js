@@ -5,7 +5,10 @@
   /* {path: ["run", "folder"], query: {sort: "loop"}} */
   function read() {
     const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
-    return {path: path.split("/").filter(Boolean).map(decode), query: Object.fromEntries(new URLSearchParams(query || ""))};
+    return {
+      path: path.split("/").filter(Boolean).map(decode),
+      query: Object.fromEntries(new URLSearchParams(query || "")),
+    };
   }
 
   function decode(part) {

@@ -31,7 +31,11 @@
       const address = safeAddress(value);
       if (address !== null) made.setAttribute(name, address);
     } else if (name === "checked" || name === "value" || name === "disabled" || name === "open") made[name] = value;
-    else if (/^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|for|loading|scope|colspan|rowspan|width|height|tabindex|style|placeholder|download|autocomplete|name|lang)$/.test(name))
+    else if (
+      /^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|for|loading|scope|colspan|rowspan|width|height|tabindex|style|placeholder|download|autocomplete|name|lang)$/.test(
+        name,
+      )
+    )
       made.setAttribute(name, value === true ? "" : String(value));
     else throw new Error(`dom.js knows no property ${name}`);
   }
@@ -52,24 +56,30 @@
 
   /* Text in which the words between asterisks are strong. */
   function emphasised(text) {
-    return String(text).split("*").map((part, place) => (place % 2 ? element("strong", null, part) : part));
+    return String(text)
+      .split("*")
+      .map((part, place) => (place % 2 ? element("strong", null, part) : part));
   }
 
   /* A button that copies a text. */
   function copyButton(text, label) {
-    return element("button.small", {
-      type: "button",
-      "aria-label": label,
-      click: (event) => {
-        const said = (word) => (event.target.textContent = word);
-        const area = element("textarea.hidden", {value: text, "aria-hidden": "true"});
-        document.body.append(area);
-        area.select();
-        said(document.execCommand("copy") ? "Copied" : "Press Ctrl+C");
-        area.remove();
-        setTimeout(() => said("Copy"), 1500);
+    return element(
+      "button.small",
+      {
+        type: "button",
+        "aria-label": label,
+        click: (event) => {
+          const said = (word) => (event.target.textContent = word);
+          const area = element("textarea.hidden", {value: text, "aria-hidden": "true"});
+          document.body.append(area);
+          area.select();
+          said(document.execCommand("copy") ? "Copied" : "Press Ctrl+C");
+          area.remove();
+          setTimeout(() => said("Copy"), 1500);
+        },
       },
-    }, "Copy");
+      "Copy",
+    );
   }
 
   bench.dom = {element, fill, emphasised, copyButton, safeAddress};

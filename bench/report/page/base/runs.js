@@ -21,7 +21,9 @@
     function words(place) {
       if (found[place] === undefined) {
         const parts = ["name", "task", "scene", "family", "renderer", "status", "experiment", "machine"];
-        found[place] = [...parts.map((part) => text(place, part)), data.folder[place], data.reason[place]].join(" ").toLowerCase();
+        found[place] = [...parts.map((part) => text(place, part)), data.folder[place], data.reason[place]]
+          .join(" ")
+          .toLowerCase();
       }
       return found[place];
     }

@@ -20,7 +20,8 @@
   function load(kind, key) {
     const name = `${kind}/${key}`;
     if (received.has(name)) return Promise.resolve(received.get(name));
-    if (!/^[a-z]+\/[A-Za-z0-9_-]+$/.test(name) || bench.oneFile) return Promise.reject(new Error("It is not in this file."));
+    if (!/^[a-z]+\/[A-Za-z0-9_-]+$/.test(name) || bench.oneFile)
+      return Promise.reject(new Error("It is not in this file."));
     if (!waiting.has(name)) {
       const waits = {};
       waits.promise = new Promise((resolve, reject) => Object.assign(waits, {resolve, reject}));
@@ -46,7 +47,8 @@
   /* A promise of Plotly, which lies beside the page and is loaded when a chart first needs it. */
   function plotly() {
     if (window.Plotly) return Promise.resolve(window.Plotly);
-    if (bench.oneFile) return Promise.reject(new Error("Charts that answer the mouse are left out of a page in one file."));
+    if (bench.oneFile)
+      return Promise.reject(new Error("Charts that answer the mouse are left out of a page in one file."));
     library = library || script("page/plotly.min.js").then(() => window.Plotly);
     return library;
   }

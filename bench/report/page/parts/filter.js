@@ -2,7 +2,13 @@
 (function (bench) {
   "use strict";
 
-  const FILTERS = {family: "Shapes", renderer: "Renderer", status: "Status", machine: "Machine", experiment: "Experiment"};
+  const FILTERS = {
+    family: "Shapes",
+    renderer: "Renderer",
+    status: "Status",
+    machine: "Machine",
+    experiment: "Experiment",
+  };
   const LINKED = ["name"]; // set by links alone, and shown as a word that can be taken away
   const COLUMNS = [...Object.keys(FILTERS), ...LINKED];
 
@@ -10,7 +16,8 @@
   function choose(runs, query) {
     const wanted = [];
     for (const column of ["task", ...COLUMNS])
-      if (query[column]) wanted.push({column, codes: runs.codes(column), code: runs.values(column).indexOf(query[column])});
+      if (query[column])
+        wanted.push({column, codes: runs.codes(column), code: runs.values(column).indexOf(query[column])});
     const counts = Object.fromEntries(Object.keys(FILTERS).map((column) => [column, new Map()]));
     const words = (query.q || "").toLowerCase().split(/\s+/).filter(Boolean);
     const places = [];
@@ -50,7 +57,9 @@
     if (!values.length) return null;
     const sorted = Float64Array.from(values).sort();
     const half = sorted.length >> 1;
-    return sorted.length % 2 || sorted[half - 1] === sorted[half] ? sorted[half] : (sorted[half - 1] + sorted[half]) / 2;
+    return sorted.length % 2 || sorted[half - 1] === sorted[half]
+      ? sorted[half]
+      : (sorted[half - 1] + sorted[half]) / 2;
   }
 
   /* A row per name: its runs, what they cover, its failures, and medians in which a run that failed is the worst. */
@@ -80,8 +89,11 @@
     const worst = better === "higher" ? -Infinity : Infinity;
     const known = places.map((place) => (runs.text(place, "status") === "ok" ? after[place] : null));
     const missing = (value) => value === null || Number.isNaN(value);
-    if (known.every(missing)) return places.some((place) => runs.text(place, "status") === "ok") || !better ? null : worst;
-    return median(better ? known.map((value) => (missing(value) ? worst : value)) : known.filter((value) => !missing(value)));
+    if (known.every(missing))
+      return places.some((place) => runs.text(place, "status") === "ok") || !better ? null : worst;
+    return median(
+      better ? known.map((value) => (missing(value) ? worst : value)) : known.filter((value) => !missing(value)),
+    );
   }
 
   bench.filter = {FILTERS, LINKED, choose, sort, median, methods};

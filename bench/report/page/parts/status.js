@@ -18,7 +18,12 @@
 
   function badge(status) {
     const [tone, mark] = KINDS[status] || ["bad", "✕"];
-    return element(`span.status.${tone}`, null, element("span.mark", {"aria-hidden": "true"}, mark), status.replace("_", " "));
+    return element(
+      `span.status.${tone}`,
+      null,
+      element("span.mark", {"aria-hidden": "true"}, mark),
+      status.replace("_", " "),
+    );
   }
 
   bench.badge = badge;

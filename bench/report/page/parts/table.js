@@ -8,27 +8,51 @@
   /* A table of columns {key, label, unit, cell, kind, sortable} over items.
      `order` is {key, down}; `sorted` is called with the key of a heading that is pressed. */
   function table(columns, items, {order, sorted, caption, rowLabel} = {}) {
-    const head = element("tr", null, columns.map((column) => heading(column, order, sorted)));
-    const rows = items.map((item) => element("tr", {}, columns.map((column) => cell(column, item))));
-    return element("table.list", {keydown: follow},
-      element("caption.unseen", null, caption || ""), element("thead", null, head), element("tbody", null, rows));
+    const head = element(
+      "tr",
+      null,
+      columns.map((column) => heading(column, order, sorted)),
+    );
+    const rows = items.map((item) =>
+      element(
+        "tr",
+        {},
+        columns.map((column) => cell(column, item)),
+      ),
+    );
+    return element(
+      "table.list",
+      {keydown: follow},
+      element("caption.unseen", null, caption || ""),
+      element("thead", null, head),
+      element("tbody", null, rows),
+    );
   }
 
   function heading(column, order, sorted) {
     const own = order && order.key === column.key;
     const direction = own ? (order.down ? "descending" : "ascending") : null;
-    const shown = column.sortable && sorted
-      ? element("button.sort", {type: "button", click: () => sorted(column.key), "data-key": column.key},
-          column.label, element("span.arrow", {"aria-hidden": "true"}, own ? (order.down ? "▼" : "▲") : ""),
-          column.unit ? element("small", null, column.unit) : null)
-      : [column.label, column.unit ? element("small", null, column.unit) : null];
+    const shown =
+      column.sortable && sorted
+        ? element(
+            "button.sort",
+            {type: "button", click: () => sorted(column.key), "data-key": column.key},
+            column.label,
+            element("span.arrow", {"aria-hidden": "true"}, own ? (order.down ? "▼" : "▲") : ""),
+            column.unit ? element("small", null, column.unit) : null,
+          )
+        : [column.label, column.unit ? element("small", null, column.unit) : null];
     return element(`th.${column.kind || "words"}`, {scope: "col", "aria-sort": direction}, shown);
   }
 
   function cell(column, item) {
     const content = column.cell(item);
     const kind = column.head ? "th" : "td";
-    return element(`${kind}.${column.kind || "words"}`, {"data-label": column.label, scope: column.head ? "row" : null}, content);
+    return element(
+      `${kind}.${column.kind || "words"}`,
+      {"data-label": column.label, scope: column.head ? "row" : null},
+      content,
+    );
   }
 
   /* Up and down go to the link of the row above or below. */
@@ -51,7 +75,11 @@
     const home = element("div.wide", {tabindex: 0, role: "region", "aria-label": "Table"});
     let order = null;
     const columns = header.map((label, place) => ({
-      key: String(place), label, sortable: true, head: place === 0, kind: numeric[place] ? "number" : longest[place] <= LONGEST_LINE ? "words.line" : "words",
+      key: String(place),
+      label,
+      sortable: true,
+      head: place === 0,
+      kind: numeric[place] ? "number" : longest[place] <= LONGEST_LINE ? "words.line" : "words",
       cell: (row) => (link && link(row, place)) || row[place],
     }));
     const show = () => {
@@ -59,7 +87,14 @@
       const get = (row) => (numeric[place] ? leading(rows[row][place]) : (rows[row][place] || "").toLowerCase());
       const places = rows.map((_, row) => row);
       const shown = order ? bench.filter.sort(places, get, order.down) : places;
-      fill(home, table(columns, shown.map((row) => rows[row]), {order, sorted: press}));
+      fill(
+        home,
+        table(
+          columns,
+          shown.map((row) => rows[row]),
+          {order, sorted: press},
+        ),
+      );
     };
     const press = (key) => {
       order = order && order.key === key ? (order.down ? null : {key, down: true}) : {key, down: false};

@@ -27,18 +27,27 @@
     const next = () => Object.keys(MODES)[(Object.keys(MODES).indexOf(mode) + 1) % 3];
     const label = () => `Colours: ${MODES[mode].toLowerCase()}. Change to ${MODES[next()].toLowerCase()}.`;
     const mark = () => ({auto: "◐", light: "☀", dark: "☾"})[mode];
-    return bench.dom.element("button.theme", {type: "button", "aria-label": label(), title: label(), click: (event) => {
-      mode = next();
-      try {
-        localStorage.setItem(KEY, mode);
-      } catch {
-        // kept until the page is closed
-      }
-      event.currentTarget.textContent = mark();
-      event.currentTarget.setAttribute("aria-label", label());
-      event.currentTarget.title = label();
-      apply();
-    }}, mark());
+    return bench.dom.element(
+      "button.theme",
+      {
+        type: "button",
+        "aria-label": label(),
+        title: label(),
+        click: (event) => {
+          mode = next();
+          try {
+            localStorage.setItem(KEY, mode);
+          } catch {
+            // kept until the page is closed
+          }
+          event.currentTarget.textContent = mark();
+          event.currentTarget.setAttribute("aria-label", label());
+          event.currentTarget.title = label();
+          apply();
+        },
+      },
+      mark(),
+    );
   }
 
   /* A colour of the figures; one that is too dark for a dark page becomes lighter. */

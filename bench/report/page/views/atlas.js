@@ -6,18 +6,49 @@
   const SHADES = ["#8c2d04", "#cc6a1a", "#f0b46a", "#f3ead8", "#a9cfe3", "#4a90c2", "#0b4f8a"]; // from at once to never
 
   function atlas(data) {
-    const opened = element("div.opened", {"aria-live": "polite"}, element("p.soft", null, "Choose a cell: its curve and its first failure open here."));
-    const head = element("tr", null, element("th.words", {scope: "col"}, "Axis"), data.rows.map((row) => element("th.turned", {scope: "col"}, element("span", null, row))));
+    const opened = element(
+      "div.opened",
+      {"aria-live": "polite"},
+      element("p.soft", null, "Choose a cell: its curve and its first failure open here."),
+    );
+    const head = element(
+      "tr",
+      null,
+      element("th.words", {scope: "col"}, "Axis"),
+      data.rows.map((row) => element("th.turned", {scope: "col"}, element("span", null, row))),
+    );
     const lines = data.axes.flatMap((axis, line) => {
-      const group = line === 0 || data.axes[line - 1].group !== axis.group
-        ? [element("tr.group", null, element("th.words", {colspan: data.rows.length + 1, scope: "rowgroup"}, axis.group))] : [];
-      return [...group, element("tr", null, element("th.words", {scope: "row"}, axis.title, element("small", null, axis.unit)),
-        data.rows.map((row, place) => element("td.shade", null, cell(data, line, place, opened))))];
+      const group =
+        line === 0 || data.axes[line - 1].group !== axis.group
+          ? [
+              element(
+                "tr.group",
+                null,
+                element("th.words", {colspan: data.rows.length + 1, scope: "rowgroup"}, axis.group),
+              ),
+            ]
+          : [];
+      return [
+        ...group,
+        element(
+          "tr",
+          null,
+          element("th.words", {scope: "row"}, axis.title, element("small", null, axis.unit)),
+          data.rows.map((row, place) => element("td.shade", null, cell(data, line, place, opened))),
+        ),
+      ];
     });
-    return element("div.atlas", null,
+    return element(
+      "div.atlas",
+      null,
       element("div.key", null, "breaks at the mildest severity", SHADES.map(swatch), "does not break at the severest"),
-      element("div.wide", {tabindex: 0, role: "region", "aria-label": "Breakdowns by axis and renderer"},
-        element("table.heat", null, element("thead", null, head), element("tbody", {keydown: follow}, lines))), opened);
+      element(
+        "div.wide",
+        {tabindex: 0, role: "region", "aria-label": "Breakdowns by axis and renderer"},
+        element("table.heat", null, element("thead", null, head), element("tbody", {keydown: follow}, lines)),
+      ),
+      opened,
+    );
   }
 
   function swatch(colour) {
@@ -29,11 +60,19 @@
   function cell(data, line, place, opened) {
     const found = data.cells[line][place];
     if (!found) return element("span.soft", null, "");
-    const button = element("button.cell", {type: "button", "aria-label": `${data.axes[line].title}, ${data.rows[place]}: ${found.full}`, click: (event) => {
-      for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
-      event.currentTarget.setAttribute("aria-pressed", "true");
-      open(data, line, place, opened);
-    }}, found.status === "unsupported" ? "–" : found.short);
+    const button = element(
+      "button.cell",
+      {
+        type: "button",
+        "aria-label": `${data.axes[line].title}, ${data.rows[place]}: ${found.full}`,
+        click: (event) => {
+          for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
+          event.currentTarget.setAttribute("aria-pressed", "true");
+          open(data, line, place, opened);
+        },
+      },
+      found.status === "unsupported" ? "–" : found.short,
+    );
     if (found.shade !== null) {
       const step = Math.min(SHADES.length - 1, Math.floor(found.shade * SHADES.length));
       button.style.background = SHADES[step];
@@ -62,31 +101,63 @@
   function open(data, line, place, opened) {
     const [axis, row, found] = [data.axes[line], data.rows[place], data.cells[line][place]];
     const run = bench.runs.place(found.folder);
-    const parts = [element("h2", null, `${axis.title}, ${row}`), element("p", null, `Breaks: ${found.full}${found.status === "ok" ? ` ${axis.unit}` : ""}. `,
-      found.reason || "", run === undefined ? element("span.soft", null, " Its run is not among these results.")
-        : element("a", {href: bench.runs.link(run)}, "The run"))];
+    const parts = [
+      element("h2", null, `${axis.title}, ${row}`),
+      element(
+        "p",
+        null,
+        `Breaks: ${found.full}${found.status === "ok" ? ` ${axis.unit}` : ""}. `,
+        found.reason || "",
+        run === undefined
+          ? element("span.soft", null, " Its run is not among these results.")
+          : element("a", {href: bench.runs.link(run)}, "The run"),
+      ),
+    ];
     const curve = element("div");
     fill(opened, parts, curve, run === undefined ? null : failure(run));
-    curves().then((panels) => {
-      const panel = panels.find((each) => each.axis === axis.axis);
-      if (panel) fill(curve, bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}));
-    }, () => {});
+    curves().then(
+      (panels) => {
+        const panel = panels.find((each) => each.axis === axis.axis);
+        const looks = new Map(Object.entries(data.looks || {}));
+        const series = panel && panel.series.map((each) => ({...each, ...looks.get(each.name)}));
+        if (panel)
+          fill(
+            curve,
+            bench.chart({panels: [{...panel, series}]}, {label: `Share of successes on ${axis.title}`, focus: row}),
+          );
+      },
+      () => {},
+    );
     if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
   }
 
   /* The curves of all axes, which stand in a page of their own. */
   function curves() {
     const paper = bench.store.have("list", "papers").find(({name}) => name === "stability_curves");
-    return paper ? bench.store.load("paper", paper.key).then((data) => (data.chart ? data.chart.panels : [])) : Promise.resolve([]);
+    return paper
+      ? bench.store.load("paper", paper.key).then((data) => (data.chart ? data.chart.panels : []))
+      : Promise.resolve([]);
   }
 
   function failure(run) {
     const home = element("div");
-    bench.store.load("run", bench.runs.key(run)).then((detail) => {
-      const picture = detail.pictures.find(([name]) => name === "failure.png");
-      fill(home, picture ? element("figure", null, element("img.figure", {src: picture[1], alt: picture[2]}), element("figcaption", null, picture[2]))
-        : element("p.soft", null, "This run has no picture of a failure."));
-    }, () => {});
+    bench.store.load("run", bench.runs.key(run)).then(
+      (detail) => {
+        const picture = detail.pictures.find(([name]) => name === "failure.png");
+        fill(
+          home,
+          picture
+            ? element(
+                "figure",
+                null,
+                element("img.figure", {src: picture[1], alt: picture[2]}),
+                element("figcaption", null, picture[2]),
+              )
+            : element("p.soft", null, "This run has no picture of a failure."),
+        );
+      },
+      () => {},
+    );
     return home;
   }
 

@@ -3,7 +3,7 @@
   "use strict";
 
   const {element, fill} = bench.dom;
-  const {number, count, seconds, date, plural, label, MISSING} = bench.format;
+  const {plural} = bench.format;
   const ON_A_PAGE = 100;
   const MOST_METRICS = 6;
 
@@ -12,11 +12,15 @@
     const runs = bench.runs;
     const state = {task: runs.tasks[0].task, view: "methods", ...query};
     if (query.task === "all") state.task = "";
-    const parts = {tasks: element("nav.tabs", {"aria-label": "Tasks"}), controls: element("div.controls"), found: element("div")};
+    const parts = {
+      tasks: element("nav.tabs", {"aria-label": "Tasks"}),
+      controls: element("div.controls"),
+      found: element("div"),
+    };
     fill(home, element("h2", {id: "board"}, "Leaderboards"), parts.tasks, parts.controls, parts.found);
     const change = (changes) => {
       Object.assign(state, {page: ""}, changes);
-      bench.address.keep(["runs"], asked(state));
+      bench.address.keep(["runs"], bench.columns.asked(state));
       show();
     };
     const show = () => {
@@ -28,40 +32,80 @@
     show();
   }
 
-  /* What of the state stands in the address: all but what is so without it. */
-  function asked(state) {
-    return {...state, task: state.task || "all", view: state.view === "methods" ? "" : state.view};
-  }
-
   function tabs(state) {
     const runs = bench.runs;
-    const entries = [...runs.tasks.map(({task, count: n}) => [task, task.replace("_", " "), n]), ["", "all", runs.count]];
-    return entries.map(([task, name, n]) => element("a", {
-      href: bench.address.to(["runs"], {task: task || "all", view: task ? "" : "runs"}),
-      "aria-current": task === state.task ? "page" : null,
-    }, name, element("small", null, n.toLocaleString("en"))));
+    const entries = [
+      ...runs.tasks.map(({task, count: n}) => [task, task.replace("_", " "), n]),
+      ["", "all", runs.count],
+    ];
+    return entries.map(([task, name, n]) =>
+      element(
+        "a",
+        {
+          href: bench.address.to(["runs"], {task: task || "all", view: task ? "" : "runs"}),
+          "aria-current": task === state.task ? "page" : null,
+        },
+        name,
+        element("small", null, n.toLocaleString("en")),
+      ),
+    );
   }
 
   /* Controls are made once; what they offer follows from the other filters. */
   function controls(home, state, chosen, change) {
     if (!home.childElementCount) {
-      const search = element("input", {type: "search", placeholder: "Search names, scenes, reasons", "aria-label": "Search",
-        value: state.q || "", input: (event) => change({q: event.target.value})});
-      const selects = Object.entries(bench.filter.FILTERS).map(([column, name]) => element("label.pick", null, name,
-        element("select", {"data-column": column, "aria-label": name, change: (event) => change({[column]: event.target.value})})));
-      const views = ["methods", "runs"].map((view) => element("button", {type: "button", "data-view": view,
-        click: () => change({view, sort: "", order: ""})}, view === "methods" ? "Methods" : "Runs"));
-      const sorts = element("label.pick.narrow", null, "Sort by", element("select", {"data-column": "sort", "aria-label": "Sort by",
-        change: (event) => change({sort: event.target.value, order: ""})}));
-      home.append(element("div.switch", {role: "group", "aria-label": "What a row is"}, views), search,
-        element("div.picks", null, selects, sorts), element("div.chips"));
+      const search = element("input", {
+        type: "search",
+        placeholder: "Search names, scenes, reasons",
+        "aria-label": "Search",
+        value: state.q || "",
+        input: (event) => change({q: event.target.value}),
+      });
+      const selects = Object.entries(bench.filter.FILTERS).map(([column, name]) =>
+        element(
+          "label.pick",
+          null,
+          name,
+          element("select", {
+            "data-column": column,
+            "aria-label": name,
+            change: (event) => change({[column]: event.target.value}),
+          }),
+        ),
+      );
+      const views = ["methods", "runs"].map((view) =>
+        element(
+          "button",
+          {type: "button", "data-view": view, click: () => change({view, sort: "", order: ""})},
+          view === "methods" ? "Methods" : "Runs",
+        ),
+      );
+      const sorts = element(
+        "label.pick.narrow",
+        null,
+        "Sort by",
+        element("select", {
+          "data-column": "sort",
+          "aria-label": "Sort by",
+          change: (event) => change({sort: event.target.value, order: ""}),
+        }),
+      );
+      home.append(
+        element("div.switch", {role: "group", "aria-label": "What a row is"}, views),
+        search,
+        element("div.picks", null, selects, sorts),
+        element("div.chips"),
+      );
     }
     for (const button of home.querySelectorAll("[data-view]"))
       button.setAttribute("aria-pressed", String(button.dataset.view === state.view));
     for (const column of Object.keys(bench.filter.FILTERS)) offer(home, column, state, chosen.counts[column]);
     const sort = home.querySelector('[data-column="sort"]');
     const options = columnsOf(state, chosen).filter((column) => column.sortable);
-    fill(sort, options.map((column) => element("option", {value: column.key}, column.label)));
+    fill(
+      sort,
+      options.map((column) => element("option", {value: column.key}, column.label)),
+    );
     sort.value = orderOf(state, options).key;
     chips(home.querySelector(".chips"), state, change);
   }
@@ -70,7 +114,9 @@
     const select = home.querySelector(`[data-column="${column}"]`);
     const values = bench.runs.values(column);
     const known = [...counts].filter(([code]) => values[code] !== "").sort((a, b) => b[1] - a[1]);
-    const options = known.map(([code, n]) => element("option", {value: values[code]}, `${values[code]} (${n.toLocaleString("en")})`));
+    const options = known.map(([code, n]) =>
+      element("option", {value: values[code]}, `${values[code]} (${n.toLocaleString("en")})`),
+    );
     if (state[column] && !known.some(([code]) => values[code] === state[column]))
       options.push(element("option", {value: state[column]}, `${state[column]} (0)`));
     fill(select, element("option", {value: ""}, "all"), options);
@@ -82,9 +128,18 @@
   function chips(home, state, change) {
     const set = [...bench.filter.LINKED, ...Object.keys(bench.filter.FILTERS), "q"].filter((column) => state[column]);
     const clear = Object.fromEntries(set.map((column) => [column, ""]));
-    fill(home, set.map((column) => element("button.chip", {type: "button", "aria-label": `Remove the filter ${state[column]}`,
-      click: () => change({[column]: ""})}, state[column], element("span", {"aria-hidden": "true"}, " ×"))),
-    set.length > 1 ? element("button.chip.plain", {type: "button", click: () => change(clear)}, "Clear all") : null);
+    fill(
+      home,
+      set.map((column) =>
+        element(
+          "button.chip",
+          {type: "button", "aria-label": `Remove the filter ${state[column]}`, click: () => change({[column]: ""})},
+          state[column],
+          element("span", {"aria-hidden": "true"}, " ×"),
+        ),
+      ),
+      set.length > 1 ? element("button.chip.plain", {type: "button", click: () => change(clear)}, "Clear all") : null,
+    );
     const search = home.parentElement.querySelector("input[type=search]");
     if (search.value !== (state.q || "")) search.value = state.q || "";
   }
@@ -94,7 +149,8 @@
     const {places} = chosen;
     if (!places.length) return element("p.empty", null, "No run fits. Take a filter away.");
     const failed = places.filter((place) => runs.text(place, "status") !== "ok").length;
-    const said = `${plural(places.length, "run")}${places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : ""}, ` +
+    const said =
+      `${plural(places.length, "run")}${places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : ""}, ` +
       (failed ? `${failed.toLocaleString("en")} did not end ok` : "all ended ok");
     const columns = columnsOf(state, chosen);
     const order = orderOf(state, columns);
@@ -122,44 +178,30 @@
     const task = bench.runs.tasks.find((each) => each.task === state.task);
     const known = (key) => chosen.places.some((place) => bench.runs.metrics[key].after[place] !== null);
     const metrics = task ? task.metrics.filter(known).slice(0, MOST_METRICS) : [];
-    return state.view === "methods" ? methodColumns(state, metrics) : runColumns(state, metrics);
+    return state.view === "methods" ? bench.columns.methods(state, metrics) : bench.columns.runs(state, metrics);
   }
 
   function ofMethods(chosen, columns, order) {
     const metrics = columns.filter(({metric}) => metric).map(({key}) => key);
     const {rows, cells} = bench.filter.methods(bench.runs, chosen.places, metrics);
     const get = columns.find(({key}) => key === order.key).get;
-    const places = bench.filter.sort(rows.map((_, place) => place), (place) => get(rows[place]), order.down);
+    const places = bench.filter.sort(
+      rows.map((_, place) => place),
+      (place) => get(rows[place]),
+      order.down,
+    );
     const sorted = places.map((place) => rows[place]);
     const whole = sorted.filter((row) => row.complete);
     const ranked = columns.some(({first}) => first);
     whole.forEach((row, place) => (row.rank = ranked ? place + 1 : null));
     const part = sorted.length - whole.length;
     const covers = cells > 1 ? `; ${plural(cells, "scene")} (shape, view, seed and what is given)` : "";
-    const unlike = part && sorted.length > 1 ? `. Medians of ${plural(part, "method")} are over other scenes: only methods with all ` +
-      `${cells.toLocaleString("en")} have a rank` : "";
+    const unlike =
+      part && sorted.length > 1
+        ? `. Medians of ${plural(part, "method")} are over other scenes: only methods with all ` +
+          `${cells.toLocaleString("en")} have a rank`
+        : "";
     return {items: sorted, pages: 1, said: `${covers}${unlike}.`};
-  }
-
-  function methodColumns(state, metrics) {
-    const linked = (row) => bench.address.to(["runs"], {...asked(state), view: "runs", name: row.name, sort: "", order: "", page: ""});
-    return [
-      {key: "rank", label: "#", kind: "rank", cell: (row) => row.rank || element("span.soft", null, MISSING)},
-      {key: "name", label: "Method", head: true, sortable: true, get: (row) => row.name.toLowerCase(),
-        cell: (row) => element("a", {href: linked(row)}, row.name)},
-      ...metrics.map((key, place) => methodMetric(key, place)),
-      {key: "failed", label: "Failed", kind: "number", sortable: true, get: (row) => row.failed / row.places.length,
-        cell: (row) => element(`span${row.failed ? ".failed" : ".soft"}`, null, `${row.failed} of ${row.places.length}`)},
-      {key: "covered", label: "Scenes", kind: "number", sortable: true, down: true, get: (row) => row.covered, cell: (row) => row.covered},
-      ...costs((row, key) => row[key], "median of ok runs", metrics.length === 0),
-    ];
-  }
-
-  function methodMetric(key, place) {
-    const metric = bench.runs.metrics[key];
-    const shown = (value) => (Math.abs(value) === Infinity && value !== null ? element("span.failed", null, "failed") : number(value, metric.factor));
-    return {key, label: label(metric.label), unit: "median", kind: "number", metric: true, sortable: true, first: place === 0 && metric.better !== "",
-      down: metric.better === "higher", get: (row) => row[key], cell: (row) => shown(row[key])};
   }
 
   function ofRuns(state, places, columns, order) {
@@ -168,58 +210,6 @@
     const pages = Math.ceil(sorted.length / ON_A_PAGE);
     const page = Math.min(Math.max(1, Number(state.page) || 1), pages);
     return {items: sorted.slice((page - 1) * ON_A_PAGE, page * ON_A_PAGE), pages, said: "."};
-  }
-
-  function runColumns(state, metrics) {
-    const runs = bench.runs;
-    return [
-      {key: "pick", label: "Compare", kind: "pick", cell: (place) => bench.picks.box(place)},
-      {key: "picture", label: "Picture", kind: "thumb", cell: thumb},
-      {key: "name", label: "Run", head: true, sortable: true, get: (place) => runs.text(place, "name").toLowerCase(), cell: named},
-      {key: "status", label: "Status", sortable: true, get: (place) => runs.text(place, "status"), cell: status},
-      ...metrics.map((key, place) => runMetric(key, place)),
-      ...costs((place, key) => runs.number(place, key), "total below", false),
-      {key: "started", label: "Started", unit: "UTC", kind: "number", sortable: true, down: true, first: !metrics.length,
-        get: (place) => runs.number(place, "started"), cell: (place) => element("span.soft", null, date(runs.number(place, "started")))},
-    ];
-  }
-
-  function costs(get, unit, first) {
-    return [
-      {key: "loop", label: "Loop", unit, kind: "number", sortable: true, first, get: (item) => get(item, "loop"),
-        cell: (item) => [seconds(get(item, "loop")), element("small", null, seconds(get(item, "total")))]},
-      {key: "values", label: "Field values", kind: "number", sortable: true, get: (item) => get(item, "values"),
-        cell: (item) => count(get(item, "values"))},
-    ];
-  }
-
-  function runMetric(key, place) {
-    const metric = bench.runs.metrics[key];
-    const ok = (run) => (bench.runs.text(run, "status") === "ok" ? metric.after[run] : null);
-    const start = (run) => (metric.before && metric.before[run] !== null ? element("small", null, `from ${number(metric.before[run], metric.factor)}`) : null);
-    return {key, label: label(metric.label), unit: metric.before ? "start below" : "", kind: "number", sortable: true, first: place === 0,
-      down: metric.better === "higher", get: ok, cell: (run) => [number(metric.after[run], metric.factor), start(run)]};
-  }
-
-  function thumb(place) {
-    const detail = bench.oneFile && bench.store.have("run", bench.runs.key(place));
-    const held = bench.oneFile ? detail && detail.pictures.length && detail.pictures[0][1] : bench.runs.picture(place);
-    return held ? element("a", {href: bench.runs.link(place), tabindex: "-1", "aria-hidden": "true"},
-      element("img", {src: held, alt: "", loading: "lazy", width: 60, height: 48})) : element("span.soft", {"aria-hidden": "true"}, MISSING);
-  }
-
-  function named(place) {
-    const runs = bench.runs;
-    const about = [runs.text(place, "scene"), `seed ${runs.number(place, "seed") ?? MISSING}`, runs.text(place, "experiment")];
-    const task = bench.address.read().query.task === "all" ? runs.text(place, "task") : "";
-    return [element("a", {href: runs.link(place)}, runs.text(place, "name")),
-      element("small", null, [task, ...about].filter(Boolean).join(" · ")),
-      runs.reason(place) ? element("small.reason", {title: runs.reason(place)}, runs.reason(place)) : null];
-  }
-
-  function status(place) {
-    const runs = bench.runs;
-    return [bench.badge(runs.text(place, "status")), runs.reused(place) ? element("small", null, "reused") : null];
   }
 
   /* A word on machines where the times that are shown are of several. */
@@ -231,10 +221,18 @@
       if (machine && (runs.number(place, "loop") !== null || runs.number(place, "total") !== null))
         counts.set(machine, (counts.get(machine) || 0) + 1);
     }
-    if (counts.size < 2) return counts.size ? element("p.soft.machine", null, `Times of ${[...counts.keys()][0]}.`) : null;
-    const list = [...counts].sort((a, b) => b[1] - a[1]).map(([machine, n]) => `${machine}: ${plural(n, "run")}`).join("; ");
-    return element("p.note", {id: "machines"}, element("strong", null, "Times are of different machines or numbers of threads. "),
-      `Choose one under Machine to compare seconds. ${list}.`);
+    if (counts.size < 2)
+      return counts.size ? element("p.soft.machine", null, `Times of ${[...counts.keys()][0]}.`) : null;
+    const list = [...counts]
+      .sort((a, b) => b[1] - a[1])
+      .map(([machine, n]) => `${machine}: ${plural(n, "run")}`)
+      .join("; ");
+    return element(
+      "p.note",
+      {id: "machines"},
+      element("strong", null, "Times are of different machines or numbers of threads. "),
+      `Choose one under Machine to compare seconds. ${list}.`,
+    );
   }
 
   function pager(page, pages, change) {
@@ -242,9 +240,17 @@
       change({page: to === 1 ? "" : String(to)});
       document.getElementById("board").scrollIntoView();
     };
-    const button = (to, name) => element("button", {type: "button", disabled: to < 1 || to > pages, click: () => go(to)}, name);
-    return element("nav.pager", {"aria-label": "Pages of the list"}, button(1, "« First"), button(page - 1, "‹ Previous"),
-      element("span", null, `Page ${page} of ${pages.toLocaleString("en")}`), button(page + 1, "Next ›"), button(pages, "Last »"));
+    const button = (to, name) =>
+      element("button", {type: "button", disabled: to < 1 || to > pages, click: () => go(to)}, name);
+    return element(
+      "nav.pager",
+      {"aria-label": "Pages of the list"},
+      button(1, "« First"),
+      button(page - 1, "‹ Previous"),
+      element("span", null, `Page ${page} of ${pages.toLocaleString("en")}`),
+      button(page + 1, "Next ›"),
+      button(pages, "Last »"),
+    );
   }
 
   bench.board = board;
