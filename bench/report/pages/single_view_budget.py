@@ -122,7 +122,8 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     shapes, views = (medians.index.get_level_values(level) for level in (0, 1))
     ends = [(shapes.max(), views.max()), (shapes.max(), views.min()), (shapes.min(), views.max())]
     said = [
-        f"{SCALE * medians[end]:.1f} from {end[0]} shapes with {_images(int(end[1]))} each" for end in dict.fromkeys(ends)
+        f"{SCALE * medians[end]:.1f} from {end[0]} shapes with {_images(int(end[1]))} each"
+        for end in dict.fromkeys(ends)
     ]
     first, _, rest = "; ".join(said).partition(" ")
     verdict = f"Median Chamfer-L1 × 1000: *{first}* {rest}." if len(said) > 1 else ""
