@@ -27,6 +27,7 @@ def main(arguments: list[str]) -> None:
         given = parsed(arguments)
         results_dir = Path(given.get("results_dir", "results"))
         meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
+        one_file = _one_file(given.get("one_file", "false"))
         records = read_records(results_dir)[0]
         print(write_frame(records, results_dir))
         for path in write_paper(records, results_dir):
@@ -34,7 +35,7 @@ def main(arguments: list[str]) -> None:
         for problem in write_answers(results_dir):
             print(problem, file=sys.stderr)
         write_readme(results_dir)
-        if _one_file(given.get("one_file", "false")):
+        if one_file:
             sent = write_one_file(results_dir)
             print(f"{sent} ({size(sent.stat().st_size)})")
         print(write_index(results_dir, meshes=meshes))
