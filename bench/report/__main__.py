@@ -31,6 +31,7 @@ def main(arguments: list[str]) -> None:
         given = parsed(arguments)
         results_dir = Path(given.get("results_dir", "results"))
         meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
+        one_file = _one_file(given.get("one_file", "false"))
         records = read_records(results_dir)[0]
         frames = write_frame(records, results_dir)
         if len(frames) == 1:
@@ -40,7 +41,7 @@ def main(arguments: list[str]) -> None:
         for problem in write_answers(results_dir):
             print(problem, file=sys.stderr)
         write_readme(results_dir)
-        if _one_file(given.get("one_file", "false")):
+        if one_file:
             sent = write_one_file(results_dir)
             print(f"{sent} ({size(sent.stat().st_size)})")
         print(write_index(results_dir, meshes=meshes))

@@ -215,3 +215,23 @@ def test_numbers_beyond_a_float_and_odd_meshes_are_words(tmp_path, tab):
     write_index(tmp_path)
     page = tab(tmp_path).open("#/run/completion-0001")
     page.get_by_text("shorter than its header says").wait_for()
+
+
+def test_an_address_leads_into_the_folder_or_nowhere(tmp_path, tab):
+    made.write(tmp_path, 0)
+    write_index(tmp_path)
+    page = tab(tmp_path).open()
+    good = ["#/runs", "runs/a/summary.png", "paper/table1.csv", "data:image/webp;base64,AAAA"]
+    bad = [
+        "javascript:1",
+        "../a",
+        "runs/../../a",
+        "runs/%2e%2e/%2E%2e/a",
+        "http://a/runs/",
+        "//a/runs/",
+        "file:///etc/passwd",
+        "/etc",
+    ]
+    bad += ["data:text/html;base64,AAAA", "data:image/svg+xml;base64,AAAA", "runs/a:b", " javascript:1", "runs/\\..\\a"]
+    allowed = page.evaluate("all => all.map((each) => implicitBench.dom.safeAddress(each))", [*good, *bad])
+    assert allowed == [*good, *([None] * len(bad))]

@@ -219,10 +219,13 @@ def test_command_prints_the_page_last(results):
         ("one_file=yes", "true or false"),
     ],
 )
-def test_command_refuses_what_it_does_not_know(argument, named):
+def test_command_refuses_what_it_does_not_know(argument, named, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results").mkdir()
     with pytest.raises(SystemExit) as stopped:
         main([argument])
     assert named in str(stopped.value)
+    assert not list((tmp_path / "results").iterdir())  # nothing is written before all is known to be sound
 
 
 def test_report_never_imports_torch():
