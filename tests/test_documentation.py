@@ -83,8 +83,12 @@ def composed(arguments: list[str]) -> DictConfig:
     register()
     folders, overrides = first_cell(arguments)
     extra = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
+    spaces = any("method=space/" in override for override in overrides)
+    draw = (
+        ["draw=0"] if spaces and not any("draw=" in override for override in overrides) else []
+    )  # tuning sweeps over it
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=[*overrides, *extra])
+        return compose("config", overrides=[*overrides, *draw, *extra])
 
 
 def test_there_are_commands_of_every_file():

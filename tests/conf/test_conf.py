@@ -167,8 +167,9 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, paths, 
     elif key == "silhouette":
         assert config.task.silhouette == OmegaConf.load(CONF / f"silhouette/{value}.yaml")
     elif key in ("renderer", "method"):
-        scaled = OmegaConf.select(config, "scale.reconstruction.dvr_doublings")  # a share of the iterations
-        alone = compose_config(swept, *draw, f"scale.reconstruction.dvr_doublings={list(scaled)}")
+        scaled = {name: config.scale.reconstruction[name] for name in ("iterations", "dvr_doublings")}
+        sizes = [f"scale.reconstruction.{name}={value}" for name, value in scaled.items()]  # schedules follow these
+        alone = compose_config(swept, *draw, *sizes)
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")
         if key == "method":

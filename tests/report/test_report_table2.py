@@ -359,5 +359,6 @@ def test_all_files_are_written(tmp_path):
     completed(tmp_path, REFERENCE, 1.0)
     fitted(tmp_path, 0.2)
     written = {path.name for path in write_paper(read_records(tmp_path)[0], tmp_path)}
-    assert written == {"table2.csv", "table2_intervals.csv", "table2_wins.csv", "priors.csv"}
+    tables = {"table2.csv", "table2_intervals.csv", "table2_wins.csv", "priors.csv"}
+    assert written == {*tables, "completion_gallery.csv"}
     assert pd.read_csv(tmp_path / "paper" / "table2.csv")["chamfer_l2"].tolist() == [0.001]

@@ -238,12 +238,12 @@ def test_table_3_has_intervals_from_six_shapes_on(tmp_path):
     assert ours["Failed"] == "0 of 6 [0, 45.9] %"
 
 
-def test_all_three_are_written(tmp_path):
+def test_all_pages_are_written(tmp_path):
     found(tmp_path, "table3", "DIST", 1.0)
     found(tmp_path, "fig10", "DIST", None)
     posed(tmp_path, "DIST", 30, None)
     written = write_paper(read_records(tmp_path)[0], tmp_path)
-    assert [path.stem for path in written] == ["table3", "fig10", "fig6"]
+    assert [path.stem for path in written] == ["table3", "multiview_gallery", "fig10", "fig6"]
     for path in written:
         assert path.with_suffix(".png").stat().st_size > 1000
 

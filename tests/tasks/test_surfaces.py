@@ -71,6 +71,7 @@ def test_galleries_have_it_in_sizes_and_from_other_sides(scene, tmp_path):  # no
     HULL.execute(replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, gallery=32))))
     with np.load(tmp_path / "images.npz") as arrays:
         sides = {key.removesuffix("_hit"): arrays[key].shape[0] for key in arrays if key.endswith("_hit")}
+        assert sides.pop("back") == 8
         assert sides == {"size_0": 4, "size_1": 8, "size_2": 32, "turned_0": 32, "turned_1": 32}
         for name in sides:
             hit = arrays[f"{name}_hit"]
