@@ -15,6 +15,7 @@ from renderers.field import Field
 
 NEIGHBOURS = 0.05  # scene units: farthest apart that two points of the surface are compared
 EARLY = 0.05  # scene units in front of the surface, where no weight should be
+LEAST_WEIGHT = 1e-3  # of all samples of a ray; one with less sees no surface
 ROUGHNESS = {
     f"{part}_roughness": "Mean angle between the normals of two points sampled on the surface at most 0.05 scene units "
     f"apart, that {others} given photograph sees, less the same of the true surface, in degrees; normals count without "
@@ -23,15 +24,15 @@ ROUGHNESS = {
 }
 WEIGHT = {
     OWN + "early_weight": "Share of the weight of a ray that lies more than 0.05 scene units in front of the first hit "
-    "of the mesh, mean over the rays of held-out photographs that hit it; of renderers that sum along a ray (NeuS, "
-    "Sec. 3.1: an unbiased rendering has its greatest weight at the surface)."
+    "of the mesh, mean over the rays of held-out photographs that hit it and have weight; of renderers that sum along "
+    "rays (NeuS, Sec. 3.1: an unbiased rendering has its greatest weight at the surface)."
 }
 
 
 def roughness_scores(
     found: tuple[Surface, Bool[np.ndarray, " n"]] | None, true: tuple[Surface, Bool[np.ndarray, " m"]]
 ) -> dict[str, float]:
-    """The metrics of `ROUGHNESS`; infinite without a surface.
+    """The metrics of `ROUGHNESS`; infinite without a surface, and without the part where the true one has it.
 
     Args:
         found: the reconstructed surface, and which of its points are seen.
@@ -39,19 +40,21 @@ def roughness_scores(
     """
     scores = {}
     for name, seen in zip(ROUGHNESS, (True, False), strict=True):
-        parts = [None if one is None else _part(one[0], one[1] == seen) for one in (found, true)]
-        here, there = (np.inf if part is None else roughness(part) for part in parts)
-        scores[name] = here - there
+        here, there = (None if one is None else roughness(_part(one[0], one[1] == seen)) for one in (found, true))
+        if here is None:
+            scores[name] = 0.0 if there is None and found is not None else np.inf
+        else:
+            scores[name] = here - (there or 0.0)
     return scores
 
 
-def roughness(surface: Surface) -> float:
-    """The mean angle between the normals of points that are neighbours, in degrees; 0 where there are none."""
+def roughness(surface: Surface) -> float | None:
+    """The mean angle between the normals of points that are neighbours, in degrees; None where there are none."""
     if len(surface.points) < 2:
-        return 0.0
+        return None
     first, second = cKDTree(surface.points).query_pairs(NEIGHBOURS, output_type="ndarray").T
     if not len(first):
-        return 0.0
+        return None
     normals = surface.normals / np.linalg.norm(surface.normals, axis=1, keepdims=True).clip(1e-12)
     cosine = np.abs((normals[first] * normals[second]).sum(axis=1)).clip(0, 1)
     return float(np.degrees(np.arccos(cosine)).mean())
@@ -77,8 +80,10 @@ def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict
             return {}
         early = (volume.distance < surface[volume.ray] - EARLY).to(surface)
         both = volume.summed(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
-        shares.append((both[:, 0] / both[:, 1].clamp_min(1e-6)).cpu())
-    return {name: float(torch.cat(shares).mean()) for name in WEIGHT} if shares else {}
+        opaque = both[:, 1] > LEAST_WEIGHT
+        shares.append((both[opaque, 0] / both[opaque, 1]).cpu())
+    known = torch.cat(shares) if shares else torch.zeros(0)
+    return {name: float(known.mean()) for name in WEIGHT} if len(known) else {}
 
 
 def _part(surface: Surface, kept: Bool[np.ndarray, " n"]) -> Surface:

@@ -23,7 +23,8 @@ LADDER = (
     (("dataset", "machine", "renderer", "sizes"), "runs of other sizes"),
 )
 SIZES = ("resolution", "iterations", "steps", "views", "repeats")  # numbers of a task that decide its time
-UNMEASURED = ("killed", "crashed", "refused", "oom", "not_run")  # statuses of runs that did not take their whole time
+# Statuses of runs that did not take their whole time.
+UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,8 @@ def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
             plan = json.loads(path.read_text(encoding="utf-8"))
             if plan["schema"] != SCHEMA:
                 raise ValueError(f"schema must be {SCHEMA}, found {plan['schema']!r}")
+            if plan["name"] != path.parent.name:
+                raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
             datetime.fromisoformat(plan["asked"])
             names = [item.name for item in fields(PlannedCell)]
             cells = [{"method": ""} | {name: cell[name] for name in names if name in cell} for cell in plan["cells"]]
@@ -129,7 +131,8 @@ def check_links(results_dir: Path) -> None:
     Raises:
         ValueError: where one of its folders, a file of it or one of its tables is a link that leads out.
     """
-    entries = [*results_dir.glob("*"), *(results_dir / "paper").glob("*"), *(results_dir / name for name in FOLDERS)]
+    tables = [path for pattern in ("*", "paper/*", "sweeps/*/*") for path in results_dir.glob(pattern)]
+    entries = [*tables, *(results_dir / name for name in FOLDERS)]
     for path in entries:
         if path.is_symlink() and (path.name in FOLDERS or not path.is_dir()) and leads_out(path, results_dir):
             raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")

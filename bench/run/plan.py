@@ -25,7 +25,8 @@ def model_of(results_dir: Path) -> Model:
 def remaining(plan: Plan, reused: set[str], workers: int) -> Remaining:
     """The time left of a sweep, as it is before its first cell."""
     model = model_of(plan.results_dir)
-    return Remaining({c.id: model.of(asdict(c)) for c in plan.cells if c.id not in reused}, workers)
+    cells = {c.id: model.of(asdict(c)) for c in plan.cells if c.id not in reused}
+    return Remaining(cells, max(1, min(workers, len(cells))))
 
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:

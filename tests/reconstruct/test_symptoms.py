@@ -25,8 +25,8 @@ def test_roughness_is_the_mean_angle_of_neighbours():
     assert roughness(plane(5)) == pytest.approx(5, rel=0.05)  # half of the pairs are 10 degrees apart
     flipped = replace(plane(0), normals=plane(0).normals * np.where(np.arange(2000) % 3, 1, -1)[:, None])
     assert roughness(flipped) == 0
-    assert roughness(plane(5, count=20, side=100.0)) == 0  # no neighbours
-    assert roughness(plane(5, count=1)) == 0
+    assert roughness(plane(5, count=20, side=100.0)) is None  # no neighbours
+    assert roughness(plane(5, count=1)) is None
 
 
 def test_roughness_is_over_the_seen_and_the_unseen_part_and_less_that_of_the_truth():
@@ -36,6 +36,9 @@ def test_roughness_is_over_the_seen_and_the_unseen_part_and_less_that_of_the_tru
     scores = roughness_scores((replace(bumpy, normals=normals), seen), (smooth, seen))
     assert scores["seen_roughness"] == pytest.approx(0, abs=1e-9)
     assert scores["unseen_roughness"] == pytest.approx(6, rel=0.05)
+    whole = np.ones_like(seen)  # without a side that is unseen
+    assert roughness_scores((smooth, whole), (smooth, seen))["unseen_roughness"] == np.inf
+    assert roughness_scores((smooth, whole), (smooth, whole))["unseen_roughness"] == 0
     assert roughness_scores(None, (smooth, seen)) == {"seen_roughness": np.inf, "unseen_roughness": np.inf}
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import bench
-from bench.records.read import Plan, PlannedCell
+from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
 from bench.report.data.frame import COLUMNS, write_frame
 from tests.report.test_report import crashed, record, write_run
@@ -64,6 +64,16 @@ def test_without_pyarrow_a_note_says_what_is_missing(results, monkeypatch, capsy
     report([f"results_dir={results}"])
     assert "pip install 'implicit-bench[parquet]'" in capsys.readouterr().err
     assert not (results / "results.parquet").exists() and (results / "runs.csv").is_file()
+
+
+@pytest.mark.parametrize("odd", [{"threads": "auto"}, {"threads": 1.5}, {"threads": 10**400}, {"dirty": "yes"}])
+def test_a_record_from_elsewhere_with_an_odd_value_leaves_the_table_whole(results, odd):
+    environment = record("odd")["environment"] | odd
+    write_run(results, record("odd", environment=environment, started="2025-03-04T10:00:00Z"), "odd")
+    runs = bench.load(results)
+    (name, value), *_ = odd.items()
+    assert len(runs) == 4 and str(runs[name].dtype) == "string" and runs[name][0] == str(value)
+    assert write_frame(read_records(results)[0], results)[0].is_file()
 
 
 def test_no_runs_are_a_table_and_no_folder_an_error(tmp_path):

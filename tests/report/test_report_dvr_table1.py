@@ -119,10 +119,16 @@ def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
     drawn = [axis.containers[0].lines[0].get_xydata().tolist() for axis in (left, right)]
     assert drawn == [[[1, 80], [4, 40], [24, 20]], [[12, 60], [96, 20]]]
     assert "96 training shapes" in left.get_xlabel() and "24 images" in right.get_xlabel()
-    verdict = (
-        "Median Chamfer-L1 × 1000: *20.0* from 96 shapes with 24 images each; 80.0 from 96 shapes with 1 image each; "
-    )
-    assert single_view_budget.answer(result.data, []).verdict == f"{verdict}60.0 from 12 shapes with 24 images each."
+    assert single_view_budget.answer(result.data, []).verdict == ""  # of three shapes there are no intervals
+
+
+def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_training(tmp_path):
+    for index in range(8):
+        for (shapes, views), factor in {(96, 24): 1.0, (96, 1): 2.0, (12, 24): 1.5 if index % 2 else 0.7}.items():
+            budget(tmp_path, shapes, views, (0.02 + 0.001 * index) * factor, index)
+    result = single_view_budget.make(choose(read_records(tmp_path)[0], single_view_budget.READS[0], tmp_path))
+    verdict = single_view_budget.answer(result.data, []).verdict
+    assert verdict == "The interval excludes 1 for *1 of 2* ratios to the training on 96 shapes with 24 images each."
 
 
 @pytest.mark.parametrize("status", ["crashed", "empty"])

@@ -210,12 +210,14 @@ def test_a_link_within_the_results_folder_is_followed(theirs):
     assert len(read_records(theirs)[0]) == 2
 
 
-@pytest.mark.parametrize("name", ["runs", "paper", "sweeps", "earlier", ".locks", "index.html", "paper/table1.csv"])
+@pytest.mark.parametrize(
+    "name", ["runs", "paper", "sweeps", "earlier", ".locks", "index.html", "paper/table1.csv", "sweeps/p/table.csv"]
+)
 def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
     outside = tmp_path / "mine"
     if name == "runs":
         (theirs / "runs").rename(tmp_path / "mine" / "runs")
-    (theirs / name).parent.mkdir(exist_ok=True)
+    (theirs / name).parent.mkdir(exist_ok=True, parents=True)
     (theirs / name).symlink_to(outside / ("secret.png" if "." in name[1:] else ""))
     before = sorted(path.name for path in outside.rglob("*"))
     cell = PlannedCell("completion-1", [], "completion", "dist", "sofa", 0, {})
@@ -253,6 +255,16 @@ def test_a_planned_cell_has_the_name_of_a_folder(theirs, name):
     assert [record["folder"] for record in read_records(theirs)[0]] == ["sound"]
     (theirs / "sweeps" / "p" / "plan.json").write_text(json.dumps(plan | {"cells": [cell | {"id": "sound-2"}]}))
     assert len(read_plans(theirs)[0]) == 1
+
+
+@pytest.mark.parametrize("name", ["../../mine", "/etc", "other", 5, None])
+def test_a_plan_has_the_name_of_its_folder(theirs, name):
+    cell = {"id": "sound-2", "overrides": [], "task": "t", "renderer": "r", "dataset": "d", "seed": 0, "config": {}}
+    plan = {"schema": SCHEMA, "name": name, "asked": "2026-01-01T00:00:00+00:00", "cells": [cell]}
+    (theirs / "sweeps" / "p").mkdir(parents=True)
+    (theirs / "sweeps" / "p" / "plan.json").write_text(json.dumps(plan))
+    plans, problems = read_plans(theirs)
+    assert plans == [] and "its name must be that of its folder" in problems[0]
 
 
 def test_a_configuration_in_a_run_folder_is_only_text(theirs, stranger, tmp_path):

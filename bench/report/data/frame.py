@@ -97,9 +97,15 @@ def _row(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _series(values: list[Any], kind: str) -> pd.Series:
-    """A column of that type; categories are text, also where there are none."""
+    """A column of that type; categories are text, also where there are none.
+
+    A record from elsewhere may hold what is not of the type: its column is text then.
+    """
     if kind != CATEGORY:
-        return pd.Series(values, dtype=kind)
+        try:
+            return pd.Series(values, dtype=kind)
+        except (TypeError, ValueError, OverflowError):
+            return pd.Series([None if value is None else str(value) for value in values], dtype=TEXT)
     known = pd.Index(sorted({str(value) for value in values if value is not None}), dtype="str")
     return pd.Series(pd.Categorical(values, categories=known))
 

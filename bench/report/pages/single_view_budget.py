@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, Row, by_shape, grouped, setting
-from bench.report.data.statistics import Interval, bootstrap, median
+from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
 from bench.report.pages.dvr_table1 import errors_of, over
 from bench.report.write import chart
 from bench.report.write.answer import Answer
@@ -116,19 +116,20 @@ def _curve(axis: Axes, row: Row, runs: dict[int, list[Record]]) -> None:
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
-    """The medians of the fewest images of each shape, of the fewest shapes, and of the largest training."""
-    worst = data["chamfer_l1"].where(data["status"] == "ok", float("inf"))
-    medians = worst.groupby([data["shapes"], data["views"]]).median()
-    shapes, views = (medians.index.get_level_values(level) for level in (0, 1))
-    ends = [(shapes.max(), views.max()), (shapes.max(), views.min()), (shapes.min(), views.max())]
-    said = [
-        f"{SCALE * medians[end]:.1f} from {end[0]} shapes with {_images(int(end[1]))} each"
-        for end in dict.fromkeys(ends)
-    ]
-    first, _, rest = "; ".join(said).partition(" ")
-    verdict = f"Median Chamfer-L1 × 1000: *{first}* {rest}." if len(said) > 1 else ""
-    return Answer("How many shapes, and images of each, does a training need?", verdict)
-
-
-def _images(count: int) -> str:
-    return f"{count} image{'s' if count != 1 else ''}"
+    """How many ratios to the largest training of a family have an interval that excludes 1."""
+    ratios, largest = [], (0, 0)
+    for _, family in data.groupby("family", sort=False):
+        errors = family["chamfer_l1"].where(family["status"] == "ok", float("inf"))
+        by_run = errors.groupby([family["shapes"], family["views"], family["index"], family["seed"]]).first()
+        budgets = {budget: part.droplevel([0, 1]) for budget, part in by_run.groupby(level=[0, 1])}
+        largest = max(budgets, key=lambda one: one[0] * one[1])
+        ratios += [
+            geometric_ratio(list(part.to_numpy()[:, None]), list(budgets[largest].to_numpy()[:, None]))
+            for budget, part in budgets.items()
+            if budget != largest and part.index.equals(budgets[largest].index)
+        ]
+    known = [ratio for ratio in ratios if ratio.known]
+    beyond = sum(not ratio.low <= 1 <= ratio.high for ratio in known)
+    of_largest = f"{largest[0]} shapes with {largest[1]} images each"
+    verdict = f"The interval excludes 1 for *{beyond} of {len(known)}* ratios to the training on {of_largest}."
+    return Answer("How many shapes, and images of each, does a training need?", verdict if known else "")

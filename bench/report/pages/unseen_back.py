@@ -64,5 +64,6 @@ def make(experiment: Experiment) -> Result:
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The rows by how much bumpier than the truth their unseen sides are."""
-    verdict = ranked(data, "unseen_roughness").said("roughness over the truth's where no photograph looks", unit="°")
+    bumps = data.assign(unseen_roughness=data["unseen_roughness"].clip(lower=0.0))  # smoother than the truth is no bump
+    verdict = ranked(bumps, "unseen_roughness").said("roughness beyond the truth's where no photograph looks", unit="°")
     return Answer("Who leaves bumps on the side that no photograph shows?", verdict)

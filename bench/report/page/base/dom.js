@@ -4,7 +4,7 @@
   "use strict";
 
   const PICTURE = /^data:image\/(png|gif|webp|jpeg);base64,[A-Za-z0-9+/=]*$/;
-  const WITHIN = /^(runs|paper)\/[A-Za-z0-9_.~%/-]*$/;
+  const WITHIN = /^(runs|paper|sweeps)\/[A-Za-z0-9_.~%/-]*$/;
 
   /* The address, if it is a place of this page, a file of the results folder or a picture that is written into the page. */
   function safeAddress(address) {
