@@ -40,6 +40,7 @@ class RunStatus(StrEnum):
     REFUSED = "refused"
 
 
+PICTURES = ("summary.png", "strip.png", "failure.png")  # of a run: the first that it has is looked at first
 NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no record.json
 
 

@@ -12,9 +12,7 @@ from rich.table import Table
 from bench.records.format import count, number, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan
-from bench.records.record import NOT_RUN, Record, RunStatus
-
-PICTURES = ("summary.png", "strip.png", "failure.png")  # of a run, the one to look at first
+from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
 
 
 def show(folder: Path, record: Record, index: Path) -> None:

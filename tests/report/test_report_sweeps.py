@@ -1,6 +1,7 @@
 """Any sweep has a table: a row for what varies, with failed and missing cells counted."""
 
 import math
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -9,6 +10,7 @@ import pytest
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
 from bench.report.data.sweeps import numbers, read_sweeps
+from bench.report.write.html import ASSETS
 from bench.report.write.sweeps import find_sweeps, write_sweeps
 from tests.report.test_report import record, write_run
 
@@ -123,6 +125,8 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert (found["name"], found["title"]) == ("completion-1", "Sweep completion-1.")
     assert found["header"][:2] == ["Run", "Chamfer (x1000)"] and found["rows"][0][:2] == ["DIST", "1.00 (n = 1)"]
     assert found["files"] == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
+    within = re.search(r"WITHIN = /(.*)/;", (ASSETS / "base" / "dom.js").read_text())
+    assert within and all(re.fullmatch(within[1], link) for link in found["files"].values())  # the page links to them
     assert r"\label{tab:completion-1}" in (folder / "table.tex").read_text()
     assert "swept over renderer (dist, dvr)." in found["caption"] and "All 2 runs ended ok." in found["caption"]
 

@@ -3,11 +3,12 @@
 import hashlib
 from pathlib import Path
 
+from bench.records.files import leads_out
+from bench.records.record import PICTURES
 from bench.report.write.paper import link
 
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
-PICTURES = (".png", ".gif", ".webp")
-THUMBS = ("summary.png", "strip.png", "failure.png")  # the first that a run has stands for it
+SUFFIXES = (".png", ".gif", ".webp")  # of pictures
 ALT = {  # what the pictures of a run show
     "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",
     "strip.png": "The way from the start to the end, in frames",
@@ -40,20 +41,20 @@ class Folder:
         path = self.path / name
         if not path.is_file():
             return False
-        linked = self.linked or path.is_symlink()
-        return not linked or path.resolve().is_relative_to(self.results_dir.resolve())
+        linked = self.linked or path.is_symlink()  # others are not resolved, which takes time
+        return not linked or not leads_out(path, self.results_dir)
 
     def thumb(self) -> str:
         """The picture that stands for the run; empty without one."""
-        return next((name for name in THUMBS if self.has(name)), "")
+        return next((name for name in PICTURES if self.has(name)), "")
 
     def pictures(self) -> list[str]:
         """The names of its pictures, the one that stands for the run first."""
         try:
-            found = sorted(p.name for p in self.path.iterdir() if p.suffix in PICTURES and self.has(p.name))
+            found = sorted(p.name for p in self.path.iterdir() if p.suffix in SUFFIXES and self.has(p.name))
         except OSError:
             return []
-        return sorted(found, key=lambda name: THUMBS.index(name) if name in THUMBS else len(THUMBS))
+        return sorted(found, key=lambda name: PICTURES.index(name) if name in PICTURES else len(PICTURES))
 
     def link(self, name: str) -> str:
         """The address of one of its files."""
