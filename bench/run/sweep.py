@@ -21,17 +21,17 @@ from bench.records.expected import Remaining
 from bench.records.files import digest
 from bench.records.folder import identify, reusable
 from bench.records.format import number, seconds
+from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
 from bench.run.check import check_apart, check_plan, identity_of, warm_up
 from bench.run.plan import Shown, remaining, show_plan
 from bench.targets import check_targets
 
-SHOWN = (  # metric, its name in the line of a cell, factor
-    ("recommended_field", "recommended", 1.0),
-    ("chamfer_l2", "Chamfer (x1000)", 1000.0),
-    ("rotation_error_deg", "rotation error (degrees)", 1.0),
-)
+IN_LINE = {  # metrics in the line of a cell
+    "recommended_field": Metric("recommended"),
+    **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
+}
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
 
 
@@ -214,7 +214,7 @@ def line(folder: Path, record: dict[str, Any], differing: str) -> str:
         seconds(loop),
     ]
     known = record["metrics"]
-    parts += [f"{label} {number(known[name], factor)}" for name, label, factor in SHOWN if name in known]
+    parts += [f"{m.label} {number(known[name], m.factor)}" for name, m in IN_LINE.items() if name in known]
     if "level" in known:
         parts.append(breakdown(record))
     return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)

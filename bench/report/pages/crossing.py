@@ -16,7 +16,7 @@ from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, by_shape
 from bench.report.write import chart
-from bench.report.write.answer import Answer, chart_panel, ranked, series
+from bench.report.write.answer import Answer, at_fewest_points, chart_panel, series
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
 
@@ -159,8 +159,7 @@ def draw_front(crossed: Crossed, lines: list[dict[str, Any]]) -> Figure:
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The best pair of renderer and loss at the fewest points."""
-    fewest = list(dict.fromkeys(data["points"].astype(str)))[-1]
-    found = ranked(data[data["points"].astype(str) == fewest], "chamfer_l2")
+    fewest, found = at_fewest_points(data)
     verdict = found.said(f"error from {fewest} points (Chamfer × 1000)", scale=SCALE)
     return Answer("Which renderer is best under which loss of the mask?", verdict)
 

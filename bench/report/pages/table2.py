@@ -20,7 +20,7 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.oracle import LABEL, NOTE, oracles
 from bench.report.data.records import SCALE, Row, RunKey, by_shape, grouped, iterations_of, row_of
 from bench.report.write import chart
-from bench.report.write.answer import Answer, ranked
+from bench.report.write.answer import Answer, at_fewest_points
 from bench.report.write.caption import undefined
 from bench.report.write.result import Result
 from bench.report.write.table import (
@@ -288,8 +288,7 @@ def make_wins(experiment: Experiment) -> Result:
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The best row at the fewest points."""
-    fewest = list(dict.fromkeys(data["points"].astype(str)))[-1]
-    found = ranked(data[data["points"].astype(str) == fewest], "chamfer_l2")
+    fewest, found = at_fewest_points(data)
     verdict = found.said(f"error from {fewest} points, over all families (Chamfer × 1000)", scale=SCALE)
     return Answer("Which method completes a shape best from sparse depth?", verdict)
 

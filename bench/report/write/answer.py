@@ -109,6 +109,13 @@ def ranked(data: pd.DataFrame, metric: str, *, better: str = "lower", by: str = 
     return Ranked(sorted(found, key=lambda item: sign * item[1]), shapes(data))
 
 
+def at_fewest_points(data: pd.DataFrame) -> tuple[str, Ranked]:
+    """The least number of observed points, which stands last, and the rows by their errors from these."""
+    points = data["points"].astype(str)
+    fewest = list(dict.fromkeys(points))[-1]
+    return fewest, ranked(data[points == fewest], "chamfer_l2")
+
+
 def shapes(data: pd.DataFrame) -> int:
     """The number of shapes of the runs."""
     keys = [key for key in ("family", "index") if key in data]
