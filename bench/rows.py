@@ -66,9 +66,9 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
 
 
 def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
-    """The methods with a search space, to be swept over: of the kind `space` the spaces, of `tuned` the methods.
+    """The methods with a search space, to be swept over: of the kind `space` the spaces.
 
-    Of `tuned`, those for which a tuned setting has been written, each with that behind it.
+    Of another kind, the settings that have been written to the folder of that name; of `tuned`, each behind its method.
 
     Args:
         without: names of methods that are left out.
@@ -81,10 +81,8 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     if unknown := {*without} - {*names}:
         raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
     names = [name for name in names if name not in without]
-    if kind == "space":
-        return ",".join(f"space/{name}" for name in names)
-    written = [name for name in names if any((folder / "tuned" / f"{name}.yaml").is_file() for folder in folders)]
-    return ",".join(part for name in written for part in (name, f"tuned/{name}"))
+    written = [name for name in names if any((folder / kind / f"{name}.yaml").is_file() for folder in folders)]
+    return ",".join(part for name in written for part in (*((name,) if kind == "tuned" else ()), f"{kind}/{name}"))
 
 
 def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:

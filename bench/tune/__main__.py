@@ -1,7 +1,8 @@
 """`python -m bench.tune --into conf/method/tuned`: writes each method's best drawn setting as a file of its own.
 
-It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
-on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice.
+It reads the runs of `+experiment=tuning`, or of `--experiment`. The best draw is that with the smallest geometric mean
+of Chamfer distances on the validation shapes, of those with the fewest failures; the test shapes take no part in the
+choice.
 """
 
 import argparse
@@ -16,13 +17,13 @@ from omegaconf import OmegaConf
 from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import read_records
-from bench.report.data.experiments import Experiment, choose
-from bench.report.data.tuning import SPACE, TUNING, Tuning, left_out, tunings, unfinished
+from bench.report.data.experiments import Experiment, choose, shared_loss
+from bench.report.data.tuning import ONE_LOSS, SPACE, TUNING, Tuning, left_out, tunings, unfinished
 
-DRAWN = ("task", "renderer")  # nodes whose keys a search space may draw
+SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS)}
 HEAD = """# @package _global_
 # Draw {draw} of {draws} of method/space/{method}: geometric mean of Chamfer x 1000 on {runs} validation runs
-# at scale={scale} of {families}: {best}, of the median draw {middle}.
+# at scale={scale} of {families}{loss}: {best}, of the median draw {middle}.
 # Written by `python -m bench.tune` from runs of commit {commit}; do not edit.
 defaults:
   - /method/{method}
@@ -31,22 +32,22 @@ defaults:
 """
 
 
-def write(results_dir: Path, folder: Path) -> list[str]:
-    """Writes a file per method to the folder, and gives a line for each.
+def write(results_dir: Path, folder: Path, *, name: str = TUNING.experiment) -> list[str]:
+    """Writes a file per method of the experiment of that name to the folder, and gives a line for each.
 
     Raises:
         ValueError: where runs of the tuning are missing, or have not ended.
     """
-    experiment = choose(read_records(results_dir)[0], TUNING, results_dir)
+    experiment = choose(read_records(results_dir)[0], SELECTIONS[name], results_dir)
     if experiment is None:
-        raise ValueError(f"{results_dir} has no runs of the tuning: type python -m bench -m +experiment=tuning")
+        raise ValueError(f"{results_dir} has no runs of the tuning: type python -m bench -m +experiment={name}")
     if waiting := unfinished(experiment):
         raise ValueError(
             f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
         )
     found = tunings(experiment)
     if not found:
-        raise ValueError("no draw has a run on every validation and test shape for every method: sweep over them all")
+        raise ValueError("no draw has a run on every shape for every method: sweep over them all")
     if len(found[0].draws) < 2:
         raise ValueError(
             f"draw {found[0].draws[0]} alone has a run on every shape for every method, and one is no choice: type the "
@@ -81,6 +82,7 @@ def _text(method: Tuning, experiment: Experiment) -> str:
         scale=_names(record["config"]["scale"]["name"] for record in records),
         families=_names(record["config"]["dataset"]["name"] for record in records),
         commit=_names(commits),
+        loss=f", all under {loss}" if (loss := _names([shared_loss(records)])) else "",
     )
     node = OmegaConf.create({"label": f"{method.label}, tuned"})
     for name, value in method.settings[method.best].items():
@@ -96,12 +98,14 @@ def _names(found: Iterable[Any]) -> str:
 def main(arguments: list[str]) -> int:
     """Writes the files and prints a line for each."""
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__.split("\n\n")[1])
+    kind = "which sweep is read"
+    parser.add_argument("--experiment", choices=SELECTIONS, default=TUNING.experiment, help=kind)
     parser.add_argument("--results", type=Path, default=Path("results"), metavar="FOLDER", help="results folder")
     folder = "where the files go: conf/method/tuned to use them as +method=tuned/NAME; without it, RESULTS/tuned"
     parser.add_argument("--into", type=Path, metavar="FOLDER", help=folder)
     options = parser.parse_args(arguments)
     try:
-        print("\n".join(write(options.results, options.into or options.results / "tuned")))
+        print("\n".join(write(options.results, options.into or options.results / "tuned", name=options.experiment)))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

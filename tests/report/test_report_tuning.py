@@ -18,18 +18,22 @@ from tests.report.test_report_paper import coarse_pictures, told, write_run  # n
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
 OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean over the first six is 1
+ERRORS = {"validation": VALIDATION, "test": TEST}
 RATES = (0.04, 0.01, 0.03, 0.02)
 
 
-def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0, family="sofa"):
+def drawn(
+    results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0, family="sofa", **more
+):
     """Four draws of a method; the error of a shape is that of its draw times the shape's own."""
-    for split, errors in (("validation", VALIDATION), ("test", TEST)):
+    name = more.pop("experiment", "tuning")
+    for split, errors in more.pop("errors", ERRORS).items():
         for draw, value in enumerate(errors):
             for index in (i for i in range(shapes) if (split, draw, i) not in left_out):
                 status = {**dict.fromkeys(failed, "empty"), **dict.fromkeys(killed, "killed")}.get((split, draw, index))
                 write_run(
                     results,
-                    "tuning",
+                    name,
                     "DIST with mask",
                     **{"task": "completion", "dataset": family, "renderer": "dist", "method": f"space/{method}"},
                     status=status or "ok",
@@ -41,6 +45,7 @@ def drawn(results, *, shapes=6, method="dist_mask", failed=(), left_out=(), kill
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
                         "scale": {"name": "desk"},
+                        **more,
                     },
                 )
 
@@ -138,6 +143,18 @@ def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
     assert node.defaults == ["/method/dist_mask", "_self_"]
     assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
     assert set(node) == {"defaults", "label", "task", "renderer"}
+
+
+def test_another_sweep_is_read_by_its_name_and_needs_no_test_shapes(tmp_path, capsys):
+    hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
+    drawn(tmp_path, experiment="tuning_one_loss", errors={"validation": VALIDATION}, silhouette=hinge)
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 1
+    capsys.readouterr()
+    named = ["--experiment", "tuning_one_loss"]
+    assert main([*named, "--results", str(tmp_path), "--into", str(tmp_path / "one")]) == 0
+    text = (tmp_path / "one" / "dist_mask.yaml").read_text()
+    assert "# Draw 1 of 4" in text and "of sofa, all under DIST's mask loss: 1.00, of the median draw" in text
+    assert OmegaConf.load(tmp_path / "one" / "dist_mask.yaml").renderer.steps == 11
 
 
 def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):

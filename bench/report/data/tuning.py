@@ -4,7 +4,7 @@ All methods are read on the same draws, shapes and seeds: those of which every m
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from bench.report.data.records import (
 )
 
 TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"), splits=True)
+ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone
 SPACE = "space/"  # the folder of conf/method with the search spaces
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
@@ -111,7 +112,10 @@ def unfinished(experiment: Experiment) -> int:
 
 
 def tunings(experiment: Experiment) -> list[Tuning]:
-    """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none."""
+    """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
+
+    Validation shapes are enough: without test shapes `test` has no columns.
+    """
     ended = [record for record in experiment.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
     tables = [{(_split(r), _draw(r), run_key(r)): r for r in records} for records in by_method.values()]
@@ -119,7 +123,7 @@ def tunings(experiment: Experiment) -> list[Tuning]:
     runs = {split: sorted({run for of, _, run in common if of == split}) for split in (VALIDATION, TEST)}
     draws = sorted({draw for _, draw, _ in common})
     draws = [draw for draw in draws if all((s, draw, run) in common for s in runs for run in runs[s])]
-    if not draws or not all(runs.values()):
+    if not draws or not runs[VALIDATION]:
         return []
     worst = {split: _worst(tables, split, draws, runs[split]) for split in runs}
     return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]

@@ -70,7 +70,7 @@ Curve = dict[int, statistics.Interval]  # by the number of draws
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per method: the expected test error at each budget."""
-    methods = tunings(experiment)
+    methods = [method for method in tunings(experiment) if method.test_runs]
     curves = {method.label: _curve(method) for method in methods}
     budgets = sorted({k for curve in curves.values() for k in curve})
     columns = [

@@ -1,0 +1,153 @@
+"""Every renderer under one loss of the mask, each at its tuned setting: errors, ratios, and error over cost."""
+
+import math
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
+from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.records import Row, by_shape, family, loop_seconds, median_of_known, row_of, value_evaluations
+from bench.report.data.wins import gap
+from bench.report.write import chart
+from bench.report.write.answer import Answer, chart_panel, series
+from bench.report.write.result import Result
+from bench.report.write.table import Column, text, to_data, to_table
+
+PLACE = 21
+READS = (Selection("one_loss", ("completion",), ("dataset", "task"), ("points",)),)
+FOLDER = "one_loss/"  # of the presets that `python -m bench.tune` writes
+REFERENCE = "one_loss/dist_mask"
+TUNED = ", tuned"  # end of the name of every row
+COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}
+UNITS = {"evaluations": "values", "seconds": "seconds"}
+NOTES = (
+    "The ratio to DIST is that of geometric means over shapes, of each shape's geometric mean over all numbers of "
+    "points; behind it the number of shapes on which the row is better, ties half.",
+    "On a front, filled in the figure: no other row has a smaller error for a smaller cost. Field values leave out "
+    "what is no value, such as the bounds of range analysis; seconds have it, and depend on the machine.",
+    "Settings: conf/method/one_loss, chosen on validation shapes by `python -m bench.tune` under the same loss; their "
+    "first lines say from which runs. At desk these are of sofas and planes from 20 points.",
+)
+Line = dict[str, Any]
+
+
+def make(experiment: Experiment) -> Result:
+    """Makes the page, with a line per family and row, all families first."""
+    runs = Completions(experiment)
+    lines = [line for name in _names(runs) for line in _of(experiment, runs, name)]
+    columns = [
+        *(text("family", "Family"), text("row", "Method")),
+        *(Column(points, heading(points)) for points in runs.points),
+        Column("error", "Geometric mean", lambda line: line["error"].value, words=lambda line: str(line["error"])),
+        *(Column(end, value=lambda line, end=end: getattr(line["error"], end)) for end in ("low", "high")),
+        text("ratio", "Ratio to DIST", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
+        Column("evaluations", "Values", show=format.count),
+        Column("seconds", "Loop", show=format.seconds),
+        *(text(f"front_{cost}", f"Front, {unit}") for cost, unit in UNITS.items()),
+        text("failed", "Failed"),
+        text("preset"),
+    ]
+    return Result(
+        experiment,
+        "Every renderer under one loss, each at its tuned setting.",
+        "Median error at each number of given depth points, the geometric mean of all errors, and the median cost.",
+        interval="95 % intervals over shapes (Student's, of logarithms)",
+        estimates=[line["error"] for line in lines],
+        remarks=(*verdict(lines), ERROR, FAILURE, shapes_per_cell(runs), *NOTES),
+        data=to_data(columns, lines),
+        table=to_table(columns, lines),
+        figure=draw(lines),
+    )
+
+
+def verdict(lines: list[Line]) -> list[str]:
+    """The rows that differ from DIST over all families by their interval, in words."""
+    known = [line for line in lines if line["family"] == EVERY and line["ratio"] and line["ratio"].ratio.known]
+    if not known:
+        return []
+    sure = [line for line in known if line["ratio"].ratio.excludes(1)]
+    named = "; ".join(f"{line['row']} {line['ratio'].ratio}" for line in sure)
+    said = f"The interval excludes 1 for {len(sure)} of {len(known)} ratios to DIST over all families"
+    return [f"{said}: {named}." if sure else f"{said}."]
+
+
+def _names(runs: Completions) -> list[str]:
+    return [EVERY, *runs.families] if len(runs.families) > 1 else runs.families
+
+
+def _of(experiment: Experiment, runs: Completions, name: str) -> list[Line]:
+    """The lines of a family, with what is on its front."""
+    lines = [_line(experiment, runs, name, row) for row in runs.rows]
+    fronts = {f"front_{cost}": _front(lines, cost) for cost in COSTS}
+    return [line | {key: "yes" if line["row"] in on else "" for key, on in fronts.items()} for line in lines]
+
+
+def _line(experiment: Experiment, runs: Completions, name: str, row: Row) -> Line:
+    families = runs.families if name == EVERY else [name]
+    mine = [r for r in experiment.records if row_of(r) == row and family(r) in families and r["status"] == "ok"]
+    errors = by_shape(runs.over_points(name, row, finite=True))
+    reference = next((other for other in runs.rows if other.preset == REFERENCE), row)
+    failures = [runs.failures(each, row) for each in families]
+    return {
+        **{"family": name, "row": row.name.removesuffix(TUNED), "preset": row.preset.removeprefix(FOLDER)},
+        **{points: runs.median(name, row, points) for points in runs.points},
+        "error": statistics.geometric(errors) if errors else statistics.Interval(math.nan, math.nan, math.nan),
+        "ratio": None if row == reference else gap(*runs.pair(name, row, reference, finite=True)),
+        "evaluations": median_of_known(map(value_evaluations, mine)),
+        "seconds": median_of_known(map(loop_seconds, mine)),
+        "failed": "{} of {}".format(*(sum(part) for part in zip(*failures, strict=True))),
+    }
+
+
+def _front(lines: list[Line], cost: str) -> set[str]:
+    """The rows on the front of error over a cost, of those that have both."""
+    known = [line for line in lines if line[cost] is not None and math.isfinite(line["error"].value)]
+    beaten = statistics.dominated([line[cost] for line in known], [line["error"].value for line in known])
+    return {line["row"] for line, inside in zip(known, beaten, strict=True) if not inside}
+
+
+@style.styled
+def draw(lines: list[Line]) -> Figure:
+    """Draws the error over all families over each cost, with a point per row; filled points are on the front."""
+    first = [line for line in lines if line["family"] == lines[0]["family"]] if lines else []
+    figure, (axes,) = chart.sheet(3.2, 1, len(COSTS), sharey=True)
+    for axis, (cost, label) in zip(axes, COSTS.items(), strict=True):
+        _panel(axis, [line for line in first if line[cost] is not None], cost)
+        axis.set_xlabel(label)
+    axes[0].set_ylabel("Chamfer × 1000 (scene units²)")
+    style.log_axis(axes[0], "y", [v for line in first for v in (line["error"].low, line["error"].value)])
+    style.legend_below(figure, axes[0], columns=3)
+    return figure
+
+
+def _panel(axis: Axes, lines: list[Line], cost: str) -> None:
+    edge = 2 * max((line["error"].value for line in lines), default=1.0)
+    for line in lines:
+        how = {"ls": "none", "ms": 5, "label": line["row"]} | ({} if line[f"front_{cost}"] else {"mfc": "none"})
+        chart.estimates(axis, line["preset"], [line[cost]], [line["error"].below(edge)], bars=True, **how)
+    style.log_axis(axis, "x", [line[cost] for line in lines])
+
+
+def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
+    """The rows with the least error and the least cost, and the front over field values and over seconds."""
+    whole = data[data["family"] == data["family"].iloc[0]]
+    best, quick = whole.loc[whole["error"].idxmin()], whole.loc[whole["seconds"].idxmin()]
+    named = [f"({row['row']}, {format.seconds(row['seconds'])})" for row in (best, quick)]
+    said = (
+        f"Under one loss and tuned, the least error × 1000 is *{best['error']:.3g}* {named[0]}; the quickest row has "
+        f"{quick['error']:.3g} {named[1]}."
+    )
+    panels = []
+    for cost, label in COSTS.items():
+        points = [
+            series(row["row"], row["preset"], [row[cost]], [row["error"]], low=[row["low"]], high=[row["high"]], size=9)
+            for _, row in whole.iterrows()
+        ]
+        panels.append(chart_panel("error over cost", label, "error × 1000", points))
+    return Answer("How do all renderers compare under one loss, each tuned?", said, {"panels": panels})
