@@ -38,6 +38,10 @@ class Samples:
         """The field's values at distances along n rays."""
         return Samples(distance, _finite(field(rays.at_each(distance))))
 
+    def of_rays(self, index: Tensor) -> "Samples":
+        """Those of some of the rays, by their places or a mask."""
+        return Samples(self.distance[index], self.value[index])
+
     def joined(self, other: "Samples") -> "Samples":
         """The samples of both, in rising order."""
         distance, order = torch.cat([self.distance, other.distance], dim=1).sort(dim=1)

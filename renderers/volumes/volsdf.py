@@ -1,11 +1,12 @@
 """VolSDF: density from the distance, and samples that bound the error of the opacity (Yariv et al., NeurIPS 2021)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import log
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
@@ -91,49 +92,82 @@ class VolSDF:
         """The cross entropy of the opacity, as in NeuS; the paper has no masks."""
         return self.mask_weight * mask_loss(rendering, mask)
 
-    def bounded(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Samples, Float[Tensor, "n 1"]]:
-        """Algorithm 1 up to its last step: samples, and the width of each ray for which they bound the error."""
+    def bounded(
+        self, field: Field, rays: Rays, entry: Tensor, leave: Tensor
+    ) -> Iterator[tuple[Int[Tensor, " k"], Samples, Float[Tensor, "k 1"]]]:
+        """Algorithm 1 up to its last step, in groups of rays that need equally many rounds.
+
+        Gives the places of these rays, their samples, and the width of each ray for which they bound the error.
+        """
+        index = torch.arange(len(entry), device=entry.device)
         found = Samples.of(field, rays, evenly(entry, leave, self.samples))
         square = _spacing(found.distance).square().sum(dim=1, keepdim=True)
         width = (square / (4 * log(1 + self.error))).sqrt().clamp_min(self.width)  # Lemma 2, of any spacing
-        width = self._least_width(found, width)
-        for _ in range(self.rounds):
-            going_on = (width > self.width).squeeze(1).nonzero().squeeze(-1)
-            if going_on.numel() == 0:
-                break
-            more, value = (table[:, : self.samples].clone() for table in (found.distance, found.value))
-            some = Samples(found.distance[going_on], found.value[going_on])
-            more[going_on] = by_importance(some.distance, _errors(some, width[going_on]), self.samples)
-            value[going_on] = Samples.of(field, rays[going_on], more[going_on]).value
-            found = found.joined(Samples(more, value))  # of the other rays samples twice, which changes nothing
-            some = Samples(found.distance[going_on], found.value[going_on])
-            width = width.index_put((going_on,), self._least_width(some, width[going_on]))
-        return found, width
+        for number in range(self.rounds + 1):
+            bound = Bound.of(found)
+            width = self._least_width(bound, width)
+            ends = (width <= self.width).squeeze(1) | (number == self.rounds)
+            yield index[ends], found.of_rays(ends), width[ends]
+            if ends.all():
+                return
+            index, found, width, bound = index[~ends], found.of_rays(~ends), width[~ends], bound.of_rays(~ends)
+            more = by_importance(found.distance, bound.errors(width), self.samples)
+            found = found.joined(Samples.of(field, rays[index], more))
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Algorithm 1: samples by the weights at the least width whose error is bounded, and equally spaced ones."""
-        found, width = self.bounded(field, rays, entry, leave)
-        fine = by_importance(
-            found.distance, weights(_passing(found.value, found.distance, width))[:, :-1], self.fine_samples
-        )
+        fine = entry.new_empty(len(entry), self.fine_samples)
+        for index, found, width in self.bounded(field, rays, entry, leave):
+            importance = weights(_passing(found.value, found.distance, width))[:, :-1]
+            fine[index] = by_importance(found.distance, importance, self.fine_samples)
         return Samples.of(field, rays, torch.cat([fine, evenly(entry, leave, self.extra_samples)], 1).sort(dim=1)[0])
 
     def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
         return _passing(value, distance, torch.full_like(value[:, :1], self.width))
 
-    def _bound(self, found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-        """Eq. 14: the bound on the error of the opacity."""
-        return _errors(found, width).amax(dim=1)
-
-    def _least_width(self, found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n 1"]:
+    def _least_width(self, bound: "Bound", width: Float[Tensor, "n 1"]) -> Float[Tensor, "n 1"]:
         """The least width from `self.width` to `width` whose error is bounded, by halving; `width` where none is."""
-        low, high = torch.full_like(width, self.width), width
-        reached = self._bound(found, low)[:, None] <= self.error
-        for _ in range(HALVINGS):
+        least = torch.full_like(width, self.width)
+        rest = (bound.greatest(least) > self.error).nonzero().squeeze(-1)
+        bound, low, high = bound.of_rays(rest), least[rest], width[rest]
+        for _ in range(HALVINGS if len(rest) else 0):
             middle = (low + high) / 2
-            holds = self._bound(found, middle)[:, None] <= self.error
+            holds = bound.greatest(middle)[:, None] <= self.error
             low, high = torch.where(holds, low, middle), torch.where(holds, middle, high)
-        return torch.where(reached, self.width, high)
+        return least.index_put((rest,), high)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The bound on the error of the opacity along n rays, for any width (Theorem 1, Eq. 14).
+
+    `value` is that of the sample with which each interval begins, `spacing` its length, `clearance` how far it is from
+    the surface at least.
+    """
+
+    value: Float[Tensor, "n intervals"]
+    spacing: Float[Tensor, "n intervals"]
+    clearance: Float[Tensor, "n intervals"]
+
+    @staticmethod
+    def of(found: Samples) -> "Bound":
+        """The bound of the rays' samples."""
+        return Bound(found.value[:, :-1], _spacing(found.distance), _clearance(found))
+
+    def of_rays(self, index: Tensor) -> "Bound":
+        """That of some of the rays, by their places or a mask."""
+        return Bound(self.value[index], self.spacing[index], self.clearance[index])
+
+    def errors(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
+        """Of the opacity at each interval (Theorem 1)."""
+        passed = (-density(self.value, width) * self.spacing).cumsum(dim=1)
+        before = torch.nn.functional.pad(passed, (1, 0))[:, :-1]
+        error = (self.spacing.square() * torch.exp(-self.clearance / width)).cumsum(dim=1) / (4 * width.square())
+        return before.exp() * torch.expm1(error.clamp_max(MOST_LOG))
+
+    def greatest(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
+        """The greatest of each ray (Eq. 14)."""
+        return self.errors(width).amax(dim=1)
 
 
 def density(value: Float[Tensor, "n samples"], width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
@@ -149,15 +183,6 @@ def _spacing(distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n intervals
 def _passing(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
     """The logarithm of the share of light that passes each sample: by its density up to the next; all, the last one."""
     return torch.nn.functional.pad(-density(value[:, :-1], width) * _spacing(distance), (0, 1))
-
-
-def _errors(found: Samples, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
-    """Theorem 1: the bounds on the error of the opacity in each interval."""
-    spacing = _spacing(found.distance)
-    passed = (-density(found.value[:, :-1], width) * spacing).cumsum(dim=1)
-    before = torch.nn.functional.pad(passed, (1, 0))[:, :-1]
-    error = (spacing.square() * torch.exp(-_clearance(found) / width)).cumsum(dim=1) / (4 * width.square())
-    return before.exp() * torch.expm1(error.clamp_max(MOST_LOG))
 
 
 def _clearance(found: Samples) -> Float[Tensor, "n intervals"]:
