@@ -92,6 +92,7 @@ KNOWN = {
     "neus": _NEUS,
     "neus_budget": _NEUS_BUDGET,
     "volsdf": _VOLSDF,
+    "volsdf_budget": _VOLSDF,
     "unisurf": _UNISURF,
     "relaxed_boundary": _RELAXED_BOUNDARY,
     "range_analysis": _RANGE_ANALYSIS,
