@@ -46,7 +46,7 @@ PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 NEEDS = {
     "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
     "stability": ("stress=wires",),
-    **{name: ("draw=0",) for _, name in NESTED if name.startswith("space/")},
+    **{name: ("draw=0",) for name in ("_drawn", *(name for _, name in NESTED if name.startswith("space/")))},
 }
 
 

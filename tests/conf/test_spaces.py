@@ -23,7 +23,7 @@ def composed():
 
 
 def ranges(space: str) -> dict[str, tuple[int, float, float]]:
-    """The drawn keys of a space's file: dimension and ends."""
+    """The drawn keys of a space's file, and of what all share: dimension and ends."""
     found = {}
 
     def walk(node, prefix=""):
@@ -34,7 +34,8 @@ def ranges(space: str) -> dict[str, tuple[int, float, float]]:
                 dimension, least, most = str(value)[len("${drawn:") : -1].split(",")
                 found[f"{prefix}{key}"] = (int(dimension), float(least), float(most))
 
-    walk(OmegaConf.to_container(OmegaConf.load(CONF / "method" / "space" / f"{space}.yaml"), resolve=False))
+    for file in ("_drawn", f"space/{space}"):
+        walk(OmegaConf.to_container(OmegaConf.load(CONF / "method" / f"{file}.yaml"), resolve=False))
     return found
 
 
