@@ -86,22 +86,34 @@ class Hinge:
     def of_rendering(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The loss of a rendering; a hit on the foreground is right, whatever the renderer's own threshold."""
-        right = mask & rendering.hit
-        wrong = ~right & (self.violation(rendering.closest, mask) > 0)
-        closest = closest_values(field, rays, rendering, wrong)
-        return self.of(torch.where(right, 0.0, closest), mask)
+        """The loss of a rendering; a hit is right on the foreground and wrong on the background, whatever its value.
+
+        Volume renderers and meshes hit where the least value that they know is larger than `epsilon`. On the background
+        such a hit is off by `epsilon`, as one whose value is 0.
+        """
+        violates = self.violation(rendering.closest, mask) > 0
+        silent = rendering.hit & ~mask & ~violates
+        wrong = silent | (violates & ~(rendering.hit & mask))
+        excess = self._excess(closest_values(field, rays, rendering, wrong), mask)
+        excess = torch.where(silent, excess - excess.detach() + self.epsilon, excess)
+        return self._mean(torch.where(wrong, excess, 0.0))
 
     def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
         """The loss of the field's values of least magnitude on each ray, with their sign."""
-        violation = self.violation(closest, mask)
-        count = torch.full_like(mask, True) if self.average == "all" else violation > 0
-        return self.weight * violation.sum() / count.sum().clamp_min(1)
+        return self._mean(self.violation(closest, mask))
 
     def violation(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """By how much the soft silhouette is on the wrong side; 0 where it is on the right one."""
+        return self._excess(closest, mask).clamp_min(0)
+
+    def _excess(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+        """The violation, which is negative on the right side."""
         soft = (closest if self.signed else closest.abs()) - self.epsilon
-        return torch.where(mask, soft, -soft).clamp_min(0)
+        return torch.where(mask, soft, -soft)
+
+    def _mean(self, violation: Float[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        count = torch.full_like(violation, True, dtype=torch.bool) if self.average == "all" else violation > 0
+        return self.weight * violation.sum() / count.sum().clamp_min(1)
 
 
 @dataclass(frozen=True)

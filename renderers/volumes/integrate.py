@@ -16,7 +16,7 @@ from renderers.rendering import Deferred, Rendering, Status, Volume, assemble
 
 FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
 SEEN = 0.5  # opacity above which a ray has hit
-GAP = 1e-3  # weight of a sample at most, that stands between two surfaces on a ray
+RISE = 1e-5  # of the field between two samples, scene units: less is rounding
 LEAST_IMPORTANCE = 1e-12  # of a whole ray, spread evenly: where nothing is important all of it is
 LEAST_OPACITY = 1e-3  # in the mask loss, which has no gradient beyond it; as in the official code of NeuS
 
@@ -97,8 +97,8 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     """The rendering of a volume: samples are searched without a graph, then summed with one.
 
     `distance` of a hit is a mean of its samples' distances by weight, whose gradient is that of the weights: over the
-    samples with a part around the middle of the ray's light, so that a surface that it passes and one behind that are
-    not averaged. `residual` is the field's value there, between those of the samples beside it.
+    samples of the surface in which the middle of the ray's light stays, so that one that it passes and one behind that
+    are not averaged. `residual` is the field's value there, between those of the samples beside it.
 
     Args:
         rays: of any leading shape.
@@ -176,7 +176,7 @@ class _Part:
         if found.shape[1] < distance.shape[1]:
             distance = (distance[:, 1:] + distance[:, :-1]) / 2
         opacity = found.sum(dim=1)
-        main = found * _around_middle(found.detach())
+        main = found * _around_middle(found.detach(), value)
         mean = (main * distance).sum(dim=1) / main.sum(dim=1).clamp_min(FAINT)
         row, column = (found.detach() > FAINT).nonzero(as_tuple=True)
         return _Part(
@@ -208,11 +208,19 @@ def _with_graph(field: Field, rays: Rays, samples: Samples, passing: Passing) ->
     return samples.value.index_put((row, column), values)
 
 
-def _around_middle(weight: Float[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
-    """The samples with a part that are next to one another about the one at which half of the light has stayed."""
+def _around_middle(weight: Float[Tensor, "n k"], value: Float[Tensor, "n samples"]) -> Bool[Tensor, "n k"]:
+    """The samples of the surface at which half of the light has stayed.
+
+    Between two surfaces the field, still positive, turns from rising to falling.
+    """
     passed = weight.cumsum(dim=1)
     middle = (passed < passed[:, -1:] / 2).sum(dim=1, keepdim=True).clamp_max(weight.shape[1] - 1)
-    group = (weight <= GAP).cumsum(dim=1)
+    step = value[:, 1:] - value[:, :-1]
+    moves = step.abs() > RISE
+    last = torch.where(moves, torch.arange(step.shape[1], device=step.device), 0).cummax(dim=1)[0]  # that moved
+    rising = (step.gather(1, last) > RISE)[:, :-1]
+    turns = rising & (step[:, 1:] < -RISE) & (value[:, 1:-1] > 0)
+    group = torch.nn.functional.pad(turns, (1, 1)).cumsum(dim=1)[:, : weight.shape[1]]
     return group == group.gather(1, middle)
 
 

@@ -25,7 +25,9 @@ class UNISURF:
         into view or leaves it has a part, as wide as the occupancy's fall.
     Needs: a distance or a bound inside the sphere, of which the occupancy is a sigmoid. The paper's occupancy network
         learns how steep it is; a level set here has no length, and is refused.
-    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty.
+    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty. Free
+        samples that have no room count as free space. `distance` is the mean by weight: while the interval is wide it
+        lies in front of the surface, as many samples of some occupancy have stopped the light there.
 
     Args:
         search_samples: equally spaced, among which the first change from free to occupied is searched.
@@ -110,4 +112,7 @@ class UNISURF:
         far = torch.minimum(root + self.interval, leave[hit])
         distance = evenly(entry, leave, self.free_samples + self.samples)
         about = [evenly(entry[hit], near, self.free_samples + 1)[:, :-1], evenly(near, far, self.samples)]
-        return Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
+        samples = Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
+        crowded = hit[near <= entry[hit]]  # the interval begins with the ray: all free samples are at one place
+        samples.value[crowded, : self.free_samples] = self.sphere_radius
+        return samples

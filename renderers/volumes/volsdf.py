@@ -36,7 +36,7 @@ class VolSDF:
         rounds: at most.
         error: epsilon, most that the opacity may be off at the samples.
         fine_samples: by the weights of the opacity that was found.
-        extra_samples: equally spaced, beside these.
+        extra_samples: beside these, of the samples that bound the error, every so many, as in the official code.
         width: beta, in scene units; the density deep inside is its inverse.
         first_width: at the first iteration of an optimisation.
         sharpening: iterations in which the one becomes the other, by equal factors.
@@ -115,12 +115,14 @@ class VolSDF:
             found = found.joined(Samples.of(field, rays[index], more))
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
-        """Algorithm 1: samples by the weights at the least width whose error is bounded, and equally spaced ones."""
-        fine = entry.new_empty(len(entry), self.fine_samples)
+        """Algorithm 1: samples by the weights at the least width whose error is bounded, and some of those before."""
+        distance = entry.new_empty(len(entry), self.fine_samples + self.extra_samples)
         for index, found, width in self.bounded(field, rays, entry, leave):
             importance = weights(_passing(found.value, found.distance, width))[:, :-1]
-            fine[index] = by_importance(found.distance, importance, self.fine_samples)
-        return Samples.of(field, rays, torch.cat([fine, evenly(entry, leave, self.extra_samples)], 1).sort(dim=1)[0])
+            fine = by_importance(found.distance, importance, self.fine_samples)
+            every = torch.linspace(0, found.distance.shape[1] - 1, self.extra_samples, device=entry.device).long()
+            distance[index] = torch.cat([fine, found.distance[:, every]], dim=1).sort(dim=1)[0]
+        return Samples.of(field, rays, distance)
 
     def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
         return _passing(value, distance, torch.full_like(value[:, :1], self.width))

@@ -10,7 +10,7 @@ from bench.config import CONF, load
 from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
-from renderers.rendering import Capabilities, Observed, Renderer
+from renderers.rendering import Capabilities, Observed, Renderer, at_iteration
 from renderers.silhouette import Hinge, SilhouetteLoss
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
@@ -140,8 +140,27 @@ def test_what_cannot_be_is_told(loss, values, message):
 
 def test_a_right_hit_costs_nothing_whatever_the_renderers_own_threshold():
     """A hit within a threshold of .05 has a value far above the loss's; a missed ray must weigh no less for it."""
-    rough = load("renderer", "idr", epsilon=0.05)
-    assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3)[0] == 0
+    rough = load("renderer", "idr", epsilon=0.05)  # hits what is .005 outside as well
+    assert of_sphere(rough, load("silhouette", "hinge"), [True] * 3 + [False] * 2)[0] == 0
+    assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3) == (5e-5, 1.0)
+
+
+@pytest.mark.parametrize("name", ["neus", "volsdf", "unisurf"])
+def test_every_hit_on_the_background_shrinks_the_shape_whatever_its_least_value(name):
+    """The least value that a volume renderer knows may be in front of the surface: at a hit it would cost nothing."""
+    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    side = torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)
+    x, y = torch.meshgrid(side, side, indexing="xy")
+    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
+    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(origins))
+    rendering = at_iteration(load("renderer", name), 0).render(sphere(radius), rays)
+    assert (rendering.hit & (rendering.closest > 5e-5)).sum() > 10
+    loss = Hinge(5e-5, signed=True, average="all").of_rendering(
+        sphere(radius), rays, rendering, torch.zeros_like(rendering.hit)
+    )
+    (slope,) = torch.autograd.grad(loss, radius)
+    assert slope.item() >= rendering.hit.double().mean().item() * 0.999
+    assert loss.item() >= 5e-5 * rendering.hit.double().mean().item() * 0.999
 
 
 @dataclass(frozen=True)

@@ -138,6 +138,29 @@ def test_what_is_seen_behind_gives_way_to_what_comes_into_view():
     assert opacity.item() == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.parametrize("iteration", [0, 50, None])
+@pytest.mark.parametrize("renderer", [NEUS, VOLSDF], ids=lambda one: type(one).__name__)
+def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer, iteration):
+    """Away from the outline the distance to a sphere falls as it grows by 1 / cosine, and all weights have a part."""
+    now = renderer if iteration is None else at_iteration(renderer, iteration)
+    leaf = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
+    rays = parallel(24, half=0.5).flat()
+    rendering = now.render(sphere(leaf), rays)
+    cosine = (0.36 - rays.origins[:, :2].square().sum(-1)).clamp_min(0).sqrt() / 0.6
+    seen = rendering.hit & (cosine > 0.5)
+    assert seen.sum() > 300
+    (rate,) = torch.autograd.grad(rendering.distance[seen].sum(), leaf)
+    assert rate.item() == pytest.approx(-(1 / cosine[seen]).sum().item(), rel=0.12)
+
+
+def test_a_surface_near_the_sphere_has_a_gradient_where_free_samples_of_unisurf_have_no_room():
+    leaf = torch.tensor(0.95, dtype=torch.float64, requires_grad=True)
+    ray = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
+    rendering = at_iteration(UNISURF, 0).render(sphere(leaf), ray)
+    assert rendering.hit.item() and rendering.distance.item() > 1.01  # not where the ray enters
+    assert torch.autograd.grad(rendering.distance.sum(), leaf)[0].item() < -0.2
+
+
 @VOLUMES
 def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
     """At the outline of a sphere in front of a wall what is seen is a mixture, but a hit is one or the other."""
