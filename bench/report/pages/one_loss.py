@@ -35,8 +35,8 @@ NOTES = (
     "take no part, so that Relaxed boundary is IDR with more steps: what these two differ by is the noise of the "
     "choice of settings and of the fits, which the intervals, over shapes, do not contain.",
     "Settings: conf/method/one_loss, chosen on validation shapes by `python -m bench.tune` under the same loss; their "
-    "first lines say from which runs. At desk these are 6 draws, each on 4 runs of sofas and planes from 20 points. What "
-    "a search space has for a renderer's own loss (`mask_sharpness`, `occupancy_width`) has no effect here.",
+    "first lines say from which runs. At desk these are 6 draws, each on 4 runs of sofas and planes from 20 points. "
+    "What a search space has for a renderer's own loss (`mask_sharpness`, `occupancy_width`) has no effect here.",
 )
 Line = dict[str, Any]
 
