@@ -49,6 +49,7 @@ def test_a_line_has_errors_ratio_cost_and_both_fronts(tmp_path):
     newton = line(result, "newton with mask")
     assert newton["ratio"] == "0.500 [0.500, 0.500]; 12 of 12"
     assert (newton["evaluations"], newton["seconds"], newton["failed"]) == (500, 8.0, "0 of 24")
+    assert newton["100"] == pytest.approx(0.5 * (6 + 9) / 2)  # of sofas 1 to 6 and planes 9 to 54
     own = line(result, "newton with mask", "plane")
     assert own["error"] == pytest.approx(0.5 * 720 ** (1 / 6) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
     assert own["100"] == pytest.approx(0.5 * 3.5 * 9) and own["20"] == pytest.approx(0.5 * 3.5 * 9 * 4)

@@ -100,13 +100,18 @@ def _line(experiment: Experiment, runs: Completions, name: str, row: Row) -> Lin
     failures = [runs.failures(each, row) for each in families]
     return {
         **{"family": name, "row": row.name.removesuffix(TUNED), "preset": row.preset.removeprefix(FOLDER)},
-        **{points: runs.median(name, row, points) for points in runs.points},
+        **{points: _median(runs, families, row, points) for points in runs.points},
         "error": statistics.geometric(errors) if errors else statistics.Interval(math.nan, math.nan, math.nan),
         "ratio": None if row == reference else gap(*runs.pair(name, row, reference, finite=True)),
         "evaluations": median_of_known(map(value_evaluations, mine)),
         "seconds": median_of_known(map(loop_seconds, mine)),
         "failed": "{} of {}".format(*(sum(part) for part in zip(*failures, strict=True))),
     }
+
+
+def _median(runs: Completions, families: list[str], row: Row, points: str) -> float | None:
+    errors = [error for name in families for error in runs.errors.get((name, row, points), {}).values()]
+    return float(statistics.median(errors)) if errors else None
 
 
 def _front(lines: list[Line], cost: str) -> set[str]:
