@@ -6,16 +6,17 @@ after another is dropped, as `LADDER` says, and the estimate says which. Runs of
 
 import statistics
 from collections import defaultdict
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+Ladder = tuple[tuple[tuple[str, ...], str], ...]
 Record = dict[str, Any]  # as `read_record` gives it; a planned cell has the same fields, but no environment
 FEWEST = 4  # like runs from which on the spread is that of quartiles; below, the least and the largest
 BELIEVED = 0.25  # cells: how much the estimate weighs against what the sweep's own cells took
 ALWAYS = ("task", "scale")  # demands that are never dropped
 # What is dropped, in this order, and what an estimate then says of the runs that it is from.
-LADDER = (
+LADDER: Ladder = (
     ((), "like runs"),
     (("dataset",), "runs on other shapes"),
     (("dataset", "machine"), "runs on other machines or threads"),
@@ -52,26 +53,30 @@ class Expected:
 class Model:
     """Expects of a run what like runs took."""
 
-    def __init__(self, records: Iterable[Record], cpu: str) -> None:
+    def __init__(
+        self, records: Iterable[Record], cpu: str, *, ladder: Ladder = LADDER, sizes: Sequence[str] = SIZES
+    ) -> None:
         """Learns from records.
 
         Args:
             records: those of a results folder.
             cpu: the name of this machine's processor.
+            ladder: what is dropped where there are no like runs, and what an estimate then says.
+            sizes: keys of the task whose values decide its time.
         """
-        self.cpu = cpu
-        self.known: list[dict[Hashable, list[Record]]] = [defaultdict(list) for _ in LADDER]
+        self.cpu, self.ladder, self.sizes = cpu, ladder, sizes
+        self.known: list[dict[Hashable, list[Record]]] = [defaultdict(list) for _ in ladder]
         for record in records:
             if not _measured(record):
                 continue
-            parts = _parts(record, record["environment"].get("cpu", ""))
-            for (dropped, _), known in zip(LADDER, self.known, strict=True):
+            parts = _parts(record, record["environment"].get("cpu", ""), sizes)
+            for (dropped, _), known in zip(ladder, self.known, strict=True):
                 known[_key(parts, dropped)].append(record)
 
     def of(self, planned: Record) -> Expected | None:
         """What a planned run will take on this machine; None where there is no like run."""
-        parts = _parts(planned, self.cpu)
-        for (dropped, words), known in zip(LADDER, self.known, strict=True):
+        parts = _parts(planned, self.cpu, self.sizes)
+        for (dropped, words), known in zip(self.ladder, self.known, strict=True):
             if like := known.get(_key(parts, dropped)):
                 return _expected(like, words)
         return None
@@ -126,7 +131,7 @@ def _expected(like: list[Record], words: str) -> Expected:
     return Expected(statistics.median(seconds), low, high, max(memory, default=None), len(seconds), words, waited)
 
 
-def _parts(record: Record, cpu: str) -> dict[str, Any]:
+def _parts(record: Record, cpu: str, wanted: Sequence[str]) -> dict[str, Any]:
     """What decides how long a run takes, each part by the name that `LADDER` has for it."""
     config = record["config"]
     scale, view = config.get("scale"), config.get("view")
@@ -136,20 +141,20 @@ def _parts(record: Record, cpu: str) -> dict[str, Any]:
         "scale": str(scale.get("name")) if isinstance(scale, dict) else None,
         "renderer": (record["renderer"], record.get("method", "")),
         "dataset": record["dataset"],
-        "sizes": (*sizes, *_numbers(config.get("task"), "")),
+        "sizes": (*sizes, *_numbers(config.get("task"), "", wanted)),
         "machine": (str(cpu), str(config.get("device")), str(config.get("threads"))),
     }
 
 
-def _numbers(node: Any, name: str) -> list[tuple[str, Any]]:
-    """The values of the keys `SIZES` below a node, with their dotted names."""
+def _numbers(node: Any, name: str, wanted: Sequence[str]) -> list[tuple[str, Any]]:
+    """The values of the wanted keys below a node, with their dotted names."""
     if not isinstance(node, dict):
         return []
     found: list[tuple[str, Any]] = []
     for key, value in sorted(node.items(), key=lambda item: str(item[0])):
         if isinstance(value, dict):
-            found += _numbers(value, f"{name}{key}.")
-        elif key in SIZES and isinstance(value, int | float | str):
+            found += _numbers(value, f"{name}{key}.", wanted)
+        elif key in wanted and isinstance(value, int | float | str):
             found.append((f"{name}{key}", value))
     return found
 

@@ -32,8 +32,12 @@ EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the be
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
-def command_line(job: Callable[[DictConfig], None]) -> int:
+def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int:
     """Composes the configuration of the command line and gives it to `job`, once, or in a sweep once a cell.
+
+    Args:
+        job: what the command does; where its cells are no runs, `plan=true` is its to read.
+        runs: whether the cells of a sweep are runs, so that they have a plan.
 
     Returns:
         the exit status: 0, or the status of a mistake that was told on standard error.
@@ -53,6 +57,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
             raised.append(error)
 
     catch_signals()
+    Sweep.other = None if runs else job
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         sys.argv[1:] = options_first(sys.argv[1:])
