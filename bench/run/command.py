@@ -23,6 +23,7 @@ from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.targets import check_targets
+from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
@@ -154,7 +155,7 @@ def _explain(error: Exception) -> str:
             nested = missing.startswith("hydra/") or "/" not in missing
             group, _, name = missing.rpartition("/") if nested else missing.partition("/")
             if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
-                return f"hydra/launcher={name} needs a plugin: pip install -e '.[{extra}]'"
+                return f"hydra/launcher={name} needs a plugin: {install(extra)}"
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
             known = [option for option in cause.options or [] if not option.startswith("_")]  # others build on these
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
