@@ -13,7 +13,6 @@ from typing import Any
 Ladder = tuple[tuple[tuple[str, ...], str], ...]
 Record = dict[str, Any]  # as `read_record` gives it; a planned cell has the same fields, but no environment
 FEWEST = 4  # like runs from which on the spread is that of quartiles; below, the least and the largest
-BELIEVED = 0.25  # cells: how much the estimate weighs against what the sweep's own cells took
 ALWAYS = ("task", "scale")  # demands that are never dropped
 # What is dropped, in this order, and what an estimate then says of the runs that it is from.
 LADDER: Ladder = (
@@ -84,35 +83,47 @@ class Model:
 
 @dataclass
 class Remaining:
-    """The time left of a sweep: what its cells are expected to take, corrected by what was measured so far.
+    """The time left of a sweep: what its cells are expected to take, corrected by what its ended cells took.
+
+    The correction is the median, over the ended cells, of the time that a cell took over the time that it was expected
+    to take: this machine, with its load of today. Until there are some, the expectation itself counts as one more.
 
     Args:
-        cells: what each cell is expected to take, by its id; None where there is no like run. Those that are reused
-            are not among them.
+        cells: what each cell is expected to take, by its id, in the order in which they run; None where there is no
+            like run. Those that are reused are not among them.
         workers: how many cells run at a time.
     """
 
     cells: dict[str, Expected | None]
     workers: int
-    done: set[str] = field(default_factory=set)
+    done: dict[str, float | None] = field(default_factory=dict)  # what each ended cell took; None: not its whole time
+    latest: float = 0.0  # when the last of them ended, in seconds since the sweep began
 
-    def ended(self, cell: str) -> None:
-        """Notes that a cell has ended; one that was reused takes no time."""
-        if cell in self.cells:
-            self.done.add(cell)
+    def ended(self, cell: str, record: Record, elapsed: float) -> None:
+        """Notes the record of a cell that has ended by now; one that was reused takes no time."""
+        if cell in self.cells and cell not in self.done:
+            whole = _measured(record) and not record.get("reused")  # a reused one: another command ran it meanwhile
+            self.done[cell] = float(record["seconds"]["total"]) if whole else None
+            self.latest = elapsed
 
     def left(self, elapsed: float) -> float | None:
         """Seconds left, `elapsed` seconds after the sweep began; None where nothing is known yet."""
         known = [expected.seconds for expected in self.cells.values() if expected is not None]
-        usual = statistics.mean(known) if known else 1.0  # of a cell without a like run: as long as the others
-        if not known and not self.done:
+        took = {cell: seconds for cell, seconds in self.done.items() if seconds is not None}
+        if not known and not took:
             return None
+        usual = statistics.mean(known) if known else statistics.median(took.values())  # of cells without a like run
         weights = {cell: usual if expected is None else expected.seconds for cell, expected in self.cells.items()}
-        ended = sum(weight for cell, weight in weights.items() if cell in self.done)
-        pending = sum(weight for cell, weight in weights.items() if cell not in self.done)
-        # Seconds of the clock for each that was expected; a part of a cell's worth is believed from the beginning.
-        believed = BELIEVED * usual if known else 0.0
-        return pending * (elapsed * bool(self.done) + believed / self.workers) / (ended + believed)
+        slower = statistics.median([1.0, *(seconds / weights[cell] for cell, seconds in took.items())])
+        pending = [slower * weight + self._between(took) for cell, weight in weights.items() if cell not in self.done]
+        whole, others = sum(pending) / self.workers, sum(pending[self.workers :]) / self.workers
+        return max(whole - (elapsed - self.latest), others)  # of those that are under way, some is done
+
+    def _between(self, took: dict[str, float]) -> float:
+        """Seconds from the end of a cell to the start of the next one; of several at a time that is not known."""
+        if self.workers > 1 or not took or len(took) < len(self.done):
+            return 0.0
+        return max(self.latest - sum(took.values()), 0.0) / len(took)
 
 
 def _measured(record: Record) -> bool:

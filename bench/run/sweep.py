@@ -200,7 +200,7 @@ def followed(plan: Plan, left: Remaining) -> Iterator[None]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    left.ended(cell.id)
+                    left.ended(cell.id, record, time.monotonic() - begun)
                     text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
                     print(place(left.left(time.monotonic() - begun)) + text, flush=True)
             ended = len(plan.cells) - len(pending)
