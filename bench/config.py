@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.hints import nearest, renamed
 from bench.rows import LABEL, ROWS, register_resolvers
 from bench.targets import LEAVE, find_class
-from datasets.dataset import Split
+from datasets.dataset import SPLIT_STRIDE, Split
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 LEAST = {
@@ -159,6 +159,8 @@ def check_top_level(config: DictConfig) -> None:
         raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
     if config.evaluation.film is not None and config.evaluation.picture is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
+    if config.index >= SPLIT_STRIDE:
+        raise ValueError(f"index must be at most {SPLIT_STRIDE - 1}, not {config.index}: a split has no more shapes")
     for name, least in LEAST.items():
         value = OmegaConf.select(config, name)
         if isinstance(value, int) and value < least:

@@ -1,0 +1,1 @@
+"""Configurations (implicit-bench): YAML only; a package, so that it is installed."""

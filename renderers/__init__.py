@@ -1,4 +1,7 @@
-"""Differentiable renderers of implicit surfaces. They turn a field and rays into a rendering, and know no task."""
+"""Differentiable renderers of implicit surfaces (implicit-bench). They know no task.
+
+They turn a field and rays into a rendering.
+"""
 
 from renderers.camera import Camera, Rays
 from renderers.dist import DIST

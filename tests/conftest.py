@@ -101,7 +101,7 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def asked_once() -> Iterator[None]:
-    """Caches, for runs in this process, what each run would find out anew; runs in processes of their own do ask.
+    """Caches, for runs in this process, what each run would find out anew; `tests.run.spared` is for runs in others.
 
     These are what git says, the machine's matrix product rate, and `hydra.mode`, for which Hydra composes the
     configuration of a command once more; a test in conf checks that no configuration sets it.
@@ -110,6 +110,7 @@ def asked_once() -> Iterator[None]:
     from hydra._internal.hydra import Hydra
 
     from bench.machine import environment
+    from bench.run import process
 
     measure = environment.gemm_peak
     rate = cache(lambda *asked: measure(*asked[:-1]))  # for each number of threads
@@ -117,6 +118,10 @@ def asked_once() -> Iterator[None]:
         patch.setattr(environment, "_git", cache(environment._git))
         patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
+        # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
+        loaded = [*process.preloaded(), "pytest", "tests.run.spared"]
+        patch.setattr(process, "preloaded", lambda: loaded)
+        patch.setattr("bench.run.run.needed", lambda config: [])
         yield
 
 

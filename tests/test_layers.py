@@ -41,7 +41,8 @@ PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds module
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a method that is made of what others maintain
 WITHOUT_TORCH = ("bench.records", "bench.report", "bench.pictures.style", "bench.pictures.size_chart")
-REPORT_MAY = ("bench.report", "bench.records", "bench.pictures.style", "bench.pictures.size_chart")
+COMMON = "datasets.extras"  # without torch, and of use to all but renderers
+REPORT_MAY = (COMMON, "bench.report", "bench.records", "bench.pictures.style", "bench.pictures.size_chart")
 
 
 def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
@@ -95,7 +96,8 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
             f"imports {name}" for name in names if name.split(".")[0] not in RENDERERS_MAY | ALSO.get(module, set())
         ]
     if within(module, *WITHOUT_TORCH):
-        found += [f"imports {name}" for name in names if within(name, "torch", "renderers", "datasets")]
+        slow = [name for name in names if within(name, "torch", "renderers", "datasets")]
+        found += [f"imports {name}" for name in slow if not within(name, COMMON)]
     if within(module, "bench.report"):
         found += [f"imports {name}" for name in names if name.split(".")[0] in OURS and not within(name, *REPORT_MAY)]
     if module == "bench":  # runs before every import of bench.report, and before torch may be imported

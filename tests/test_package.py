@@ -15,6 +15,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bench.run.command import EXTRAS
+from datasets.extras import install
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "conf", "datasets", "renderers")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -49,6 +52,58 @@ def test_one_version_is_told_everywhere():
     assert f"version = {{{VERSION}}}" in (ROOT / "README.md").read_text(encoding="utf-8")
     headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert VERSION in headings[:2]  # what is unreleased may stand before it
+
+
+def test_an_extra_is_installed_into_the_checkout_or_beside_the_installed_package(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert install("ray") == "pip install -e '.[ray]'"
+    monkeypatch.chdir(tmp_path)
+    assert install("ray") == f"pip install -e '{ROOT}[ray]'"
+    assert install("ray", tmp_path) == "pip install 'implicit-bench[ray]'"
+
+
+def test_every_extra_that_a_message_names_is_there():
+    sources = [(ROOT / path).read_text(encoding="utf-8") for path in of_packages(tracked()) if path.endswith(".py")]
+    named = [found for source in sources for found in re.findall(r"""\binstall\(["'](\w+)["']\)""", source)]
+    assert len(named) >= 5
+    assert {*named, *EXTRAS.values()} <= set(PROJECT["project"]["optional-dependencies"])
+
+
+def started(folder: Path, *arguments: str) -> tuple[int, str]:
+    """The exit status and standard error of Python in a folder, which comes before all others that have modules."""
+    paths = {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+    program = [sys.executable, *arguments]
+    done = subprocess.run(program, cwd=folder, env=os.environ | paths, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("file", ["datasets/__init__.py", "datasets.py", "renderers/__init__.py"])
+def test_another_package_in_the_place_of_ours_is_told_in_one_line(tmp_path, file):
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('"""Of another project."""\nraise RuntimeError("it was imported")')
+    said = f"{path} is not the package {file.split('/')[0].removesuffix('.py')} of implicit-bench"
+    code, err = started(tmp_path, "-m", "bench.report", "--help")
+    assert code == 1 and err.startswith(f"error: {said}") and len(err.splitlines()) == 1
+    assert "an environment of its own (python -m venv)" in err
+    code, err = started(tmp_path, "-c", "import bench")
+    assert code == 1 and err.splitlines()[-1].startswith(f"ImportError: {said}")
+
+
+@pytest.mark.parametrize("name", PACKAGES[1:])
+def test_a_package_that_was_installed_over_ours_is_told(tmp_path, name):
+    for package in PACKAGES:
+        (tmp_path / package).mkdir()
+        shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
+    assert started(tmp_path, "-S", "-c", "import bench") == (0, "")
+    (tmp_path / name / "__init__.py").write_text("# of another project")
+    code, err = started(tmp_path, "-S", "-c", "import bench")
+    assert code == 1 and f"not the package {name} of implicit-bench" in err
+
+
+def test_a_conf_of_ones_own_does_no_harm(tmp_path):
+    (tmp_path / "conf.py").write_text("project = 'documentation'")
+    assert started(tmp_path, "-c", "import bench") == (0, "")
 
 
 @pytest.fixture(scope="module")

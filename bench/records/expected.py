@@ -6,16 +6,16 @@ after another is dropped, as `LADDER` says, and the estimate says which. Runs of
 
 import statistics
 from collections import defaultdict
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+Ladder = tuple[tuple[tuple[str, ...], str], ...]
 Record = dict[str, Any]  # as `read_record` gives it; a planned cell has the same fields, but no environment
 FEWEST = 4  # like runs from which on the spread is that of quartiles; below, the least and the largest
-BELIEVED = 0.25  # cells: how much the estimate weighs against what the sweep's own cells took
 ALWAYS = ("task", "scale")  # demands that are never dropped
 # What is dropped, in this order, and what an estimate then says of the runs that it is from.
-LADDER = (
+LADDER: Ladder = (
     ((), "like runs"),
     (("dataset",), "runs on other shapes"),
     (("dataset", "machine"), "runs on other machines or threads"),
@@ -52,26 +52,30 @@ class Expected:
 class Model:
     """Expects of a run what like runs took."""
 
-    def __init__(self, records: Iterable[Record], cpu: str) -> None:
+    def __init__(
+        self, records: Iterable[Record], cpu: str, *, ladder: Ladder = LADDER, sizes: Sequence[str] = SIZES
+    ) -> None:
         """Learns from records.
 
         Args:
             records: those of a results folder.
             cpu: the name of this machine's processor.
+            ladder: what is dropped where there are no like runs, and what an estimate then says.
+            sizes: keys of the task whose values decide its time.
         """
-        self.cpu = cpu
-        self.known: list[dict[Hashable, list[Record]]] = [defaultdict(list) for _ in LADDER]
+        self.cpu, self.ladder, self.sizes = cpu, ladder, sizes
+        self.known: list[dict[Hashable, list[Record]]] = [defaultdict(list) for _ in ladder]
         for record in records:
             if not _measured(record):
                 continue
-            parts = _parts(record, record["environment"].get("cpu", ""))
-            for (dropped, _), known in zip(LADDER, self.known, strict=True):
+            parts = _parts(record, record["environment"].get("cpu", ""), sizes)
+            for (dropped, _), known in zip(ladder, self.known, strict=True):
                 known[_key(parts, dropped)].append(record)
 
     def of(self, planned: Record) -> Expected | None:
         """What a planned run will take on this machine; None where there is no like run."""
-        parts = _parts(planned, self.cpu)
-        for (dropped, words), known in zip(LADDER, self.known, strict=True):
+        parts = _parts(planned, self.cpu, self.sizes)
+        for (dropped, words), known in zip(self.ladder, self.known, strict=True):
             if like := known.get(_key(parts, dropped)):
                 return _expected(like, words)
         return None
@@ -79,35 +83,47 @@ class Model:
 
 @dataclass
 class Remaining:
-    """The time left of a sweep: what its cells are expected to take, corrected by what was measured so far.
+    """The time left of a sweep: what its cells are expected to take, corrected by what its ended cells took.
+
+    The correction is the median, over the ended cells, of the time that a cell took over the time that it was expected
+    to take: this machine, with its load of today. Until there are some, the expectation itself counts as one more.
 
     Args:
-        cells: what each cell is expected to take, by its id; None where there is no like run. Those that are reused
-            are not among them.
+        cells: what each cell is expected to take, by its id, in the order in which they run; None where there is no
+            like run. Those that are reused are not among them.
         workers: how many cells run at a time.
     """
 
     cells: dict[str, Expected | None]
     workers: int
-    done: set[str] = field(default_factory=set)
+    done: dict[str, float | None] = field(default_factory=dict)  # what each ended cell took; None: not its whole time
+    latest: float = 0.0  # when the last of them ended, in seconds since the sweep began
 
-    def ended(self, cell: str) -> None:
-        """Notes that a cell has ended; one that was reused takes no time."""
-        if cell in self.cells:
-            self.done.add(cell)
+    def ended(self, cell: str, record: Record, elapsed: float) -> None:
+        """Notes the record of a cell that has ended by now; one that was reused takes no time."""
+        if cell in self.cells and cell not in self.done:
+            whole = _measured(record) and not record.get("reused")  # a reused one: another command ran it meanwhile
+            self.done[cell] = float(record["seconds"]["total"]) if whole else None
+            self.latest = elapsed
 
     def left(self, elapsed: float) -> float | None:
         """Seconds left, `elapsed` seconds after the sweep began; None where nothing is known yet."""
         known = [expected.seconds for expected in self.cells.values() if expected is not None]
-        usual = statistics.mean(known) if known else 1.0  # of a cell without a like run: as long as the others
-        if not known and not self.done:
+        took = {cell: seconds for cell, seconds in self.done.items() if seconds is not None}
+        if not known and not took:
             return None
+        usual = statistics.mean(known) if known else statistics.median(took.values())  # of cells without a like run
         weights = {cell: usual if expected is None else expected.seconds for cell, expected in self.cells.items()}
-        ended = sum(weight for cell, weight in weights.items() if cell in self.done)
-        pending = sum(weight for cell, weight in weights.items() if cell not in self.done)
-        # Seconds of the clock for each that was expected; a part of a cell's worth is believed from the beginning.
-        believed = BELIEVED * usual if known else 0.0
-        return pending * (elapsed * bool(self.done) + believed / self.workers) / (ended + believed)
+        slower = statistics.median([1.0, *(seconds / weights[cell] for cell, seconds in took.items())])
+        pending = [slower * weight + self._between(took) for cell, weight in weights.items() if cell not in self.done]
+        whole, others = sum(pending) / self.workers, sum(pending[self.workers :]) / self.workers
+        return max(whole - (elapsed - self.latest), others)  # of those that are under way, some is done
+
+    def _between(self, took: dict[str, float]) -> float:
+        """Seconds from the end of a cell to the start of the next one; of several at a time that is not known."""
+        if self.workers > 1 or not took or len(took) < len(self.done):
+            return 0.0
+        return max(self.latest - sum(took.values()), 0.0) / len(took)
 
 
 def _measured(record: Record) -> bool:
@@ -126,7 +142,7 @@ def _expected(like: list[Record], words: str) -> Expected:
     return Expected(statistics.median(seconds), low, high, max(memory, default=None), len(seconds), words, waited)
 
 
-def _parts(record: Record, cpu: str) -> dict[str, Any]:
+def _parts(record: Record, cpu: str, wanted: Sequence[str]) -> dict[str, Any]:
     """What decides how long a run takes, each part by the name that `LADDER` has for it."""
     config = record["config"]
     scale, view = config.get("scale"), config.get("view")
@@ -136,20 +152,20 @@ def _parts(record: Record, cpu: str) -> dict[str, Any]:
         "scale": str(scale.get("name")) if isinstance(scale, dict) else None,
         "renderer": (record["renderer"], record.get("method", "")),
         "dataset": record["dataset"],
-        "sizes": (*sizes, *_numbers(config.get("task"), "")),
+        "sizes": (*sizes, *_numbers(config.get("task"), "", wanted)),
         "machine": (str(cpu), str(config.get("device")), str(config.get("threads"))),
     }
 
 
-def _numbers(node: Any, name: str) -> list[tuple[str, Any]]:
-    """The values of the keys `SIZES` below a node, with their dotted names."""
+def _numbers(node: Any, name: str, wanted: Sequence[str]) -> list[tuple[str, Any]]:
+    """The values of the wanted keys below a node, with their dotted names."""
     if not isinstance(node, dict):
         return []
     found: list[tuple[str, Any]] = []
     for key, value in sorted(node.items(), key=lambda item: str(item[0])):
         if isinstance(value, dict):
-            found += _numbers(value, f"{name}{key}.")
-        elif key in SIZES and isinstance(value, int | float | str):
+            found += _numbers(value, f"{name}{key}.", wanted)
+        elif key in wanted and isinstance(value, int | float | str):
             found.append((f"{name}{key}", value))
     return found
 

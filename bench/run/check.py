@@ -6,7 +6,7 @@ a process that branches off from the server of processes, as runs do, or with is
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
@@ -18,6 +18,7 @@ from bench.config import Isolation, build, built_once, check_top_level, register
 from bench.records.folder import Identity
 from bench.records.read import Plan, PlannedCell
 from bench.run.process import BOOT, RunLimits, fork_server, raise_if_stopped, signals_delayed
+from bench.targets import OURS
 
 Config = dict[str, Any]  # resolved, as plain data
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
@@ -37,11 +38,23 @@ UNREAD = (
 INTERVAL = 0.1  # seconds between two looks at whether the user stopped it
 
 
-def warm_up() -> None:
-    """Starts the server of processes, which loads what is slow while this process does something else."""
-    fork_server()
+def warm_up(modules: Sequence[str] = ()) -> None:
+    """Starts the server of processes, which loads what is slow while this process does something else.
+
+    Args:
+        modules: that it loads; none are all that runs import.
+    """
+    fork_server(modules)
     with signals_delayed():
         forkserver.ensure_running()
+
+
+def needed(config: Config) -> list[str]:
+    """Modules that the check of a configuration takes: half of what its run takes, and a second or two sooner there."""
+    parts = [config.get(name) for name in ("task", "renderer", "dataset")]
+    paths = [str(part.get("_target_")) for part in parts if isinstance(part, dict)]
+    modules = [path.rpartition(".")[0] for path in paths if path.split(".")[0] in OURS]
+    return ["bench", "bench.run.execute", *modules]
 
 
 def check_apart(config: DictConfig) -> None:

@@ -23,6 +23,7 @@ from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.targets import check_targets
+from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
@@ -32,8 +33,12 @@ EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the be
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
-def command_line(job: Callable[[DictConfig], None]) -> int:
+def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int:
     """Composes the configuration of the command line and gives it to `job`, once, or in a sweep once a cell.
+
+    Args:
+        job: what the command does; where its cells are no runs, `plan=true` is its to read.
+        runs: whether the cells of a sweep are runs, so that they have a plan.
 
     Returns:
         the exit status: 0, or the status of a mistake that was told on standard error.
@@ -53,6 +58,7 @@ def command_line(job: Callable[[DictConfig], None]) -> int:
             raised.append(error)
 
     catch_signals()
+    Sweep.other = None if runs else job
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         sys.argv[1:] = options_first(sys.argv[1:])
@@ -149,7 +155,7 @@ def _explain(error: Exception) -> str:
             nested = missing.startswith("hydra/") or "/" not in missing
             group, _, name = missing.rpartition("/") if nested else missing.partition("/")
             if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
-                return f"hydra/launcher={name} needs a plugin: pip install -e '.[{extra}]'"
+                return f"hydra/launcher={name} needs a plugin: {install(extra)}"
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
             known = [option for option in cause.options or [] if not option.startswith("_")]  # others build on these
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""

@@ -1,6 +1,6 @@
 """`plan=true`: lists what would run, with the time and the memory that like runs took; runs nothing, writes nothing."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bench.machine.processor import cpu_name
@@ -10,6 +10,19 @@ from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
 
 BUSY = 0.05  # share of the time that like runs waited, above which it is told
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a plan says of what it lists: what would be done, that it was done before, what no estimate is from."""
+
+    noun: str
+    verb: str
+    done: str
+    like: str
+
+
+RUNS = Words("run", "run", "reused", "like run")
 
 
 class Shown(BaseException):
@@ -35,7 +48,7 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     for number, cell in enumerate(plan.cells, 1):
         about = "reused" if cell.id in reused else told(left.cells[cell.id])
         print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
-    print(total(plan, left))
+    print(total(len(plan.cells), left))
     known = [expected for expected in left.cells.values() if expected is not None]
     if (whole := sum(e.seconds for e in known)) and (waited := sum(e.waited * e.seconds for e in known) / whole) > BUSY:
         free = seconds(whole * (1 - waited) / left.workers)
@@ -47,24 +60,24 @@ def named(cell: PlannedCell) -> str:
     return ", ".join((cell.task, row_name(cell.config, cell.renderer), cell.dataset))
 
 
-def told(expected: Expected | None) -> str:
+def told(expected: Expected | None, words: Words = RUNS) -> str:
     """What a run will take, in words."""
     if expected is None:
-        return "no like run"
+        return f"no {words.like}"
     spread = "" if expected.n == 1 else f", {seconds(expected.low)} to {seconds(expected.high)}"
     memory = "" if expected.memory is None else f", +{size(expected.memory)}"
-    runs = expected.like.replace("runs", "run") if expected.n == 1 else expected.like
+    runs = expected.like.replace(f"{words.noun}s", words.noun) if expected.n == 1 else expected.like
     return f"about {seconds(expected.seconds)} ({expected.n} {runs}{spread}){memory}"
 
 
-def total(plan: Plan, left: Remaining) -> str:
-    """The sum over a plan's cells, in a line."""
+def total(planned: int, left: Remaining, words: Words = RUNS) -> str:
+    """The sum over all that is planned, in a line."""
     known = [expected for expected in left.cells.values() if expected is not None]
-    parts = [f"{len(plan.cells)} planned: {len(left.cells)} to run"]
-    if reused := len(plan.cells) - len(left.cells):
-        parts.append(f"{reused} reused")
+    parts = [f"{planned} planned: {len(left.cells)} to {words.verb}"]
+    if done := planned - len(left.cells):
+        parts.append(f"{done} {words.done}")
     if unknown := len(left.cells) - len(known):
-        parts.append(f"{unknown} without a like run")
+        parts.append(f"{unknown} without a {words.like}")
     text = ", ".join(parts)
     if not known:
         return text + ("" if left.cells else "; nothing is left to do")

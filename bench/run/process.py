@@ -4,9 +4,10 @@ import errno
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
@@ -139,17 +140,29 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
                 _end(process, channel, receive)
 
 
-def fork_server() -> ForkServerContext:
-    """The context of processes that branch off from a server, which has imported what is slow, once for all of them."""
+def preloaded() -> list[str]:
+    """Modules that runs import and that are slow to import; bench first, as it sets what torch reads at its import."""
     packages = bench.tasks, datasets
     named = [module.name for one in packages for module in iter_modules(one.__path__, f"{one.__name__}.")]
+    return ["bench", "open3d", "bench.run.execute", *named]
+
+
+def fork_server(modules: Sequence[str] = ()) -> ForkServerContext:
+    """The context of processes that branch off from a server, which has imported what is slow, once for all of them.
+
+    Args:
+        modules: that the server imports before its first process, where it is not there yet; none are all that runs
+            import, which is best for a sweep.
+    """
     context = multiprocessing.get_context("forkserver")
-    # bench first: it sets what torch reads at its import
-    context.set_forkserver_preload(["bench", "open3d", "bench.run.execute", *named])
+    context.set_forkserver_preload([*modules] or preloaded())
     return context
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:
+    for module in preloaded():  # what the server has left out, so that it is imported off the run's clocks
+        with suppress(ImportError):
+            import_module(module)
     from bench.run.execute import main
 
     main(job, channel, parent)

@@ -17,7 +17,7 @@ from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, identify, release, reusable
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus, now, read_record
-from bench.run.check import refusals
+from bench.run.check import needed, refusals, warm_up
 from bench.run.command import unwritten
 from bench.run.plan import show_plan
 from bench.run.process import (
@@ -94,6 +94,8 @@ def _check(config: DictConfig) -> None:
     identity = identify(config, HydraConfig.get().runtime)
     results_dir = Path(config.results_dir)
     reused = reusable(results_dir / "runs" / identity.name, identity, config.rerun) is not None
+    if not reused and config.isolation == Isolation.process:
+        warm_up(needed(identity.config))
     if not reused and (reason := refusals([identity.config], config.isolation)[0]):
         raise ValueError(reason)
     if config.plan:

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -44,9 +44,13 @@ class Refused(BaseException):
 
 
 class Sweep:
-    """The sweep that this process drives; `plan` is None where it drives none."""
+    """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs.
+
+    What a command does with a cell that is no run is `other`; it is None where the cells are runs.
+    """
 
     plan: Plan | None = None
+    other: Callable[[DictConfig], None] | None = None
     shown = ExitStack()
 
     @classmethod
@@ -71,6 +75,10 @@ class Planner(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Plans the sweep and starts to follow it."""
+        if Sweep.other is not None:
+            if config.plan:
+                self.list_others(config, Sweep.other)
+            return
         try:
             if config.isolation == Isolation.process:
                 warm_up()
@@ -85,9 +93,19 @@ class Planner(Callback):
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
 
+    def list_others(self, config: DictConfig, tell: Callable[[DictConfig], None]) -> None:
+        """Lists the cells of a sweep that are no runs, in this process."""
+        try:
+            for cell in make_plan(config).cells:
+                tell(OmegaConf.create(cell.config))
+        except Exception as error:
+            raise Refused(error) from error
+        raise Shown
+
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Gives Hydra its own check back."""
-        Sweeper.validate_batch_is_legal = self.check
+        if Sweep.other is None:
+            Sweeper.validate_batch_is_legal = self.check
 
 
 def make_plan(config: DictConfig) -> Plan:
@@ -182,7 +200,7 @@ def followed(plan: Plan, left: Remaining) -> Iterator[None]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    left.ended(cell.id)
+                    left.ended(cell.id, record, time.monotonic() - begun)
                     text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
                     print(place(left.left(time.monotonic() - begun)) + text, flush=True)
             ended = len(plan.cells) - len(pending)

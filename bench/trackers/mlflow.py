@@ -8,6 +8,7 @@ from typing import Any
 
 from bench.records.record import started
 from bench.trackers import curve, settings, values
+from datasets.extras import install
 
 METRICS, PARAMETERS = 1000, 100  # largest numbers that one call of log_batch takes
 LONGEST = 500  # characters of a parameter's value
@@ -29,7 +30,7 @@ class MLflow:
 
     def __post_init__(self) -> None:
         if find_spec("mlflow") is None:  # checked before the run, not after it
-            raise ValueError("tracker=mlflow needs MLflow: pip install -e '.[mlflow]'")
+            raise ValueError(f"tracker=mlflow needs MLflow: {install('mlflow')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Makes a run in MLflow; its status is FINISHED where the run ended ok, else FAILED."""

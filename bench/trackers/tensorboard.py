@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.trackers import curve, settings, values
+from datasets.extras import install
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class TensorBoard:
 
     def __post_init__(self) -> None:
         if find_spec("tensorboard") is None:  # checked before the run, not after it
-            raise ValueError("tracker=tensorboard needs TensorBoard: pip install -e '.[tensorboard]'")
+            raise ValueError(f"tracker=tensorboard needs TensorBoard: {install('tensorboard')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Writes the run's event file."""

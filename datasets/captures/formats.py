@@ -17,6 +17,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.linalg import rq
 
+from datasets.extras import install
 from renderers.checks import BadInput
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -233,7 +234,7 @@ def colmap(folder: Path) -> Layout | None:
     try:
         import pycolmap
     except ImportError as error:
-        raise BadInput(f"{places[0]} is read by pycolmap: pip install -e '.[colmap]'") from error
+        raise BadInput(f"{places[0]} is read by pycolmap: {install('colmap')}") from error
     stored = pycolmap.Reconstruction(str(places[0]))
     images = {image.name: image for image in _images(folder, "images", "images_2", "images_4", "images_8")}
     masks, frames, missing = _matched(list(images.values()), _images(folder, "mask", "masks")), [], []

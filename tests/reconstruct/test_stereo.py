@@ -1,5 +1,6 @@
 """Points that photographs of a textured sphere agree on: they lie on it, and those outside of masks are left out."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import torch
 
 from bench.reconstruct import stereo
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
+from datasets.extras import install
 from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput
@@ -131,7 +133,7 @@ def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
 def test_without_opencv_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0))) for turn in (0.0, 10.0)]
-    with pytest.raises(BadInput, match=r"task=stereo needs OpenCV: type pip install -e '\.\[stereo\]'"):
+    with pytest.raises(BadInput, match=re.escape(f"task=stereo needs OpenCV: type {install('stereo')}")):
         stereo_clouds(shots, ALL)
 
 

@@ -62,29 +62,70 @@ def test_before_the_first_cell_the_time_left_is_the_sum_for_the_workers():
     assert Remaining(expected(None, None), workers=1).left(5.0) is None
 
 
+def after(left: Remaining, *seconds: float, pause: float = 0.0) -> float:
+    """Lets the first cells end one after another, each after its seconds; gives the time of the last end."""
+    elapsed = 0.0
+    for cell, spent in enumerate(seconds):
+        elapsed += (spent + pause) / left.workers
+        left.ended(str(cell), run(spent), elapsed)
+    return elapsed
+
+
 def test_each_cell_counts_as_long_as_it_is_expected_to_take():
     left = Remaining(expected(10.0, 10.0, 100.0), workers=1)
-    left.ended("0")
-    assert left.left(10.0) == pytest.approx(110.0)
-    left.ended("1")
-    assert left.left(20.0) == pytest.approx(100.0)
-    left.ended("2")
+    assert after(left, 10.0) == 10.0 and left.left(10.0) == pytest.approx(110.0)
+    assert after(left, 10.0, 10.0) == 20.0 and left.left(20.0) == pytest.approx(100.0)
+    after(left, 10.0, 10.0, 100.0)
     assert left.left(120.0) == 0.0
 
 
-def test_a_slower_machine_is_noticed():
-    left, plain = Remaining(expected(*[10.0] * 100), workers=1), Remaining(expected(*[None] * 100), workers=1)
-    for cell in range(50):
-        left.ended(str(cell))
-        plain.ended(str(cell))
-    assert left.left(1000.0) == pytest.approx(1000.0, rel=0.02)
-    assert plain.left(1000.0) == pytest.approx(1000.0)  # without a like run, by what was measured alone
+def test_what_is_under_way_is_partly_done():
+    left = Remaining(expected(10.0, 10.0, 100.0, 30.0), workers=1)
+    after(left, 10.0, 10.0)
+    assert [left.left(time) for time in (20.0, 60.0, 110.0)] == pytest.approx([130.0, 90.0, 40.0])
+    assert left.left(500.0) == pytest.approx(30.0)  # it takes longer than expected: the next one is still to come
+    two = Remaining(expected(*[10.0] * 6), workers=2)
+    after(two, 10.0, 10.0)
+    assert [two.left(time) for time in (10.0, 15.0, 99.0)] == pytest.approx([20.0, 15.0, 10.0])
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_a_slower_machine_is_noticed(workers):
+    left = Remaining(expected(*[10.0, 30.0] * 50), workers)
+    assert left.left(after(left, *[20.0, 60.0] * 25)) == pytest.approx(2000.0 * 2 / 2 / workers)
+    plain = Remaining(expected(*[None] * 100), workers)
+    assert plain.left(after(plain, *[20.0] * 50)) == pytest.approx(1000.0 / workers)  # by what was measured alone
+
+
+def test_one_cell_alone_is_half_believed():
+    left = Remaining(expected(10.0, 10.0), workers=1)
+    assert left.left(after(left, 30.0)) == pytest.approx(20.0)
+
+
+def test_a_cell_that_took_far_too_long_does_not_stand_for_the_others():
+    left = Remaining(expected(*[10.0] * 10), workers=2)
+    assert left.left(after(left, 11.0, 3600.0, 11.0, 11.0, 11.0)) == pytest.approx(5 * 11.0 / 2)
+
+
+@pytest.mark.parametrize("ended", [
+    {"status": "crashed"}, {"status": "killed"}, {"status": "refused"}, {"status": "unsupported"}, {"reused": True},
+])  # fmt: skip
+def test_a_cell_that_did_not_take_its_whole_time_does_not_stand_for_the_others(ended):
+    left = Remaining(expected(*[10.0] * 5), workers=1)
+    for cell in "012":
+        left.ended(cell, run(0.1) | ended, 0.3)
+    assert left.left(0.3) == pytest.approx(20.0)
+
+
+def test_the_time_between_cells_counts():
+    left = Remaining(expected(*[2.0] * 10), workers=1)
+    assert left.left(after(left, *[2.0] * 4, pause=0.5)) == pytest.approx(6 * 2.5)
 
 
 def test_cells_that_are_reused_take_no_time():
     left = Remaining(expected(10.0, 10.0), workers=1)
-    left.ended("reused")
-    assert left.left(0.5) == pytest.approx(20.0)
+    left.ended("reused", run(10.0), 0.5)
+    assert left.left(0.0) == pytest.approx(20.0)
 
 
 def test_it_says_for_how_long_like_runs_waited_for_a_processor():

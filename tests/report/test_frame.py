@@ -10,6 +10,7 @@ import bench
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
 from bench.report.data.frame import COLUMNS, write_frame
+from datasets.extras import install
 from tests.report.test_report import crashed, record, write_run
 
 
@@ -62,7 +63,7 @@ def test_without_pyarrow_a_note_says_what_is_missing(results, monkeypatch, capsy
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name))
     report([f"results_dir={results}"])
-    assert "pip install 'implicit-bench[parquet]'" in capsys.readouterr().err
+    assert f"needs pyarrow: {install('parquet')}" in capsys.readouterr().err
     assert not (results / "results.parquet").exists() and (results / "runs.csv").is_file()
 
 

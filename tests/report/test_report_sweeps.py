@@ -138,3 +138,75 @@ def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):
     write_run(tmp_path, "{", cells[1].id)
     (sweep,) = read_sweeps(read_records(tmp_path)[0], tmp_path)
     assert [(row.name, row.runs, row.failed) for row in numbers(sweep)] == [("DIST", 2, 1)]
+
+
+def costing(seconds: float) -> dict:
+    """The costs of a run whose loop takes some seconds, a tenth of all, and asks as many thousand values."""
+    spent = {"forward": seconds, "backward": 0.0, "total": 10 * seconds}
+    return {"seconds": spent, "evaluations": {"value": 1000 * seconds}}
+
+
+def test_a_row_has_medians_not_means_of_its_ended_runs(tmp_path):
+    cells = [cell("dist", seed=s) for s in range(5)]
+    swept(tmp_path, cells)
+    for one, chamfer, seconds in zip(cells, (0.001, 0.002, 0.003, 0.020, None), (1, 2, 3, 20, 500), strict=True):
+        ran(tmp_path, one, chamfer, **costing(seconds))
+    found = table(tmp_path).loc["DIST"]
+    assert found["chamfer_l2"] == pytest.approx(0.003)  # of five, one of them infinite
+    assert (found["loop_seconds"], found["value_evaluations"]) == (2.5, 2500)  # of the four that ended ok
+
+
+def test_the_interval_is_over_shapes_however_many_seeds_they_have(tmp_path):
+    for name, seeds in (("one", 1), ("four", 4)):
+        cells = [cell("dist", index=i, seed=s, steps=name) for i in range(6) for s in range(seeds)]
+        swept(tmp_path, cells, name)
+        for number, one in enumerate(cells):
+            ran(tmp_path, one, 0.001 * (1 + number // seeds))  # the same for all seeds of a shape
+    one, four = (table(tmp_path, name).loc["DIST"] for name in ("one", "four"))
+    widths = [found["chamfer_l2_high"] - found["chamfer_l2_low"] for found in (one, four)]
+    assert widths[1] > 0.8 * widths[0]  # more seeds are no more shapes
+    assert (one["runs"], four["runs"]) == (6, 24)
+
+
+def test_the_share_of_failures_has_an_interval(tmp_path):
+    cells = [cell("dist", index=i) for i in range(12)]
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 if number % 2 else None)
+    found = table(tmp_path).loc["DIST"]
+    assert found["failed"] == 6 and 0.1 < found["failed_low"] < 0.5 < found["failed_high"] < 0.9
+
+
+def test_rows_stand_in_the_order_of_the_plan_and_metrics_in_that_of_tables(tmp_path):
+    cells = [cell(r) for r in ("newton", "dist")]
+    swept(tmp_path, cells)
+    for one in cells:
+        metrics = {"own_queries": 3, "fscore": 0.5, "chamfer_l2": 0.002}
+        config = {"config": one.config, "renderer": one.renderer}
+        write_run(tmp_path, record(one.id, **config, metrics=metrics), one.id)
+    found = table(tmp_path)
+    assert list(found.index) == ["NEWTON", "DIST"]
+    named = [name for name in found if name in metrics]
+    assert named == ["chamfer_l2", "fscore", "own_queries"]  # the first one has the ratio
+    assert found.loc["DIST", "ratio"] == 1
+
+
+def test_special_characters_of_names_are_escaped_in_latex(tmp_path):
+    cells = [cell("dist", max_steps=steps) for steps in ("5%", "6%")]
+    swept(tmp_path, cells)
+    for one in cells:
+        ran(tmp_path, one, 0.001)
+    assert list(table(tmp_path).index) == ["max_steps 5%", "max_steps 6%"]
+    text = (tmp_path / "sweeps" / "completion-1" / "table.tex").read_text()
+    assert r"max\_steps 5\% & " in text and r"renderer.max\_steps (5\%, 6\%)" in text
+
+
+def test_two_sweeps_have_their_own_runs(tmp_path):
+    shared = cell("dist")
+    for name, renderer, chamfer in (("first", "dvr", 0.002), ("second", "idr", 0.004)):
+        one = cell(renderer)
+        swept(tmp_path, [shared, one], name)
+        ran(tmp_path, one, chamfer)
+    ran(tmp_path, shared, 0.001)
+    assert list(table(tmp_path, "first")["chamfer_l2"].items()) == [("DIST", 0.001), ("DVR", 0.002)]
+    assert list(table(tmp_path, "second")["chamfer_l2"].items()) == [("DIST", 0.001), ("IDR", 0.004)]

@@ -1,7 +1,10 @@
 """A value that cannot be is refused before anything runs, for the whole sweep, with its cell."""
 
+import subprocess
+import sys
 from collections import Counter
 from copy import deepcopy
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -10,8 +13,10 @@ from omegaconf import OmegaConf
 from bench import config as config_module
 from bench.config import Isolation
 from bench.records.read import Plan, PlannedCell
-from bench.run.check import check_plan, refusals
-from tests.run.driving import command
+from bench.records.record import Record
+from bench.run import process
+from bench.run.check import check_plan, needed, refusals
+from tests.run.driving import ROOT, command
 
 SMALL = ("scale=smoke", "threads=1")
 CODE = """
@@ -56,6 +61,27 @@ def test_a_process_of_its_own_finds_the_same(plain):
     found = refusals(cells, Isolation.process)
     assert found == refusals(cells, Isolation.off)
     assert [bool(reason) for reason in found] == [False, True, True, True, True]
+
+
+def test_a_single_run_is_checked_before_what_its_run_alone_takes_is_loaded(plain):
+    modules = needed(plain("renderer=dvr", "task=pose", "dataset=sphere"))
+    assert modules == ["bench", "bench.run.execute", "bench.tasks.pose", "renderers", "datasets.families"]
+    assert set(modules) < set(process.preloaded()) | {"renderers"}
+    assert needed(plain("renderer=custom", "renderer._target_=mypkg.Mine"))[2:] == [
+        "bench.tasks.completion", "datasets.families"
+    ]  # fmt: skip
+    code = "import sys, bench.__main__, bench.run.run; print(*{'torch', 'pandas', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is_ready(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(process, "import_module", done.append)
+    monkeypatch.setattr("bench.run.execute.main", lambda *_: done.append("main"))
+    job = process.Job(OmegaConf.create(), tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
+    process._enter(job, *Pipe())
+    assert done == [*process.preloaded(), "main"] and "open3d" in done
 
 
 @pytest.mark.parametrize(
@@ -106,6 +132,7 @@ def test_a_gpu_is_looked_for_where_the_runs_are(planned, monkeypatch):
 @pytest.mark.parametrize(("arguments", "words"), [
     (("-m", "seed=0,1", "renderer.steps=50,0"), "cell 2 of 4 (seed=0 renderer.steps=0): steps must be at least 1"),
     (("-m", "index=0,-1"), "cell 2 (index=-1"),
+    (("index=1000000",), "index must be at most 999999, not 1000000"),
     (("-m", "seed=0,1", "threads=0"), "threads must be at least 1, not 0"),
     (("-m", "seed=0,1", "time_limit=0"), "time_limit must be positive"),
     (("-m", "seed=0,1", "split=holdout"), "split must be one of train, validation, test, not 'holdout'"),

@@ -13,6 +13,7 @@ from bench.records.names import flat
 from bench.records.read import read_records
 from bench.records.record import row_name, started
 from bench.report.data.records import index
+from datasets.extras import install
 
 TEXT, CATEGORY, WHOLE, NUMBER, TRUTH, TIME = (
     *("string", "category", "Int64", "Float64", "boolean"),
@@ -36,7 +37,7 @@ MACHINE = ("cpu", "device", "threads", "commit", "dirty")  # of the record's env
 PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
 PARQUET = "results.parquet"
-NO_PARQUET = f"{PARQUET} was not written, as it needs pyarrow: pip install 'implicit-bench[parquet]'"
+NO_PARQUET = f"{PARQUET} was not written, as it needs pyarrow: {install('parquet')}"
 
 
 def load(results: str | os.PathLike[str] = "results") -> pd.DataFrame:
