@@ -4,6 +4,7 @@ import base64
 import json
 import shlex
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import Surface, mesh_data, read_ply, simplified
 from bench.report.site.script import safe_json, to_script
-from bench.report.site.words import TASKS, asked, command
+from bench.report.site.words import TASKS, asked, command, lines_again
 from bench.report.write import html
 from bench.report.write.html import write_index
 from bench.report.write.one_file import small_picture, write_one_file
@@ -108,17 +109,30 @@ def test_the_command_is_what_was_typed_and_safe_to_paste():
     assert shlex.split(line) == ["python", "-m", "bench", *typed[:2], typed[3], "results_dir=my results"]
     older, remark = command(record("x", method="dist_mask"), Path("results"))
     assert older == "python -m bench task=completion renderer=dist dataset=sofa +method=dist_mask seed=0"
-    assert "config.yaml has all settings" in remark
+    assert "config.yaml has all the settings" in remark
     stressed = command(record("x", dataset="wires", config={"stress": {"name": "wires"}}), Path("results"))[0]
     assert "stress=wires" in stressed and "dataset" not in stressed
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):
-    made.write(tmp_path, 0)
-    write_index(tmp_path)
+    results = tmp_path / "it's mine"
+    made.write(results, 0)
+    made.write(results, 1)
+    write_index(results)
     found: dict = {}
-    exec(Page(tmp_path).run("completion-0000")["python"], found)  # as a reader would paste them
-    assert found["record"]["status"] == "ok" and len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+    exec(Page(results).run("completion-0001")["python"], found)  # as a reader would paste them
+    assert found["run"].folder == "completion-0001" and found["run"].chamfer_l2 == 0.002
+    assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+
+
+def test_the_lines_for_python_ask_for_what_was_typed():
+    typed = ["task=completion", "renderer.steps=40", "results_dir=elsewhere", "label='it\\'s'"]
+    run = mock.Mock()
+    with mock.patch("bench.run", run):
+        exec(lines_again(record("x", overrides=typed), Path("my results")), {})
+    run.assert_called_once_with([*typed[:2], typed[3]], results_dir="my results")
+    long = lines_again(record("x", overrides=[f"task.points={n}" for n in range(20)]), Path("results"))
+    assert max(map(len, long.splitlines())) < 90 and "results_dir" not in long
 
 
 def test_costs_are_by_phase_and_add_up(tmp_path):

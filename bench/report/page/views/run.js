@@ -76,8 +76,13 @@
         : section("Pictures", element("p.soft", null, "This run left no picture.")),
       detail.curve ? section("Curve", bench.curves([{name: "run", curve: detail.curve}])) : null,
       section("Metrics, unscaled", metrics(detail.metrics)),
-      section("Make it again", code(detail.command, "Copy the command"), element("p.soft", null, detail.remark)),
-      section("Open it in Python", code(detail.python, "Copy the lines")),
+      section(
+        "Make it again",
+        code(detail.command, "Copy the command"),
+        element("p.soft", null, detail.remark, " From Python:"),
+        code(detail.again, "Copy the lines that make it again"),
+      ),
+      section("Open it in Python", code(detail.python, "Copy the lines that open it")),
       section(
         "Files",
         Object.keys(detail.files).length
