@@ -118,12 +118,10 @@
     curves().then(
       (panels) => {
         const panel = panels.find((each) => each.axis === axis.axis);
-        const looks = new Map(Object.entries(data.looks || {}));
-        const series = panel && panel.series.map((each) => ({...each, ...looks.get(each.name)}));
         if (panel)
           fill(
             curve,
-            bench.chart({panels: [{...panel, series}]}, {label: `Share of successes on ${axis.title}`, focus: row}),
+            bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}),
           );
       },
       () => {},
