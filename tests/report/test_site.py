@@ -9,9 +9,10 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from bench.records.names import differences
 from bench.records.record import NOT_RUN, RunStatus
 from bench.records.statuses import STATUSES, said
-from bench.report.data.names import names
+from bench.report.data.names import Nameable, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import Surface, mesh_data, read_ply, simplified
@@ -31,30 +32,39 @@ def renderer(**settings) -> dict:
     return {"config": {"renderer": settings}}
 
 
+def named(records) -> list[str]:
+    return names([Nameable.of(one) for one in records])
+
+
+def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():
+    swept = [record("x", **renderer(_label_="DIST", epsilon=epsilon)) for epsilon in (1e-4, 5e-5)]
+    assert [name.removeprefix("DIST, ") for name in named(swept)] == list(differences(swept).names)
+
+
 def test_runs_are_named_by_what_differs():
     swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
-    assert names(swept) == ["DIST, steps=20", "DIST, steps=50"]
+    assert named(swept) == ["DIST, steps 20", "DIST, steps 50"]
     same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
-    assert names(same) == ["DIST", "DIST"]
+    assert named(same) == ["DIST", "DIST"]
 
 
 def test_a_setting_that_follows_from_another_is_not_named():
     configs = [{"scale": {"name": name}, "view": {"resolution": size}} for name, size in (("smoke", 32), ("desk", 64))]
-    assert names([record("x", config=config) for config in configs]) == ["dist, name=smoke", "dist, name=desk"]
+    assert named([record("x", config=config) for config in configs]) == ["dist, scale smoke", "dist, scale desk"]
 
 
 def test_own_renderers_are_named_by_their_class():
     own = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
-    assert names(own) == ["Mine", "Other"]
+    assert named(own) == ["Mine", "Other"]
     labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
-    assert names([labelled]) == ["Ours"]
+    assert named([labelled]) == ["Ours"]
 
 
 def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
-    assert max(name.count("=") for name in names([record("x", config=config) for config in configs])) == 3
+    assert max(name.count(",") for name in named([record("x", config=config) for config in configs])) == 3
     alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
-    assert names([record("x", config=config) for config in alike])[3] == "dist, renderer.weight=2, task.weight=1"
+    assert named([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 from bench.records.files import digest
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.record import started
-from bench.report.data.names import base_name, names
+from bench.report.data.names import Nameable, base_name, names
 from bench.report.data.records import Record, family, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
@@ -22,7 +22,7 @@ def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
     folders = [Folder(results_dir, record["folder"]) for record in records]
     texts = {
         "task": [record["task"] for record in records],
-        "name": names(records),
+        "name": names([Nameable.of(record) for record in records]),
         "row": [base_name(record) for record in records],
         "family": [_safely(family, record, record["dataset"]) for record in records],
         "scene": [record.get("scene") or record["dataset"] for record in records],
