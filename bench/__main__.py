@@ -13,10 +13,10 @@ def main() -> int:
     statuses: list[str] = []
 
     def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
-        from bench.report.write.html import write_index  # what it needs waits until the command line is sound
+        from bench.report.write.html import update_index  # what it needs waits until the command line is sound
         from bench.run.run import run_cell
 
-        statuses.append(run_cell(config, write_index))
+        statuses.append(run_cell(config, update_index))
 
     code = command_line(one)
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there

@@ -5,6 +5,7 @@ same in both. A list has another beginning and end: a name begins with the row, 
 experiments, and lacks what stands in columns of its own, such as shape and seed.
 """
 
+import json
 from dataclasses import dataclass
 
 from bench.records.names import in_order, settings_of, told_apart
@@ -21,16 +22,16 @@ FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
 
 @dataclass(frozen=True)
 class Nameable:
-    """What the name of a run in a list depends on: its task, its row and the settings that may be named."""
+    """What the name of a run in a list depends on: its task, its row and, as JSON, the settings that may be named."""
 
     task: str
     row: str
-    settings: dict[str, str]
+    settings: str
 
     @classmethod
     def of(cls, record: Record) -> "Nameable":
         """What the name of a record depends on."""
-        return cls(record["task"], base_name(record), settings_of(record["config"], SHOWN))
+        return cls(record["task"], base_name(record), json.dumps(settings_of(record["config"], SHOWN)))
 
 
 def names(runs: list[Nameable]) -> list[str]:
@@ -41,8 +42,10 @@ def names(runs: list[Nameable]) -> list[str]:
     """
     found = [""] * len(runs)
     for places in grouped(range(len(runs)), lambda place: (runs[place].task, runs[place].row)).values():
-        alike = list(grouped(places, lambda place: frozenset(runs[place].settings.items())).values())
-        settings = [runs[same[0]].settings for same in alike]  # each once: most runs of a list have the same
+        alike = list(grouped(places, lambda place: runs[place].settings).values())
+        settings = [
+            json.loads(runs[same[0]].settings) for same in alike
+        ]  # each once: most runs of a list have the same
         told = told_apart(
             in_order(settings, FIRST), classes=[0] * len(alike), names=[runs[places[0]].row] * len(alike), most=MOST
         )
