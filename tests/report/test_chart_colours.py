@@ -39,7 +39,11 @@ def test_of_the_atlas(tmp_path):
     shown = assert_alike(curves, stability_curves.answer(read(curves), []))
     assert shown == {label: style.look(preset).colour for label, preset in LABELS.items()}
     cost = of_stability.made(tmp_path, stability.make_cost)
-    assert assert_alike(cost, stability.answer_cost(read(cost), [])) == shown
+    answer = stability.answer_cost(read(cost), [])
+    assert assert_alike(cost, answer) == shown
+    (panel,) = answer.chart["panels"]
+    assert panel["y"]["reversed"] and cost.figure.axes[0].yaxis_inverted()
+    assert panel["series"][0]["size"] > panel["series"][1]["size"]  # at the same place: neither is hidden
 
 
 def test_of_the_crossing(tmp_path):

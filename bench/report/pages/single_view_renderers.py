@@ -60,7 +60,9 @@ def make(experiment: Experiment) -> Result:
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """In each family the renderer with the least ratio of the error to that of the first row, paired by shape."""
     said = [text for name, runs in data.groupby("family", sort=False) if (text := _least(str(name), runs))]
-    verdict = f"Chamfer-L1 over that of the network that Newton taught, on the same unseen shapes: {'; '.join(said)}."
+    trained = ", one training each" if data["seed"].nunique() == 1 else ""
+    verdict = f"Chamfer-L1 over that of the network that Newton taught, on the same unseen shapes{trained}: "
+    verdict += f"{'; '.join(said)}."
     return Answer("Does it matter which renderer teaches a network of one image?", verdict if said else "")
 
 

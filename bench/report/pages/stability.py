@@ -306,15 +306,12 @@ def answer_cost(data: pd.DataFrame, notes: list[str]) -> Answer:
         if same
         else f"{cheap['row']} is the cheapest: rank {format.number(cheap['rank'])} for {format.number(cheap['cost'])}"
     )
-    presets = presets_of(data)
+    presets, places = presets_of(data), data.groupby(["cost", "rank"]).cumcount()  # later ones smaller: none is hidden
     points = [
-        series(row["row"], presets[row["row"]], [row["cost"]], [row["rank"]], size=11) for _, row in data.iterrows()
+        series(row["row"], presets[row["row"]], [row["cost"]], [row["rank"]], size=12 / (1 + 0.4 * places[place]))
+        for place, row in data.iterrows()
     ]
-    chart = {
-        "panels": [
-            chart_panel(
-                "", "field values per ray at the mild end", "mean rank over axes (1 is best)", points, height=420
-            )
-        ]
-    }
-    return Answer("Is a robust renderer an expensive one?", f"{said}{rest}.", chart)
+    axes = ("field values per ray at the mild end", "mean rank over axes (1 is best)")
+    panel = chart_panel("", *axes, points, height=420)
+    panel["y"]["reversed"] = True
+    return Answer("Is a robust renderer an expensive one?", f"{said}{rest}.", {"panels": [panel]})

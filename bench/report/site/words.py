@@ -62,8 +62,8 @@ def command(record: Record, results_dir: Path) -> tuple[str, str]:
 
 def lines_again(record: Record, results_dir: Path) -> str:
     """The lines that make the run again in Python, or reuse it where nothing has changed."""
-    words = [repr(word) for word in _overrides(record)]
-    folder = "" if _default(results_dir) else f", results_dir={results_dir.as_posix()!r}"
+    words = [_quoted(word) for word in _overrides(record)]
+    folder = "" if _default(results_dir) else f", results_dir={_quoted(results_dir.as_posix())}"
     inner = ", ".join(words)
     if len(inner) + len(folder) > WIDEST:
         inner = "".join(f"\n    {word}," for word in words) + "\n"
@@ -74,22 +74,28 @@ def lines_again(record: Record, results_dir: Path) -> str:
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
     """The lines that open the run in Python: its values of the table of all runs, its curve and its mesh."""
-    results, name = folder.parents[1].as_posix(), folder.name
+    results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
     shown = ["status", *[metric for metric in metrics.SHOWN if metric in record["metrics"]][:MOST_SHOWN]]
+    opened = {
+        "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
+        "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),
+    }
+    others = [lines for file, lines in opened.items() if file in files]
+    imports = ["import bench", *(first for first, _ in others)]
     lines = [
-        "import bench",
-        "",
-        f"runs = bench.load({results!r})",
-        f"run = runs[runs.folder == {name!r}].iloc[0]",
+        f"runs = bench.load({results})",
+        f"run = runs[runs.folder == {name}].iloc[0]",
         f"print(run[{json.dumps(shown)}])",
     ]
-    if {"curve.jsonl", "mesh.ply"} & set(files):
-        lines += ["", "from pathlib import Path", "", f'folder = Path({results!r}) / "runs" / {name!r}']
-    if "curve.jsonl" in files:
-        lines += ["", "import pandas as pd", "", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)']
-    if "mesh.ply" in files:
-        lines += ["", "import trimesh", "", 'mesh = trimesh.load(folder / "mesh.ply")']
-    return "\n".join(lines)
+    if others:
+        imports.insert(0, "from pathlib import Path\n")
+        lines += ["", f'folder = Path({results}) / "runs" / {name}', *(line for _, line in others)]
+    return "\n".join([*imports, "", *lines])
+
+
+def _quoted(text: str) -> str:
+    """A text as Python reads it, in double quotes where that is the same."""
+    return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)
 
 
 def _overrides(record: Record) -> list[str]:
