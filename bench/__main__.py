@@ -9,11 +9,11 @@ from bench.run.command import FAILED, command_line
 from bench.run.sweep import Sweep
 
 
-def _write_index(results_dir: Path) -> Path:
-    """The report's page of a results folder; it imports pandas, which waits until there is something to show."""
-    from bench.report.write.html import write_index
+def _update_index(results_dir: Path) -> Path:
+    """The report's page with a run that has ended; what it needs waits until there is something to show."""
+    from bench.report.write.html import update_index
 
-    return write_index(results_dir)
+    return update_index(results_dir)
 
 
 def main() -> int:
@@ -23,14 +23,15 @@ def main() -> int:
     def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
         from bench.run.run import run_cell
 
-        statuses.append(run_cell(config, _write_index))
+        statuses.append(run_cell(config, _update_index))
 
     code = command_line(one)
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there
         Sweep.end()
+        from bench.report.write.html import write_index
         from bench.run.summary import show_sweep
 
-        statuses = show_sweep(plan, _write_index(plan.results_dir))
+        statuses = show_sweep(plan, write_index(plan.results_dir))
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)
 
 

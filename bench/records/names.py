@@ -1,7 +1,7 @@
 """Names of runs by what differs among them: the renderer's row, the choices, and settings by key and value."""
 
 import json
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,19 +42,55 @@ def differences(
         apart: what tells runs apart without being in their names, such as shape and seed; None for nothing.
         asked: of each run, the keys and values that its sweep asked for, which come before other settings.
     """
-    classes: list[int] = _classes([apart(record) if apart else None for record in records])
-    keys, names = [], [""] * len(records)
-    for key, values in _parts(records, asked):
+    classes = _classes([apart(record) if apart else None for record in records])
+    told = told_apart(_parts(records, asked), classes=classes, names=[""] * len(records))
+    default = [row_name(record["config"], record["renderer"]) for record in records]
+    return Differences(told.keys, tuple(name or other for name, other in zip(told.names, default, strict=True)))
+
+
+def told_apart(
+    parts: Iterable[tuple[str, Sequence[str | None]]], *, classes: list[int], names: list[str], most: int | None = None
+) -> Differences:
+    """Names with what tells runs apart behind them.
+
+    Args:
+        parts: keys with the value of each run as text, None where it has none, in the order in which they make names.
+        classes: a number for each run; those of unequal numbers are told apart already, without it being in the name.
+        names: of the runs, before anything is added.
+        most: keys that are added; None for all that are needed.
+    """
+    keys: list[str] = []
+    for key, values in parts:
+        if len(keys) == most or len(set(classes)) == len(classes):
+            break
         refined = _classes(list(zip(classes, values, strict=True)))
         if len(set(refined)) == len(set(classes)):
             continue
         classes = refined
         keys.append(key)
         names = _extended(names, _heading(key, keys), values)
-        if len(set(classes)) == len(records):
-            break
-    default = [row_name(record["config"], record["renderer"]) for record in records]
-    return Differences(tuple(keys), tuple(name or other for name, other in zip(names, default, strict=True)))
+    return Differences(tuple(keys), tuple(names))
+
+
+def in_order(settings: Sequence[dict[str, str]], first: Sequence[str] = ()) -> Iterator[tuple[str, list[str | None]]]:
+    """The keys of settings with the value of each run, in the order in which they make names.
+
+    Names of choices come before what follows from them, such as scale.name before view.resolution; then settings of the
+    top-level keys `first`, in their order; then outer keys.
+    """
+
+    def place(key: str) -> tuple[bool, int, int]:
+        top = key.partition(".")[0]
+        return not key.endswith(".name"), first.index(top) if top in first else len(first), key.count(".")
+
+    for key in sorted({key: None for values in settings for key in values}, key=place):
+        yield key, [values.get(key) for values in settings]
+
+
+def settings_of(config: dict[str, Any], without: Container[str] = SKIPPED) -> dict[str, str]:
+    """The settings that may be in a name, as text by dotted keys, but those of the top-level keys `without`."""
+    kept = flat({key: value for key, value in config.items() if key not in without})
+    return {key: _text(value) for key, value in kept.items() if _public(key)}
 
 
 def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
@@ -74,23 +110,17 @@ def _parts(
     yield "silhouette", [(record["config"].get("silhouette") or {}).get("_label_") for record in records]
     for key in CHOICES:
         yield key, [record.get(key) or None for record in records]
-    own = [_settings(record["config"]) for record in records]
+    own = [settings_of(record["config"]) for record in records]
     for key in ("dataset.path", "index", "seed"):
         yield key, [values.get(key) for values in own]
     for settings in (asked, own):
-        for key in sorted({key: None for values in settings for key in values}, key=_order):
-            yield key, [values.get(key) for values in settings]
+        yield from in_order(settings)
 
 
-def _settings(config: dict[str, Any]) -> dict[str, str]:
-    """The settings that may change a result, as text by dotted keys."""
-    kept = {key: value for key, value in config.items() if key not in SKIPPED}
-    return {key: _text(value) for key, value in flat(kept).items()}
-
-
-def _order(key: str) -> tuple[bool, int]:
-    """Names of choices before what follows from them, such as scale.name before view.resolution; then outer keys."""
-    return not key.endswith(".name"), key.count(".")
+def _public(key: str) -> bool:
+    """Whether a key is no mark of ours, such as `_label_`, which stands in the name of the row."""
+    last = key.rpartition(".")[2]
+    return last == "_target_" or not last.startswith("_")
 
 
 def _text(value: Any) -> str:
@@ -120,7 +150,7 @@ def _heading(key: str, keys: Sequence[str]) -> str:
     return key if any(other.rpartition(".")[2] == last for other in keys if other != key) else last
 
 
-def _extended(names: list[str], heading: str, values: list[str | None]) -> list[str]:
+def _extended(names: list[str], heading: str, values: Sequence[str | None]) -> list[str]:
     """The names with the values behind them, where runs of one name differ in these."""
     found: dict[str, set[str | None]] = {}
     for name, value in zip(names, values, strict=True):

@@ -1,6 +1,7 @@
 """Reads a results folder: the records of its runs, and the plans of its sweeps, whose cells must have a run each."""
 
 import json
+import os
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
@@ -70,27 +71,35 @@ class Plan:
 
 def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """All plans of a results folder as plain data, and an error message for each that cannot be read."""
-    plans, problems = [], []
-    for path in sorted((results_dir / "sweeps").glob(f"*/{PLAN}")):
-        try:
-            if leads_out(path, results_dir):
-                raise ValueError("it is a link out of the results folder")
-            plan = json.loads(path.read_text(encoding="utf-8"))
-            if plan["schema"] != SCHEMA:
-                raise ValueError(f"schema must be {SCHEMA}, found {plan['schema']!r}")
-            if plan["name"] != path.parent.name:
-                raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
-            datetime.fromisoformat(plan["asked"])
-            names = [item.name for item in fields(PlannedCell)]
-            cells = [{"method": ""} | {name: cell[name] for name in names if name in cell} for cell in plan["cells"]]
-            if any(len(cell) < len(names) for cell in cells):
-                raise ValueError(f"each cell must have {', '.join(names)}")
-            if not all(_sound(cell) for cell in cells):
-                raise ValueError("each cell's id must be the name of a folder, and its config an object")
-            plans.append({"name": plan["name"], "asked": plan["asked"], "cells": cells})
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            problems.append(f"sweeps/{path.parent.name}/{PLAN}: {error!r}")
-    return plans, problems
+    found = [read_plan(path, results_dir) for path in plan_paths(results_dir)]
+    return [plan for plan, _ in found if plan is not None], [problem for _, problem in found if problem]
+
+
+def plan_paths(results_dir: Path) -> list[Path]:
+    """The files of all plans of a results folder, by name."""
+    return sorted((results_dir / "sweeps").glob(f"*/{PLAN}"))
+
+
+def read_plan(path: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:
+    """The plan of a file as plain data, or None and why it cannot be read."""
+    try:
+        if leads_out(path, results_dir):
+            raise ValueError("it is a link out of the results folder")
+        plan = json.loads(path.read_text(encoding="utf-8"))
+        if plan["schema"] != SCHEMA:
+            raise ValueError(f"schema must be {SCHEMA}, found {plan['schema']!r}")
+        if plan["name"] != path.parent.name:
+            raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
+        datetime.fromisoformat(plan["asked"])
+        names = [item.name for item in fields(PlannedCell)]
+        cells = [{"method": ""} | {name: cell[name] for name in names if name in cell} for cell in plan["cells"]]
+        if any(len(cell) < len(names) for cell in cells):
+            raise ValueError(f"each cell must have {', '.join(names)}")
+        if not all(_sound(cell) for cell in cells):
+            raise ValueError("each cell's id must be the name of a folder, and its config an object")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        return None, f"sweeps/{path.parent.name}/{PLAN}: {error!r}"
+    return {"name": plan["name"], "asked": plan["asked"], "cells": cells}, ""
 
 
 def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -102,27 +111,47 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     Raises:
         ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
     """
-    if not results_dir.is_dir():
-        raise ValueError(f"results_dir must be an existing folder, found {results_dir}; make a run there first.")
-    check_links(results_dir)
-    records, problems = [], []
-    folders = [f for f in sorted((results_dir / "runs").glob("*")) if f.is_dir() and not f.name.startswith(".")]
-    for folder in folders:
-        if link := link_out(folder, results_dir):
-            problems.append(f"{folder.name}: not read, since {link} is a link out of the results folder")
-            continue
-        try:
-            records.append(read_record(folder))
-        except FileNotFoundError:
-            problems.append(f"{folder.name}: no record.json; the run has not finished, or its record was removed")
-        except (OSError, ValueError, RecursionError) as error:
-            problems.append(f"{folder.name}: {error}")
+    check_results(results_dir)
+    found = [read_run(folder, results_dir) for folder in run_folders(results_dir)]
+    records, problems = [record for record, _ in found if record is not None], [said for _, said in found if said]
     known = {record["folder"] for record in records}
     plans, unread = read_plans(results_dir)
-    missing = {cell["id"]: _not_run(cell, plan) for plan in plans for cell in plan["cells"] if cell["id"] not in known}
+    missing = {cell["id"]: not_run(cell, plan) for plan in plans for cell in plan["cells"] if cell["id"] not in known}
     records.extend(missing.values())
     records.sort(key=started, reverse=True)
     return records, problems + unread
+
+
+def check_results(results_dir: Path) -> None:
+    """Checks that a results folder is there, and that what is written to it stays in it.
+
+    Raises:
+        ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
+    """
+    if not results_dir.is_dir():
+        raise ValueError(f"results_dir must be an existing folder, found {results_dir}; make a run there first.")
+    check_links(results_dir)
+
+
+def run_folders(results_dir: Path) -> list[Path]:
+    """The folders of all runs by name, but hidden ones."""
+    runs = results_dir / "runs"
+    if not runs.is_dir():
+        return []
+    with os.scandir(runs) as found:
+        return [runs / name for name in sorted(f.name for f in found if not f.name.startswith(".") and f.is_dir())]
+
+
+def read_run(folder: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:
+    """The record of a run's folder, or None and why it cannot be read, with the folder's name."""
+    if link := link_out(folder, results_dir):
+        return None, f"{folder.name}: not read, since {link} is a link out of the results folder"
+    try:
+        return read_record(folder), ""
+    except FileNotFoundError:
+        return None, f"{folder.name}: no record.json; the run has not finished, or its record was removed"
+    except (OSError, ValueError, RecursionError) as error:
+        return None, f"{folder.name}: {error}"
 
 
 def check_links(results_dir: Path) -> None:
@@ -161,7 +190,7 @@ def _line(text: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:
+def not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:
     """A record in place of a planned cell's run that does not exist."""
     given = {name: cell[name] for name in ("id", "task", "renderer", "dataset", "seed", "config", "method")}
     reason = f"planned by sweep {plan['name']}; the same command runs it"

@@ -167,7 +167,8 @@ def test_a_run_has_its_page(results, tab):
         "It ended as planned.",
         "Sum of two means.",
         "python -m bench task=completion",
-        "read_record(folder)",
+        'bench.run(["task=completion"',
+        "runs = bench.load(",
         "in the loop",
     ):
         assert words in text

@@ -18,11 +18,23 @@ ROWS = {
 }
 
 
-def made(results, row, chamfer, *, dataset="car", index=0, status="ok", seconds=None, experiment="dvr_table1", **more):
+def made(
+    results,
+    row,
+    chamfer,
+    *,
+    renderer="newton",
+    dataset="car",
+    index=0,
+    status="ok",
+    seconds=None,
+    experiment="dvr_table1",
+    **more,
+):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
-        results, experiment, row, task="single_view", dataset=dataset, method=ROWS[row], renderer="newton",
-        status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {}, **more,
+        results, experiment, row, task="single_view", dataset=dataset, method=ROWS[row],
+        renderer=renderer, status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {}, **more,
         settings={"dataset": {"name": dataset}, "index": index},
     )  # fmt: skip
 
@@ -69,8 +81,22 @@ def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_pa
     assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
     assert table["Over Newton"].tolist() == ["", "∞ (n = 3)", "0.500 (n = 3)"]
     assert table.loc["IDR", "Failed"] == "1 of 3"
+
+
+def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path):
+    for index in range(3):
+        for family, factor in (("car", 1.5), ("sofa", 0.5)):
+            more = {"index": index, "dataset": family, "experiment": "single_view_renderers"}
+            made(tmp_path, "Newton", 0.2, **more)
+            made(tmp_path, "IDR", 0.2 * factor, **more, renderer="idr")
+            made(tmp_path, "Mean shape", 0.01, **more, renderer="dist")
+    experiment = choose(read_records(tmp_path)[0], single_view_renderers.READS[0], tmp_path)
     data = single_view_renderers.make(experiment).data
-    assert single_view_renderers.answer(data, []).verdict.endswith("*20.0* (Newton), then 30.0 (IDR); n = 3 shapes.")
+    verdict = single_view_renderers.answer(data, []).verdict
+    assert verdict.endswith("shapes, one training each: car: IDR *1.50* (n = 3); sofa: IDR *0.500* (n = 3).")
+    failed = data.assign(status=data["status"].where(data["row"] != "IDR", "empty"))
+    assert "car: IDR *∞* (n = 3)" in single_view_renderers.answer(failed, []).verdict
+    assert single_view_renderers.answer(data[data["row"] != "Newton"], []).verdict == ""
 
 
 def test_a_line_has_the_seconds_of_the_training_and_of_the_inference(tmp_path):

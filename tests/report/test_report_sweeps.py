@@ -11,7 +11,8 @@ from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
 from bench.report.data.sweeps import numbers, read_sweeps
 from bench.report.write.html import ASSETS
-from bench.report.write.sweeps import find_sweeps, write_sweeps
+from bench.report.write.paper import find_sweeps
+from bench.report.write.sweeps import write_sweeps
 from tests.report.test_report import record, write_run
 
 

@@ -4,18 +4,20 @@ import base64
 import json
 import shlex
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from bench.records.names import differences
 from bench.records.record import NOT_RUN, RunStatus
 from bench.records.statuses import STATUSES, said
-from bench.report.data.names import names
+from bench.report.data.names import Nameable, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import Surface, mesh_data, read_ply, simplified
 from bench.report.site.script import safe_json, to_script
-from bench.report.site.words import TASKS, asked, command
+from bench.report.site.words import TASKS, asked, command, lines_again
 from bench.report.write import html
 from bench.report.write.html import write_index
 from bench.report.write.one_file import small_picture, write_one_file
@@ -30,30 +32,39 @@ def renderer(**settings) -> dict:
     return {"config": {"renderer": settings}}
 
 
+def named(records) -> list[str]:
+    return names([Nameable.of(one) for one in records])
+
+
+def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():
+    swept = [record("x", **renderer(_label_="DIST", epsilon=epsilon)) for epsilon in (1e-4, 5e-5)]
+    assert [name.removeprefix("DIST, ") for name in named(swept)] == list(differences(swept).names)
+
+
 def test_runs_are_named_by_what_differs():
     swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
-    assert names(swept) == ["DIST, steps=20", "DIST, steps=50"]
+    assert named(swept) == ["DIST, steps 20", "DIST, steps 50"]
     same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
-    assert names(same) == ["DIST", "DIST"]
+    assert named(same) == ["DIST", "DIST"]
 
 
 def test_a_setting_that_follows_from_another_is_not_named():
     configs = [{"scale": {"name": name}, "view": {"resolution": size}} for name, size in (("smoke", 32), ("desk", 64))]
-    assert names([record("x", config=config) for config in configs]) == ["dist, name=smoke", "dist, name=desk"]
+    assert named([record("x", config=config) for config in configs]) == ["dist, scale smoke", "dist, scale desk"]
 
 
 def test_own_renderers_are_named_by_their_class():
     own = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
-    assert names(own) == ["Mine", "Other"]
+    assert named(own) == ["Mine", "Other"]
     labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
-    assert names([labelled]) == ["Ours"]
+    assert named([labelled]) == ["Ours"]
 
 
 def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
-    assert max(name.count("=") for name in names([record("x", config=config) for config in configs])) == 3
+    assert max(name.count(",") for name in named([record("x", config=config) for config in configs])) == 3
     alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
-    assert names([record("x", config=config) for config in alike])[3] == "dist, renderer.weight=2, task.weight=1"
+    assert named([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
 
 
 @pytest.mark.parametrize(
@@ -108,17 +119,30 @@ def test_the_command_is_what_was_typed_and_safe_to_paste():
     assert shlex.split(line) == ["python", "-m", "bench", *typed[:2], typed[3], "results_dir=my results"]
     older, remark = command(record("x", method="dist_mask"), Path("results"))
     assert older == "python -m bench task=completion renderer=dist dataset=sofa +method=dist_mask seed=0"
-    assert "config.yaml has all settings" in remark
+    assert "config.yaml has all the settings" in remark
     stressed = command(record("x", dataset="wires", config={"stress": {"name": "wires"}}), Path("results"))[0]
     assert "stress=wires" in stressed and "dataset" not in stressed
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):
-    made.write(tmp_path, 0)
-    write_index(tmp_path)
+    results = tmp_path / "it's mine"
+    made.write(results, 0)
+    made.write(results, 1)
+    write_index(results)
     found: dict = {}
-    exec(Page(tmp_path).run("completion-0000")["python"], found)  # as a reader would paste them
-    assert found["record"]["status"] == "ok" and len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+    exec(Page(results).run("completion-0001")["python"], found)  # as a reader would paste them
+    assert found["run"].folder == "completion-0001" and found["run"].chamfer_l2 == 0.002
+    assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+
+
+def test_the_lines_for_python_ask_for_what_was_typed():
+    typed = ["task=completion", "renderer.steps=40", "results_dir=elsewhere", "label='it\\'s'"]
+    run = mock.Mock()
+    with mock.patch("bench.run", run):
+        exec(lines_again(record("x", overrides=typed), Path("my results")), {})
+    run.assert_called_once_with([*typed[:2], typed[3]], results_dir="my results")
+    long = lines_again(record("x", overrides=[f"task.points={n}" for n in range(20)]), Path("results"))
+    assert max(map(len, long.splitlines())) < 90 and "results_dir" not in long
 
 
 def test_costs_are_by_phase_and_add_up(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 import bench
 from bench.report.data import frame
 from bench.run import library
+from tests.report.page_data import Page
 from tests.run.driving import ROOT, Outcome, command
 
 SMALL = (
@@ -96,6 +97,17 @@ def test_a_run_that_failed_is_a_record(within):
     })  # fmt: skip
     assert record.status == "crashed" and record.reason
     assert record.folder.parent == within / "results" / "runs"
+
+
+def test_the_lines_of_the_page_open_the_run_and_make_it_again(within):
+    made = bench.run(scale="smoke", renderer="newton", seed=3)
+    shown = Page(within / "results").run(made.id)
+    opened: dict = {}
+    exec(shown["python"], opened)
+    assert opened["run"].status == "ok" and opened["run"].seed == 3 and len(opened["curve"]) == 8
+    again: dict = {}
+    exec(shown["again"], again)
+    assert again["record"].reused and again["record"].folder == made.folder
 
 
 def test_importing_bench_imports_nothing_that_is_slow():

@@ -1,9 +1,14 @@
-"""Names of runs by what differs: the row's name, then the settings in which runs of that name differ."""
+"""Names of runs in a list: the row's name, then the settings in which runs of that name differ.
 
-from collections.abc import Hashable
-from typing import Any
+What differs is found and written as `bench.records.names` does it for the rows of a sweep, so that a setting reads the
+same in both. A list has another beginning and end: a name begins with the row, since the list mixes all tasks and
+experiments, and lacks what stands in columns of its own, such as shape and seed.
+"""
 
-from bench.records.names import flat
+import json
+from dataclasses import dataclass
+
+from bench.records.names import in_order, settings_of, told_apart
 from bench.records.record import NEUTRAL_KEYS, row_name
 from bench.report.data.records import OURS, Record, grouped, setting
 
@@ -11,20 +16,42 @@ CUSTOM = "custom"  # the file of conf/renderer that stands for a user's class
 MOST = 3  # settings in a name
 # Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
 SHOWN = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw"}
-# What is named first where several settings tell runs apart; the others follow in the order of their names.
+# What is named first where several settings tell runs apart.
 FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
 
 
-def names(records: list[Record]) -> list[str]:
-    """The name of each record: that of its row, a user's renderer by its class, and the settings that differ.
+@dataclass(frozen=True)
+class Nameable:
+    """What the name of a run in a list depends on: its task, its row and, as JSON, the settings that may be named."""
 
-    Settings are added, in the order of `FIRST`, as long as one tells apart runs of one task and name that those before
-    it do not, so that what follows from another setting is not repeated; at most `MOST`.
+    task: str
+    row: str
+    settings: str
+
+    @classmethod
+    def of(cls, record: Record) -> "Nameable":
+        """What the name of a record depends on."""
+        return cls(record["task"], base_name(record), json.dumps(settings_of(record["config"], SHOWN)))
+
+
+def names(runs: list[Nameable]) -> list[str]:
+    """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
+
+    Settings are added as long as one tells apart runs of one task and row that those before it do not, so that what
+    follows from another setting is not repeated; at most `MOST`.
     """
-    found = [base_name(record) for record in records]
-    for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
-        for place, told in zip(places, _told_apart([records[place] for place in places]), strict=True):
-            found[place] += told
+    found = [""] * len(runs)
+    for places in grouped(range(len(runs)), lambda place: (runs[place].task, runs[place].row)).values():
+        alike = list(grouped(places, lambda place: runs[place].settings).values())
+        settings = [
+            json.loads(runs[same[0]].settings) for same in alike
+        ]  # each once: most runs of a list have the same
+        told = told_apart(
+            in_order(settings, FIRST), classes=[0] * len(alike), names=[runs[places[0]].row] * len(alike), most=MOST
+        )
+        for same, name in zip(alike, told.names, strict=True):
+            for place in same:
+                found[place] = name
     return found
 
 
@@ -36,46 +63,3 @@ def base_name(record: Record) -> str:
         own = target.rpartition(".")[2]
         return name.replace(CUSTOM, own, 1) if name.startswith(CUSTOM) else name
     return name
-
-
-def _told_apart(records: list[Record]) -> list[str]:
-    """For each record of one name the settings that differ among them, such as `, steps=20, alpha=1.5`."""
-    known = [_settings(record["config"]) for record in records]
-    if all(settings == known[0] for settings in known):
-        return [""] * len(records)
-    keys = sorted({key for settings in known for key in settings}, key=_order)
-    varied = [key for key in keys if len({settings.get(key, "") for settings in known}) > 1]
-    classes: list[Hashable] = [0] * len(records)
-    chosen: list[str] = []
-    for key in varied:
-        finer = [(known, settings.get(key, "")) for known, settings in zip(classes, known, strict=True)]
-        if len(set(finer)) > len(set(classes)):
-            numbers = {each: number for number, each in enumerate(dict.fromkeys(finer))}
-            classes = [numbers[each] for each in finer]
-            chosen.append(key)
-        if len(chosen) == MOST:
-            break
-    short = _short(chosen)
-    return ["".join(f", {short[key]}={settings.get(key, 'none')}" for key in chosen) for settings in known]
-
-
-def _order(key: str) -> tuple[int, str]:
-    top = key.split(".")[0]
-    return (FIRST.index(top) if top in FIRST else len(FIRST), key)
-
-
-def _short(keys: list[str]) -> dict[str, str]:
-    """The last part of each key, or all of it where two keys would be called the same."""
-    last = [key.rpartition(".")[2] for key in keys]
-    return {key: end if last.count(end) == 1 else key for key, end in zip(keys, last, strict=True)}
-
-
-def _settings(config: dict[str, Any]) -> dict[str, str]:
-    """The settings that may be part of a name, as text."""
-    known = flat({top: value for top, value in config.items() if top not in SHOWN})
-    return {key: "null" if value is None else str(value) for key, value in known.items() if _public(key)}
-
-
-def _public(key: str) -> bool:
-    last = key.rpartition(".")[2]
-    return last == "_target_" or not last.startswith("_")

@@ -16,9 +16,9 @@ from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, by_shape
 from bench.report.write import chart
-from bench.report.write.answer import Answer, at_fewest_points, chart_panel, series
+from bench.report.write.answer import Answer, at_fewest_points, chart_panel, presets_of, series
 from bench.report.write.result import Result
-from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table
+from bench.report.write.table import COMPLETION, FAMILY, LOOP, PRESET, Column, configured, text, to_data, to_table
 
 PLACE = 32
 PLACE_FRONT = 35
@@ -105,6 +105,7 @@ def make_front(experiment: Experiment) -> Result:
         Column("error", "Error × 1000", lambda line: line["error"].value, words=lambda line: str(line["error"])),
         *(Column(end, value=lambda line, end=end: getattr(line["error"], end)) for end in ("low", "high")),
         text("front", "On the front"),
+        PRESET,
     ]
     return Result(
         experiment,
@@ -169,11 +170,17 @@ def answer_front(data: pd.DataFrame, notes: list[str]) -> Answer:
     front = data[data["front"] == "yes"]
     losses, counts = data["loss"].nunique(), front["renderer"].value_counts()
     said = "; ".join(f"{name} under *{n} of {losses}*" for name, n in counts.items())
-    panels = []
+    panels, presets = [], presets_of(data, "renderer")
     for loss, found in data.groupby("loss", sort=False):
         points = [
             series(
-                name, name, own["evaluations"], own["error"], low=own["low"].tolist(), high=own["high"].tolist(), size=9
+                name,
+                presets[name],
+                own["evaluations"],
+                own["error"],
+                low=own["low"].tolist(),
+                high=own["high"].tolist(),
+                size=9,
             )
             for name, own in found.groupby("renderer", sort=False)
         ]

@@ -14,7 +14,7 @@ from bench.report.data import curves
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, Row, setting
 from bench.report.write import chart
-from bench.report.write.answer import Answer, chart_panel, series
+from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, to_data
 
@@ -153,12 +153,11 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
         f"{ends.index[0]} ends with the lowest median error, *{format.number(ends.iloc[0], SCALE)}* (Chamfer × "
         f"1000), {ends.index[-1]} with {format.number(ends.iloc[-1], SCALE)}."
     )
-    panels = []
+    panels, presets = [], presets_of(data)
     for value, label, factor in (("total", "loss", 1.0), ("chamfer_l2", "Chamfer × 1000", SCALE)):
         found = data[data["kind"] == "median"].dropna(subset=[value, "seconds"])
-        presets = dict(zip(data["row"], data["renderer"].fillna(""), strict=True))
         lines = [
-            series(row, presets.get(row) or row, own["seconds"], factor * own[value], dash="-", symbol="")
+            series(row, presets[row], own["seconds"], factor * own[value], dash="-", symbol="")
             for row, own in found.groupby("row", sort=False)
         ]
         panels.append(chart_panel("", "time in the loop (seconds)", label, lines))

@@ -18,9 +18,9 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
 from bench.report.write import chart
-from bench.report.write.answer import Answer, chart_panel, series
+from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, defined, shown, text, through, to_data, to_table
+from bench.report.write.table import IDENTITY, PRESET, Column, defined, shown, text, through, to_data, to_table
 
 PLACE = 120
 PLACE_COST = 130
@@ -59,6 +59,7 @@ COSTS = (
     text("at_once", "At once"),
     text("never", "None"),
     Column("cost", "Field values per ray"),
+    PRESET,
 )
 FAILURES = text(
     "failures", value=lambda line: "; ".join(f"{count} {kind}" for kind, count in line[1].failures().items())
@@ -234,7 +235,13 @@ def _cost(grid: Atlas, row: Row, axes: list[str]) -> dict[str, Any]:
     right = [cell for cell in cells if not cell.at_once]  # a renderer that breaks there may be cheap but find nothing
     cost = median_of_known(cell.number("evaluations_per_ray") for cell in right)
     ends = {"at_once": sum(cell.at_once for cell in cells), "never": sum(cell.never for cell in cells)}
-    return {"row": row.name, "axes": len(cells), **ends, "cost": math.nan if cost is None else cost}
+    return {
+        "row": row.name,
+        "preset": row.preset,
+        "axes": len(cells),
+        **ends,
+        "cost": math.nan if cost is None else cost,
+    }
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
@@ -260,11 +267,9 @@ def _cells(data: pd.DataFrame) -> dict[str, Any]:
         for a, g, u in data[["axis", "group", "unit"]].drop_duplicates().itertuples(index=False)
     ]
     rows = list(dict.fromkeys(data["row"]))
-    looks = {row: style.look(preset) for row, preset in zip(data["row"], data["renderer"], strict=True)}
     found = {(r["axis"], r["row"]): _cell(r) for _, r in data.iterrows()}
     cells = [[found.get((axis["axis"], row)) for row in rows] for axis in axes]
-    shown = {row: {"colour": look.colour, "symbol": look.marker} for row, look in looks.items()}
-    return {"axes": axes, "rows": rows, "looks": shown, "cells": cells}
+    return {"axes": axes, "rows": rows, "cells": cells}
 
 
 def _cell(run: pd.Series) -> dict[str, Any]:
@@ -301,12 +306,12 @@ def answer_cost(data: pd.DataFrame, notes: list[str]) -> Answer:
         if same
         else f"{cheap['row']} is the cheapest: rank {format.number(cheap['rank'])} for {format.number(cheap['cost'])}"
     )
-    points = [series(row["row"], row["row"], [row["cost"]], [row["rank"]], size=11) for _, row in data.iterrows()]
-    chart = {
-        "panels": [
-            chart_panel(
-                "", "field values per ray at the mild end", "mean rank over axes (1 is best)", points, height=420
-            )
-        ]
-    }
-    return Answer("Is a robust renderer an expensive one?", f"{said}{rest}.", chart)
+    presets, places = presets_of(data), data.groupby(["cost", "rank"]).cumcount()  # later ones smaller: none is hidden
+    points = [
+        series(row["row"], presets[row["row"]], [row["cost"]], [row["rank"]], size=12 / (1 + 0.4 * places[place]))
+        for place, row in data.iterrows()
+    ]
+    axes = ("field values per ray at the mild end", "mean rank over axes (1 is best)")
+    panel = chart_panel("", *axes, points, height=420)
+    panel["y"]["reversed"] = True
+    return Answer("Is a robust renderer an expensive one?", f"{said}{rest}.", {"panels": [panel]})

@@ -15,15 +15,15 @@ from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, grouped
 from bench.report.data.statistics import clopper_pearson
 from bench.report.write import chart
-from bench.report.write.answer import Answer, chart_panel, series
+from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result
-from bench.report.write.table import Column, text, to_data
+from bench.report.write.table import PRESET, Column, text, to_data
 
 PLACE = 140
 READS = (STABILITY,)
 PANELS = 4  # in a line of the figure
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
-COLUMNS = (text("axis"), text("row"), *(Column(name) for name in SHARES))
+COLUMNS = (text("axis"), text("row"), PRESET, *(Column(name) for name in SHARES))
 NOTES = (
     "Curves are logistic, with the most probable breakdown and width. Dots are shares of the trials at a severity; the "
     "CSV has their number and intervals (Clopper and Pearson). Renderers are shifted a little upwards, so that none "
@@ -39,7 +39,7 @@ def make(experiment: Experiment) -> Result:
     grid = atlas(experiment)
     shares = {key: _shares(experiment, cell) for key, cell in grid.cells.items() if cell.known}
     lines = [
-        {"axis": axis, "row": row.name, **share}
+        {"axis": axis, "row": row.name, "preset": row.preset, **share}
         for (axis, row), table in shares.items()
         for share in table.astype(object).to_dict("records")
     ]
@@ -126,10 +126,10 @@ def _shares(experiment: Experiment, cell: Cell) -> pd.DataFrame:
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The shares of successes over the severity, a panel per axis."""
-    panels = []
+    panels, presets = [], presets_of(data)
     for axis, found in data.groupby("axis", sort=False):
         lines = [
-            series(row, row, own["severity"], 100 * own["share"], dash="-", size=5, text=_said(own))
+            series(row, presets[row], own["severity"], 100 * own["share"], dash="-", size=5, text=_said(own))
             for row, own in found.sort_values("level").groupby("row", sort=False)
         ]
         panels.append(chart_panel(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))

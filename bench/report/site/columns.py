@@ -4,10 +4,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import digest
+from bench.records.files import digest, plain
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.record import started
-from bench.report.data.names import base_name, names
+from bench.report.data.names import Nameable, names
 from bench.report.data.records import Record, family, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
@@ -19,31 +19,38 @@ METRICS = SHOWN | MEASURED
 
 def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
     """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
-    folders = [Folder(results_dir, record["folder"]) for record in records]
-    texts = {
-        "task": [record["task"] for record in records],
-        "name": names(records),
-        "row": [base_name(record) for record in records],
-        "family": [_safely(family, record, record["dataset"]) for record in records],
-        "scene": [record.get("scene") or record["dataset"] for record in records],
-        "renderer": [record["renderer"] for record in records],
-        "status": [record["status"] for record in records],
-        "machine": [machine(record) for record in records],
-        "experiment": [str(record["config"].get("experiment") or "") for record in records],
-        "cell": [_safely(_cell, record, record["folder"]) for record in records],
-        "thumb": [folder.thumb() for folder in folders],
-    }
+    return columns_of([entry(record, Folder(results_dir, record["folder"])) for record in records])
+
+
+def entry(record: Record, folder: Folder) -> dict[str, Any]:
+    """What the list has of a run, as plain data; its name follows when all runs are known."""
+    nameable = Nameable.of(record)
     return {
-        "count": len(records),
-        "folder": [folder.name for folder in folders],
-        "address": [folder.link("") for folder in folders],
-        "key": [folder.key for folder in folders],
-        "texts": {name: _coded(values) for name, values in texts.items()},
-        "numbers": {name: [_rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
-        "metrics": _metrics(records),
-        "reason": [_reason(record) for record in records],
-        "reused": [place for place, record in enumerate(records) if record["reused"]],
-        "tasks": _tasks(records),
+        "folder": folder.name,
+        "address": folder.link(""),
+        "key": folder.key,
+        "texts": {name: of(record) for name, of in TEXTS.items()} | {"row": nameable.row, "thumb": folder.thumb()},
+        "settings": nameable.settings,
+        "numbers": {name: _rounded(of(record)) for name, of in NUMBERS.items()},
+        "after": _measured(record["metrics"]),
+        "before": _measured(record["metrics_start"]),
+        "reason": _reason(record),
+        "reused": record["reused"],
+    }
+
+
+def columns_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """The columns of entries."""
+    texts = {name: [one["texts"][name] for one in entries] for name in (*TEXTS, "row", "thumb")}
+    named = names([Nameable(one["texts"]["task"], one["texts"]["row"], one["settings"]) for one in entries])
+    return {
+        "count": len(entries),
+        **{name: [one[name] for one in entries] for name in ("folder", "address", "key", "reason")},
+        "texts": {name: _coded(values) for name, values in {**texts, "name": named}.items()},
+        "numbers": {name: [one["numbers"][name] for one in entries] for name in NUMBERS},
+        "metrics": _metrics(entries),
+        "reused": [place for place, one in enumerate(entries) if one["reused"]],
+        "tasks": _tasks(entries),
     }
 
 
@@ -76,26 +83,42 @@ NUMBERS = {
 }
 
 
-def _metrics(records: list[Record]) -> dict[str, Any]:
+TEXTS = {
+    "task": lambda record: record["task"],
+    "family": lambda record: _safely(family, record, record["dataset"]),
+    "scene": lambda record: record.get("scene") or record["dataset"],
+    "renderer": lambda record: record["renderer"],
+    "status": lambda record: record["status"],
+    "machine": machine,
+    "experiment": lambda record: str(record["config"].get("experiment") or ""),
+    "cell": lambda record: _safely(_cell, record, record["folder"]),
+}
+
+
+def _measured(part: dict[str, Any]) -> dict[str, int | float | str]:
+    """The metrics of a part of a record that are shown and are numbers."""
+    return {key: known for key in METRICS if (known := _rounded(part.get(key))) is not None}
+
+
+def _metrics(entries: list[dict[str, Any]]) -> dict[str, Any]:
     """The metrics that some run has: before and after, in scene units, with their names and factors."""
+    after, before = ({key for one in entries for key in one[part]} for part in ("after", "before"))
     found = {}
-    for key, metric in METRICS.items():
-        after, before = (
-            [_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
-        )
-        if any(value is not None for value in after):
-            start = before if any(value is not None for value in before) else None
-            found[key] = {"key": key, **metric._asdict(), "after": after, "before": start}
+    for key in (key for key in METRICS if key in after):
+        start = [one["before"].get(key) for one in entries] if key in before else None
+        found[key] = {"key": key, **METRICS[key]._asdict(), "after": [one["after"].get(key) for one in entries]}
+        found[key] |= {"before": start}
     return found
 
 
-def _tasks(records: list[Record]) -> list[dict[str, Any]]:
+def _tasks(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
+    known: dict[str, set[str]] = {}
+    for one in entries:
+        known.setdefault(one["texts"]["task"], set()).update(one["after"])
     found = []
-    for task, count in Counter(record["task"] for record in records).most_common():
-        of_task = [record for record in records if record["task"] == task]
-        keys = [key for key in METRICS if any(number(r["metrics"].get(key)) is not None for r in of_task)]
-        keys.sort(key=lambda key, task=task: key != FIRST.get(task))
+    for task, count in Counter(one["texts"]["task"] for one in entries).most_common():
+        keys = sorted((key for key in METRICS if key in known[task]), key=lambda key, task=task: key != FIRST.get(task))
         found.append({"task": task, "count": count, "metrics": keys})
     return found
 
@@ -122,9 +145,10 @@ def _reason(record: Record) -> str:
     return (reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + " …") or "no reason recorded"
 
 
-def _rounded(value: Any) -> int | float | None:
+def _rounded(value: Any) -> int | float | str | None:
+    """A number with few digits; one that is not finite as a word, as the page's scripts have it."""
     known = number(value)
-    return float(f"{known:.{DIGITS}g}") if isinstance(known, float) else known
+    return plain(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
 
 
 def _safely(of: Any, record: Record, otherwise: Any) -> Any:

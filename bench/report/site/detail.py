@@ -9,7 +9,7 @@ from bench.records.statuses import said
 from bench.report.data.records import Record
 from bench.report.site.columns import number
 from bench.report.site.files import ALT, Folder
-from bench.report.site.words import asked, command, python
+from bench.report.site.words import asked, command, lines_again, lines_open
 
 MOST_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
 PHASES = {
@@ -42,7 +42,8 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "curve": curve(folder),
         "command": typed,
         "remark": remark,
-        "python": python(record, results_dir / "runs" / folder.name, files),
+        "again": lines_again(record, results_dir),
+        "python": lines_open(record, results_dir / "runs" / folder.name, files),
     }
 
 

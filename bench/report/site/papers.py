@@ -5,8 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bench.report.write.paper import FOLDER, SMOKE, find_paper
-from bench.report.write.sweeps import find_sweeps
+from bench.report.write.paper import FOLDER, SMOKE, find_paper, find_sweeps
 
 SHOWN = ("question", "verdict", "chart", "atlas")  # what `bench.report` adds to a page's files
 

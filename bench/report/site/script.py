@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from bench.records.files import plain
 
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
+KEY = re.compile(r"[0-9a-f]{16}\.js")  # of the files with details
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
@@ -29,6 +31,16 @@ def safe_json(data: Any) -> str:
     except ValueError:  # a number that is not finite
         text = ENCODER.encode(plain(data))
     return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def remove_others(folder: Path, keys: Iterable[str]) -> None:
+    """Removes the scripts of what is gone."""
+    kept = {f"{key}.js" for key in keys}
+    if folder.is_dir():
+        with os.scandir(folder) as found:
+            gone = [one.name for one in found if one.name not in kept and KEY.fullmatch(one.name)]
+        for name in gone:
+            (folder / name).unlink(missing_ok=True)
 
 
 def write_script(path: Path, text: str) -> None:

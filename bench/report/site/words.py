@@ -1,9 +1,11 @@
-"""What a run was asked, in words; the command that makes it again; the lines that open it in Python."""
+"""What a run was asked, in words; the command and lines of Python that make it again and open it."""
 
+import json
 import shlex
 from pathlib import Path
 from typing import Any
 
+from bench.records import metrics
 from bench.report.data.records import Record, iterations_of, setting
 
 TASKS = {
@@ -25,6 +27,13 @@ TASKS = {
     "capacity": "Measure how much model a shape needs",
 }
 LEFT_OUT = ("results_dir", "rerun")  # of a command, which stands for any folder
+WIDEST = 90  # letters of overrides on one line
+MOST_SHOWN = 4  # metrics that the lines print
+TYPED = "As it was typed. Configurations are code: read one that is not yours first."
+NOT_TYPED = (
+    "This record is of a version that did not keep its command: these are its choices, and config.yaml has all the "
+    "settings."
+)
 
 
 def asked(record: Record) -> str:
@@ -46,12 +55,54 @@ def asked(record: Record) -> str:
 
 def command(record: Record, results_dir: Path) -> tuple[str, str]:
     """The command that makes the run again, for a shell, and a remark on how sure it is."""
-    overrides = [str(override) for override in record.get("overrides") or []]
-    if overrides:
-        kept = [override for override in overrides if override.partition("=")[0] not in LEFT_OUT]
-        return _command(
-            kept, results_dir
-        ), "As it was typed. Configurations are code: read one that is not yours first."
+    folder = [] if _default(results_dir) else [f"results_dir={results_dir.as_posix()}"]
+    remark = TYPED if record.get("overrides") else NOT_TYPED
+    return shlex.join(["python", "-m", "bench", *_overrides(record), *folder]), remark
+
+
+def lines_again(record: Record, results_dir: Path) -> str:
+    """The lines that make the run again in Python, or reuse it where nothing has changed."""
+    words = [_quoted(word) for word in _overrides(record)]
+    folder = "" if _default(results_dir) else f", results_dir={_quoted(results_dir.as_posix())}"
+    inner = ", ".join(words)
+    if len(inner) + len(folder) > WIDEST:
+        inner = "".join(f"\n    {word}," for word in words) + "\n"
+    return "\n".join(
+        ["import bench", "", f"record = bench.run([{inner}]{folder})", "print(record.status, record.metrics)"]
+    )
+
+
+def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
+    """The lines that open the run in Python: its values of the table of all runs, its curve and its mesh."""
+    results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
+    shown = ["status", *[metric for metric in metrics.SHOWN if metric in record["metrics"]][:MOST_SHOWN]]
+    opened = {
+        "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
+        "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),
+    }
+    others = [lines for file, lines in opened.items() if file in files]
+    imports = ["import bench", *(first for first, _ in others)]
+    lines = [
+        f"runs = bench.load({results})",
+        f"run = runs[runs.folder == {name}].iloc[0]",
+        f"print(run[{json.dumps(shown)}])",
+    ]
+    if others:
+        imports.insert(0, "from pathlib import Path\n")
+        lines += ["", f'folder = Path({results}) / "runs" / {name}', *(line for _, line in others)]
+    return "\n".join([*imports, "", *lines])
+
+
+def _quoted(text: str) -> str:
+    """A text as Python reads it, in double quotes where that is the same."""
+    return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)
+
+
+def _overrides(record: Record) -> list[str]:
+    """What the command line set; of an older record, which does not have it, its choices."""
+    typed = [str(override) for override in record.get("overrides") or []]
+    if typed:
+        return [override for override in typed if override.partition("=")[0] not in LEFT_OUT]
     config = record["config"]
     seen = "stress" if config.get("stress") else "dataset"  # a stress takes the dataset's place in a record
     known = {"task": record["task"], "renderer": record["renderer"], seen: record["dataset"]}
@@ -60,33 +111,11 @@ def command(record: Record, results_dir: Path) -> tuple[str, str]:
     known |= {"method": record.get("method")}
     known |= {key: config.get(key) for key in ("split", "index")} | {"seed": record["seed"]}
     added = ("experiment", "method")
-    words = [f"{'+' * (key in added)}{key}={value}" for key, value in known.items() if value not in (None, "")]
-    remark = (
-        "This record is of a version that did not keep its command: these are its choices, and config.yaml has all "
-    )
-    return _command(words, results_dir), remark + "settings."
+    return [f"{'+' * (key in added)}{key}={value}" for key, value in known.items() if value not in (None, "")]
 
 
-def python(record: Record, folder: Path, files: dict[str, str]) -> str:
-    """The lines that open the run in Python."""
-    lines = [
-        "from pathlib import Path",
-        "from bench.records.record import read_record",
-        "",
-        f"folder = Path({str(folder)!r})",
-        "record = read_record(folder)",
-        'print(record["status"], record["metrics"])',
-    ]
-    if "curve.jsonl" in files:
-        lines += ["", "import pandas as pd", "", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)']
-    if "mesh.ply" in files:
-        lines += ["", "import trimesh", "", 'mesh = trimesh.load(folder / "mesh.ply")']
-    return "\n".join(lines)
-
-
-def _command(words: list[str], results_dir: Path) -> str:
-    folder = [] if results_dir.as_posix() == "results" else [f"results_dir={results_dir.as_posix()}"]
-    return shlex.join(["python", "-m", "bench", *words, *folder])
+def _default(results_dir: Path) -> bool:
+    return results_dir.as_posix() == "results"
 
 
 def _known(of: Any, record: Record) -> Any:

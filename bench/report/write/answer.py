@@ -146,6 +146,15 @@ def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any
     return {"name": name, "x": _rounded(x), "y": _rounded(y), **marks}
 
 
+def presets_of(data: pd.DataFrame, names: str = "row") -> dict[str, str]:
+    """The preset of each row of a CSV, which decides its look; an older CSV has the renderer, or the name alone."""
+    found = {str(name): str(name) for name in data[names]}
+    for column in [each for each in ("renderer", "preset") if each in data and each != names]:
+        known = data[data[column].notna()]
+        found |= dict(zip(known[names].astype(str), known[column].astype(str), strict=True))
+    return found
+
+
 def _rounded(values: Any) -> list[float]:
     return [float(f"{value:.5g}") for value in np.asarray(values, float)]
 

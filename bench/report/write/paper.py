@@ -1,4 +1,4 @@
-"""Writes the tables and figures of all experiments and their README, and reads them back for index.html."""
+"""Writes the tables and figures of all experiments and their README; reads these and sweeps' tables for index.html."""
 
 import html
 import os
@@ -10,8 +10,10 @@ from typing import Any
 from urllib.parse import quote
 
 from bench.records.files import leads_out, write_text
+from bench.records.read import PLAN
 
 FOLDER = "paper"
+SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
 SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 PAGES = Path(__file__).parents[1] / "pages"
@@ -76,6 +78,16 @@ def find_paper(results_dir: Path) -> list[dict[str, Any]]:
     return [found(folder, name, (FOLDER,)) for name in names if not name.startswith(".")]
 
 
+def find_sweeps(results_dir: Path) -> list[dict[str, Any]]:
+    """The tables of sweeps for `index.html`, the sweep that was asked for last first.
+
+    Each has what `find_paper` gives: a name, title, caption, notes, the table's header and rows, links to the files.
+    """
+    tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.md")
+    folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
+    return [found(folder, TABLE, (SWEEPS, folder.name)) | {"name": folder.name} for folder in folders]
+
+
 def write_readme(results_dir: Path) -> Path | None:
     """Writes `results_dir/README.md` with all tables and figures, so that no number is copied by hand.
 
@@ -89,6 +101,12 @@ def write_readme(results_dir: Path) -> Path | None:
     path = results_dir / "README.md"
     write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
     return path
+
+
+def _asked(folder: Path) -> float:
+    """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
+    plan = folder / PLAN
+    return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
 def found(folder: Path, name: str, place: tuple[str, ...]) -> dict[str, Any]:

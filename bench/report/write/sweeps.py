@@ -1,4 +1,4 @@
-"""Writes the table of each sweep that no page shows beside its plan, and reads these tables back for index.html."""
+"""Writes the table of each sweep that no page shows, beside its plan."""
 
 from importlib import import_module
 from pathlib import Path
@@ -6,16 +6,14 @@ from typing import Any
 
 from bench.records import format
 from bench.records.metrics import SHOWN, Metric, better
-from bench.records.read import PLAN
 from bench.report.data.records import definitions
 from bench.report.data.statistics import Interval
 from bench.report.data.sweeps import RowNumbers, SweepRuns, numbers, read_sweeps
 from bench.report.write.caption import OVER
-from bench.report.write.paper import found, page_names
+from bench.report.write.paper import SWEEPS, TABLE, page_names
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, counted, shown, text, to_data, to_table
 
-FOLDER, TABLE = "sweeps", "table"
 MOST_VALUES = 6  # of a swept key that the caption lists
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
 FAILURE = (
@@ -28,18 +26,8 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 def write_sweeps(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
     """Writes `results_dir/sweeps/NAME/table.{csv,md,tex}` of every sweep without a page; gives the CSVs' paths."""
     sweeps = read_sweeps(records, results_dir, _tabled())
-    places = [results_dir / FOLDER / sweep.name / TABLE for sweep in sweeps]
+    places = [results_dir / SWEEPS / sweep.name / TABLE for sweep in sweeps]
     return [write(table_of(sweep), base, name=sweep.name)[0] for sweep, base in zip(sweeps, places, strict=True)]
-
-
-def find_sweeps(results_dir: Path) -> list[dict[str, Any]]:
-    """The tables of sweeps for `index.html`, the sweep that was asked for last first.
-
-    Each has what `find_paper` gives: a name, title, caption, notes, the table's header and rows, links to the files.
-    """
-    tables = (results_dir / FOLDER).glob(f"*/{TABLE}.md")
-    folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
-    return [found(folder, TABLE, (FOLDER, folder.name)) | {"name": folder.name} for folder in folders]
 
 
 def table_of(sweep: SweepRuns) -> Result:
@@ -58,12 +46,6 @@ def table_of(sweep: SweepRuns) -> Result:
         data=to_data(_data_columns(names), lines),
         table=to_table(_columns(headings, lines), lines),
     )
-
-
-def _asked(folder: Path) -> float:
-    """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
-    plan = folder / PLAN
-    return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
 def _tabled() -> set[str]:

@@ -128,6 +128,7 @@ IDENTITY = (
     *(text(key) for key in ("status", "reason", "folder")),
 )
 COMPLETION = (*IDENTITY, *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"))
+PRESET = text("preset")  # of a row, which decides its colour in charts; in the CSV only
 FAMILY = text("family", value=records.family)
 LOOP = (
     Column("loop_seconds", value=records.loop_seconds),

@@ -61,6 +61,12 @@
       .map((part, place) => (place % 2 ? element("strong", null, part) : part));
   }
 
+  /* A name that may be broken behind its dots and underscores. */
+  const breakable = (text) =>
+    String(text)
+      .split(/(?<=[._])/)
+      .flatMap((part, place) => (place ? [element("wbr"), part] : [part]));
+
   /* A button that copies a text. */
   function copyButton(text, label) {
     return element(
@@ -82,5 +88,5 @@
     );
   }
 
-  bench.dom = {element, fill, emphasised, copyButton, safeAddress};
+  bench.dom = {element, fill, emphasised, breakable, copyButton, safeAddress};
 })((window.implicitBench = window.implicitBench || {}));

@@ -22,10 +22,15 @@
     X: "x",
   };
 
+  /* The markers as letters, for the legend. */
+  const GLYPHS = {o: "●", s: "■", "^": "▲", D: "◆", v: "▼", "<": "◄", ">": "►", p: "⬟", h: "⬢", H: "⬣", "*": "★", d: "♦"};
+  Object.assign(GLYPHS, {8: "⬣", P: "✚", X: "✖"});
+  const MANY = 2; // panels, beyond which the legend stands above them and stays in sight
+
   /* Plotly reads some markup in its texts; a name from a record has none. */
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 
-  /* A chart of {panels: [{title, x: {title, log}, y: {title, log}, series}]}. A series is {name, colour, symbol, dash, x, y,
+  /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, series}]}. A series is {name, colour, symbol, dash, x, y,
      text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name are
      shown and hidden together. A point with a link opens it. */
   function chart(spec, {label, focus} = {}) {
@@ -51,10 +56,13 @@
     const redraw = () => places.forEach((place, number) => drawPanel(plotly, place, spec.panels[number], {off, focus}));
     const looks = new Map(spec.panels.flatMap((panel) => panel.series).map((series) => [series.name, series]));
     const entries = names.map((name) => entry(name, looks.get(name), off, redraw));
+    const many = spec.panels.length > MANY;
+    const legend = names.length > 1 ? element(`div.legend${many ? ".above" : ""}`, null, entries) : null;
     fill(
       home,
-      element("div.panels", null, places),
-      names.length > 1 ? element("div.legend", null, entries) : null,
+      many ? legend : null,
+      element(`div.panels${many ? ".many" : ""}`, null, places),
+      many ? null : legend,
       spec.note ? element("p.soft", null, spec.note) : null,
     );
     requestAnimationFrame(redraw);
@@ -62,8 +70,9 @@
   }
 
   function entry(name, look, off, redraw) {
-    const swatch = element("span.swatch", {"aria-hidden": "true"});
-    swatch.style.background = bench.colour(look.colour);
+    const glyph = GLYPHS[look.symbol];
+    const swatch = element(glyph ? "span.glyph" : "span.swatch", {"aria-hidden": "true"}, glyph);
+    swatch.style[glyph ? "color" : "background"] = bench.colour(look.colour);
     const toggle = (event) => {
       off.has(name) ? off.delete(name) : off.add(name);
       event.currentTarget.setAttribute("aria-pressed", String(!off.has(name)));
@@ -79,7 +88,8 @@
 
   function drawPanel(plotly, place, panel, {off, focus}) {
     if (!place.isConnected) return;
-    const shown = panel.series.filter((series) => !off.has(series.name));
+    const front = (series) => Number(series.name === focus); // drawn last, over the others
+    const shown = panel.series.filter((series) => !off.has(series.name)).sort((a, b) => front(a) - front(b));
     const traces = shown.map((series) => trace(series, focus));
     plotly.react(place, traces, layout(panel, place), {displayModeBar: false, responsive: true});
     place.removeAllListeners("plotly_click");
@@ -137,7 +147,8 @@
     const style = getComputedStyle(document.documentElement);
     const [text, line, card] = ["--soft", "--line", "--card"].map((name) => style.getPropertyValue(name).trim());
     const narrow = place.clientWidth < 460;
-    const axis = ({title, log}, letter) => ({
+    const axis = ({title, log, reversed}, letter) => ({
+      autorange: reversed ? "reversed" : true,
       ...(log
         ? ticks(
             panel.series.flatMap((series) => series[letter]),

@@ -24,7 +24,8 @@
               element(
                 "tr.group",
                 null,
-                element("th.words", {colspan: data.rows.length + 1, scope: "rowgroup"}, axis.group),
+                element("th.words", {scope: "rowgroup"}, axis.group), // a cell of its own stays in sight when scrolled
+                element("td", {colspan: data.rows.length}),
               ),
             ]
           : [];
@@ -41,7 +42,13 @@
     return element(
       "div.atlas",
       null,
-      element("div.key", null, "breaks at the mildest severity", SHADES.map(swatch), "does not break at the severest"),
+      element(
+        "div.key",
+        null,
+        "breaks at the mildest severity",
+        element("span", null, SHADES.map(swatch)),
+        "does not break at the severest",
+      ),
       element(
         "div.wide",
         {tabindex: 0, role: "region", "aria-label": "Breakdowns by axis and renderer"},
@@ -118,12 +125,10 @@
     curves().then(
       (panels) => {
         const panel = panels.find((each) => each.axis === axis.axis);
-        const looks = new Map(Object.entries(data.looks || {}));
-        const series = panel && panel.series.map((each) => ({...each, ...looks.get(each.name)}));
         if (panel)
           fill(
             curve,
-            bench.chart({panels: [{...panel, series}]}, {label: `Share of successes on ${axis.title}`, focus: row}),
+            bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row}),
           );
       },
       () => {},

@@ -28,7 +28,7 @@
       element("p.crumbs", null, element("a", {href: "#/"}, "All results")),
       element("h1", null, "Two runs side by side"),
       element("div.two", null, places.map(heading)),
-      element("p", null, element("a.button", {href: swapped}, "Swap")),
+      element("p.swap", null, element("a.button", {href: swapped}, "Swap")),
       body,
     );
     Promise.all(places.map((place) => bench.store.load("run", bench.runs.key(place)))).then(
@@ -97,7 +97,7 @@
     if (!keys.length) return element("p", null, `None: all ${same} settings are equal.`);
     const value = (map, key) => (map.has(key) ? map.get(key) : element("span.soft", null, "–"));
     const columns = [
-      {label: "Setting", head: true, cell: (key) => element("code", null, key)},
+      {label: "Setting", head: true, cell: (key) => element("code", null, bench.dom.breakable(key))},
       {label: "A", cell: (key) => value(own, key)},
       {label: "B", cell: (key) => value(others, key)},
     ];
@@ -124,7 +124,7 @@
       return typeof a === "number" && typeof b === "number" && a > 0 && Number.isFinite(b / a) ? number(b / a) : "–";
     };
     const columns = [
-      {label: "Metric", head: true, cell: (name) => element("code", null, name)},
+      {label: "Metric", head: true, cell: (name) => element("code", null, bench.dom.breakable(name))},
       {label: "A", kind: "number", cell: (name) => number(value(own, name))},
       {label: "B", kind: "number", cell: (name) => number(value(others, name))},
       {label: "B over A", kind: "number", cell: ratio},

@@ -2,7 +2,7 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill, copyButton} = bench.dom;
+  const {element, fill, copyButton, breakable} = bench.dom;
   const {number, count, seconds, size, date} = bench.format;
 
   function run(home, name) {
@@ -76,8 +76,13 @@
         : section("Pictures", element("p.soft", null, "This run left no picture.")),
       detail.curve ? section("Curve", bench.curves([{name: "run", curve: detail.curve}])) : null,
       section("Metrics, unscaled", metrics(detail.metrics)),
-      section("Make it again", code(detail.command, "Copy the command"), element("p.soft", null, detail.remark)),
-      section("Open it in Python", code(detail.python, "Copy the lines")),
+      section(
+        "Make it again",
+        code(detail.command, "Copy the command"),
+        element("p.soft", null, detail.remark, " From Python:"),
+        code(detail.again, "Copy the lines that make it again"),
+      ),
+      section("Open it in Python", code(detail.python, "Copy the lines that open it")),
       section(
         "Files",
         Object.keys(detail.files).length
@@ -150,12 +155,12 @@
   function metrics(rows) {
     if (!rows.length) return element("p.soft", null, "This run measured nothing.");
     const columns = [
-      {label: "Name", head: true, cell: ([name]) => element("code", null, name)},
+      {label: "Name", head: true, cell: ([name]) => element("code", null, breakable(name))},
       {label: "Before", kind: "number", cell: (row) => measured(row[1])},
       {label: "After", kind: "number", cell: (row) => measured(row[2])},
       {label: "Definition", cell: (row) => row[3] || element("span.soft", null, "No definition recorded.")},
     ];
-    return element("div.wide", null, bench.table.table(columns, rows, {caption: "Metrics before and after"}));
+    return element("div.wide.defined", null, bench.table.table(columns, rows, {caption: "Metrics before and after"}));
   }
 
   /* A metric; a whole number has no decimals. */
