@@ -317,6 +317,14 @@ def dominated(costs: Values, errors: Values) -> np.ndarray:
     return (no_worse & ((other[0] < mine[0]) | (other[1] < mine[1]))).any(axis=-1)
 
 
+def on_front(costs: Sequence[float | None], errors: Sequence[float]) -> list[bool]:
+    """Whether each point is on the front: it has a cost and a finite error, and none that has both dominates it."""
+    both = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
+    known = [(cost, error) for cost, error, has in zip(costs, errors, both, strict=True) if has]
+    beaten = iter(dominated(*zip(*known, strict=True)) if known else ())
+    return [has and not next(beaten) for has in both]
+
+
 def front(points: Sequence[Point], *, seed: int, draws: int = 2000) -> list[float]:
     """The probability of each setting to be on the Pareto front of medians, over bootstrap draws of shapes and seeds.
 

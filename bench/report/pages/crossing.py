@@ -1,6 +1,5 @@
 """The crossing: the errors and costs of every renderer under every loss of the mask."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -134,9 +133,7 @@ def _placed(crossed: Crossed, loss: str) -> list[dict[str, Any]]:
             found = statistics.geometric(errors)
             names = {"preset": key[0], "renderer": crossed.labels[key[0]], "loss": crossed.labels[loss]}
             lines.append(names | {"error": found, "evaluations": cost})
-    costs, values = [line["evaluations"] for line in lines], [line["error"].value for line in lines]
-    beaten = statistics.dominated(costs, values) if lines else []
-    front = [math.isfinite(value) and not inside for value, inside in zip(values, beaten, strict=True)]
+    front = statistics.on_front([line["evaluations"] for line in lines], [line["error"].value for line in lines])
     return [line | {"front": "yes" if on else ""} for line, on in zip(lines, front, strict=True)]
 
 
@@ -145,11 +142,10 @@ def draw_front(crossed: Crossed, lines: list[dict[str, Any]]) -> Figure:
     """Draws a panel per loss, with a point per renderer; filled points are on the front."""
     figure, (axes,) = chart.sheet(2.9, 1, len(crossed.losses), sharey=True, sharex=True)
     finite = [line for line in lines if np.isfinite(line["error"].value)]
-    edge = 2 * max((line["error"].value for line in finite), default=1.0)
     for axis, loss in zip(axes, crossed.losses, strict=True):
-        for line in (line for line in finite if line["loss"] == crossed.labels[loss]):
-            how = {"ls": "none", "ms": 5, "label": line["renderer"]} | ({} if line["front"] else {"mfc": "none"})
-            chart.estimates(axis, line["preset"], [line["evaluations"]], [line["error"].below(edge)], bars=True, **how)
+        own = [line for line in finite if line["loss"] == crossed.labels[loss]]
+        rows, errors = [(line["preset"], line["renderer"]) for line in own], [line["error"] for line in own]
+        chart.front(axis, rows, [line["evaluations"] for line in own], errors, [line["front"] for line in own])
         axis.set(title=crossed.labels[loss], xlabel="field values per run")
     axes[0].set_ylabel("Chamfer × 1000 (scene units²)")
     style.log_axis(axes[0], "x", [line["evaluations"] for line in finite])

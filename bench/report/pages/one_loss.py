@@ -88,8 +88,10 @@ def _names(runs: Completions) -> list[str]:
 def _of(experiment: Experiment, runs: Completions, name: str) -> list[Line]:
     """The lines of a family, with what is on its front."""
     lines = [_line(experiment, runs, name, row) for row in runs.rows]
-    fronts = {f"front_{cost}": _front(lines, cost) for cost in COSTS}
-    return [line | {key: "yes" if line["row"] in on else "" for key, on in fronts.items()} for line in lines]
+    for cost in COSTS:
+        front = statistics.on_front([line[cost] for line in lines], [line["error"].value for line in lines])
+        lines = [line | {f"front_{cost}": "yes" if on else ""} for line, on in zip(lines, front, strict=True)]
+    return lines
 
 
 def _line(experiment: Experiment, runs: Completions, name: str, row: Row) -> Line:
@@ -114,13 +116,6 @@ def _median(runs: Completions, families: list[str], row: Row, points: str) -> fl
     return float(statistics.median(errors)) if errors else None
 
 
-def _front(lines: list[Line], cost: str) -> set[str]:
-    """The rows on the front of error over a cost, of those that have both."""
-    known = [line for line in lines if line[cost] is not None and math.isfinite(line["error"].value)]
-    beaten = statistics.dominated([line[cost] for line in known], [line["error"].value for line in known])
-    return {line["row"] for line, inside in zip(known, beaten, strict=True) if not inside}
-
-
 @style.styled
 def draw(lines: list[Line]) -> Figure:
     """Draws the error over all families over each cost, with a point per row; filled points are on the front."""
@@ -136,10 +131,8 @@ def draw(lines: list[Line]) -> Figure:
 
 
 def _panel(axis: Axes, lines: list[Line], cost: str) -> None:
-    edge = 2 * max((line["error"].value for line in lines), default=1.0)
-    for line in lines:
-        how = {"ls": "none", "ms": 5, "label": line["row"]} | ({} if line[f"front_{cost}"] else {"mfc": "none"})
-        chart.estimates(axis, line["preset"], [line[cost]], [line["error"].below(edge)], bars=True, **how)
+    rows, errors = [(line["preset"], line["row"]) for line in lines], [line["error"] for line in lines]
+    chart.front(axis, rows, [line[cost] for line in lines], errors, [line[f"front_{cost}"] for line in lines])
     style.log_axis(axis, "x", [line[cost] for line in lines])
 
 

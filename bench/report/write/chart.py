@@ -71,6 +71,16 @@ def estimates(axis: Axes, preset: str, x: Any, found: Sequence[Interval], *, bar
     shapes(axis, preset, x, found)
 
 
+def front(
+    axis: Axes, rows: Sequence[tuple[str, str]], costs: Any, errors: Sequence[Interval], on: Sequence[Any]
+) -> None:
+    """Draws the error of each row, a preset and its name, over its cost; those on the front are filled."""
+    edge = 2 * max((error.value for error in errors), default=1.0)
+    for (preset, name), cost, error, filled in zip(rows, costs, errors, on, strict=True):
+        how = {"ls": "none", "ms": 5, "label": name} | ({} if filled else {"mfc": "none"})
+        estimates(axis, preset, [cost], [error.below(edge)], bars=True, **how)
+
+
 def shapes(axis: Axes, preset: str, x: Any, found: Sequence[Interval]) -> None:
     """Draws the points of the shapes of estimates that have no interval, in the colour of their row."""
     drawn = [(at, point) for at, one in zip(x, found, strict=True) if not one.known for point in one.points]
