@@ -135,7 +135,9 @@ MUTANTS = (
     M("renderers/field.py", "self.counts.value += values.numel()", "self.counts.value += len(values)",
       "tests/renderers"),
     # Losses.
-    M("renderers/silhouette.py", "torch.where(mask, soft, -soft).clamp_min(0)", "torch.where(mask, soft, -soft).abs()",
+    M("renderers/silhouette.py", "self._excess(closest, mask).clamp_min(0)", "self._excess(closest, mask).abs()",
+      "tests/renderers/test_silhouette.py"),
+    M("renderers/silhouette.py", "wrong = silent | (violates", "wrong = (violates",
       "tests/renderers/test_silhouette.py"),
     M("renderers/silhouette.py", "closest if self.signed else closest.abs()", "closest",
       "tests/renderers/test_silhouette.py"),
