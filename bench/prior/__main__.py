@@ -36,7 +36,7 @@ def main() -> int:
         print(path)
 
     code = command_line(train, runs=False)
-    if planned:
+    if planned and code == 0:
         from bench.run.trainings import show_total
 
         show_total(planned)

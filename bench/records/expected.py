@@ -86,7 +86,8 @@ class Remaining:
     """The time left of a sweep: what its cells are expected to take, corrected by what its ended cells took.
 
     The correction is the median, over the ended cells, of the time that a cell took over the time that it was expected
-    to take: this machine, with its load of today. Until there are some, the expectation itself counts as one more.
+    to take: this machine, with its load of today. The expectation itself counts as one more, so that the first cells
+    alone do not decide.
 
     Args:
         cells: what each cell is expected to take, by its id, in the order in which they run; None where there is no

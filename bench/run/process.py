@@ -160,7 +160,8 @@ def fork_server(modules: Sequence[str] = ()) -> ForkServerContext:
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:
-    for module in preloaded():  # what the server has left out, so that it is imported off the run's clocks
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    for module in preloaded():  # what the server has left out, before `Started`: off the run's clocks
         with suppress(ImportError):
             import_module(module)
     from bench.run.execute import main

@@ -25,6 +25,7 @@ from bench.run.process import (
     Message,
     Notice,
     RunLimits,
+    Started,
     Step,
     reason_of,
     run_isolated,
@@ -137,13 +138,18 @@ def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
 def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
     """Runs a configuration; its record says that it is under way, and at the end how it ended."""
     started, stopped, tracker = time.perf_counter(), "", None
+
+    def ready() -> None:
+        nonlocal started
+        started = time.perf_counter()
+
     try:
         record.write(folder)  # in here, since a signal may come just after it
         limits = RunLimits(config.time_limit, config.memory_limit)
         tracker = build(config.tracker, "tracker", list(config.packages))
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
         with run_progress(record.name) as progress:
-            _carry_out(Job(config, folder, record), limits, progress)
+            _carry_out(Job(config, folder, record), limits, progress, ready)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit
         stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, reason_of(error)
@@ -164,8 +170,15 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
     return record
 
 
-def _carry_out(job: Job, limits: RunLimits, progress: Report) -> None:
-    """Does the job in a child process or, for debugging, in this one, and fills its record with what is known."""
+def _carry_out(job: Job, limits: RunLimits, progress: Report, ready: Callable[[], None]) -> None:
+    """Does the job in a child process or, for debugging, in this one, and fills its record with what is known.
+
+    Args:
+        job: the run.
+        limits: of the child.
+        progress: is told of each step.
+        ready: is called when the child has imported what it needs.
+    """
     if job.config.isolation == Isolation.off:
         from bench.run.execute import execute  # it imports torch, which otherwise only the child does
 
@@ -173,7 +186,9 @@ def _carry_out(job: Job, limits: RunLimits, progress: Report) -> None:
         return
 
     def receive(message: Message) -> None:
-        if isinstance(message, Record):
+        if isinstance(message, Started):
+            ready()
+        elif isinstance(message, Record):
             vars(job.record).update(vars(message))
             job.record.write(job.folder)
         elif isinstance(message, Step):

@@ -73,6 +73,12 @@ def test_without_the_reference_there_is_no_ratio_and_no_verdict(tmp_path):
     assert set(result.data["ratio"]) == {""} and "ratios to DIST" not in told(result)
 
 
+def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
+    every = {(renderer, "sofa", 0) for renderer in METHODS}
+    result = one_loss.make(compared(tmp_path, families=("sofa",), shapes=1, failed=every))
+    assert one_loss.answer(result.data, []).verdict == ""
+
+
 def test_the_answer_names_the_best_and_the_quickest(tmp_path):
     result = one_loss.make(compared(tmp_path))
     verdict = one_loss.answer(result.data, []).verdict

@@ -124,6 +124,47 @@ def test_a_folder_that_was_copied_is_read_anew(results, read, tmp_path):
     assert len(read) == 4 and "evil" not in script.read_text()
 
 
+def test_a_link_in_the_place_of_a_script_is_replaced_though_it_leads_to_the_same(results, tmp_path):
+    folder, name = results / "page" / "data", f"{Page(results).runs['key'][0]}.js"
+    for part in ("run", "mesh"):
+        (folder / part / name).rename(tmp_path / part)
+        (folder / part / name).symlink_to(tmp_path / part)
+    update_index(results)
+    for part in ("run", "mesh"):
+        (tmp_path / part).write_text("evil();")
+        assert not (folder / part / name).is_symlink()
+    update_index(results)
+    assert "evil" not in "".join((folder / part / name).read_text() for part in ("run", "mesh"))
+
+
+@pytest.mark.parametrize("name", ["curve.jsonl", "mesh.ply"])
+def test_a_file_that_grows_in_its_place_is_read_again(results, read, name):
+    folder = results / "runs" / "completion-0001"
+    text = (folder / name).read_bytes()
+    (folder / name).write_bytes(text + text.splitlines(keepends=True)[-1])
+    update_index(results)
+    assert read == [folder.name]
+
+
+def test_cells_that_two_plans_share_are_read_once(results, read):
+    cell = PlannedCell("planned", [], "completion", "dvr", "plane", 0, {"seed": 0, "index": 0})
+    Plan("sweep-again", results, [cell], asked="2025-03-05T10:00:00Z").write()
+    update_index(results)
+    read.clear()
+    update_index(results)
+    assert read == []
+
+
+@pytest.mark.parametrize("line", [{"kind": "run", "name": "completion-0000"}, {"kind": "other", "name": ""}, 3])
+def test_lines_of_another_form_are_not_believed(results, read, line):
+    path = results / "page" / known.FILE
+    with path.open("a") as file:
+        file.write(json.dumps(line) + "\n")
+    update_index(results)
+    assert len(read) == 4
+    assert_as_anew(results)
+
+
 @pytest.mark.parametrize("spoilt", [lambda text: text[:-20], lambda text: "", lambda text: text.replace("kind", "x")])
 def test_what_is_known_may_be_spoilt(results, read, spoilt):
     path = results / "page" / known.FILE

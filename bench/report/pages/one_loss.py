@@ -23,6 +23,7 @@ PLACE = 21
 READS = (Selection("one_loss", ("completion",), ("dataset", "task"), ("points",)),)
 FOLDER = "one_loss/"  # of the presets that `python -m bench.tune` writes
 REFERENCE = "one_loss/dist_mask"
+QUESTION = "How do all renderers compare under one loss, each tuned?"
 TUNED = ", tuned"  # end of the name of every row
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}
 UNITS = {"evaluations": "values", "seconds": "seconds"}
@@ -138,7 +139,11 @@ def _panel(axis: Axes, lines: list[Line], cost: str) -> None:
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The rows with the least error and the least cost, and the front over field values and over seconds."""
-    whole = data[data["family"] == data["family"].iloc[0]]
+    whole = data[
+        (data["family"] == data["family"].iloc[0]) & data["error"].map(math.isfinite) & data["seconds"].notna()
+    ]
+    if whole.empty:
+        return Answer(QUESTION)
     best, quick = whole.loc[whole["error"].idxmin()], whole.loc[whole["seconds"].idxmin()]
     named = [f"({row['row']}, {format.seconds(row['seconds'])})" for row in (best, quick)]
     said = (
@@ -152,4 +157,4 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
             for _, row in whole.iterrows()
         ]
         panels.append(chart_panel("error over cost", label, "error × 1000", points))
-    return Answer("How do all renderers compare under one loss, each tuned?", said, {"panels": panels})
+    return Answer(QUESTION, said, {"panels": panels})

@@ -1,7 +1,6 @@
 """Shape from one image, by the renderer whose gradients taught the network: the same training, another renderer."""
 
 import math
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -82,4 +81,5 @@ def _least(family: str, runs: pd.DataFrame) -> str:
         return ""
     row, least = min(ratios.items(), key=lambda item: item[1].value)
     among = f", the least of {len(ratios)}" if len(ratios) > 1 else ""
-    return re.sub(r"^(\S+)", rf"{family}: {row} *\1*", str(least)) + among
+    value, _, rest = str(least).partition(" ")
+    return f"{family}: {row} *{value}*" + (f" {rest}" if rest else "") + among

@@ -295,6 +295,9 @@ def _cell(run: pd.Series) -> dict[str, Any]:
 
 def answer_cost(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The most robust renderer and the cheapest."""
+    data = data.dropna(subset=["rank", "cost"]).reset_index(drop=True)
+    if data.empty:
+        return Answer("Is a robust renderer an expensive one?")
     best, cheap = data.loc[data["rank"].idxmin()], data.loc[data["cost"].idxmin()]
     said = (
         f"{best['row']} has the best mean rank, *{format.number(best['rank'])}* of {len(data)}, for "

@@ -16,7 +16,14 @@ from typing import Any
 from bench.records.files import digest, write_text
 
 FILE = "known.jsonl"
-CODE = ("records", "report/data", "report/site")  # of this package: what the scripts of a page depend on
+CODE = ("records", "report/data", "report/site", "report/write")  # of this package: what scripts of a page depend on
+FIELDS = {  # of each kind of line, beside its kind and name
+    "run": {"stamp", "script", "settings", "entry"},
+    "mesh": {"script", "made", "of"},
+    "plan": {"stamp", "cells"},
+    "settings": {"settings"},
+}
+ENTRY = {"key", "folder", "started", "mesh"}  # of an entry, at least
 SPARE, FEW = 2, 100  # a file with more lines than that many times those in use, and some, is written anew
 Stamp = list[int] | None
 
@@ -31,13 +38,19 @@ def file_stamp(path: Path | str) -> Stamp:
 
 
 def run_stamp(folder: Path) -> Stamp:
-    """What differs when a run's folder has other files, or its record has changed; None where either is a link."""
+    """What differs when a run's folder has other files, or what the page shows of them has changed.
+
+    None where the folder or one of these files is a link.
+    """
     record = file_stamp(f"{folder}/record.json")
     try:
         found = os.lstat(folder)
     except OSError:
         return None
-    return [found.st_ino, found.st_ctime_ns, *record] if record and stat.S_ISDIR(found.st_mode) else None
+    others = [f"{folder}/{name}" for name in ("curve.jsonl", "mesh.ply")]
+    if record is None or not stat.S_ISDIR(found.st_mode) or any(map(os.path.islink, others)):
+        return None
+    return [found.st_ino, found.st_ctime_ns, *record, *(number for one in others for number in file_stamp(one) or [0])]
 
 
 class Known:
@@ -58,7 +71,7 @@ class Known:
         if line is None or stamp is None or line["stamp"] != stamp:
             return None
         found = line["entry"]
-        if file_stamp(f"{self.data}/run/{found['key']}.js") != line["script"]:
+        if line["script"] is None or file_stamp(f"{self.data}/run/{found['key']}.js") != line["script"]:
             return None
         return found | {"settings": self.parts["settings"][line["settings"]]["settings"]}
 
@@ -83,9 +96,9 @@ class Known:
     def has_mesh(self, entry: dict[str, Any], *, wanted: bool) -> bool:
         """Whether the script of a run's mesh is there, with the mesh if it is wanted."""
         line = self.parts["mesh"].get(entry["folder"])
-        if line is None or (wanted and not line["made"]) or line["of"] != self._of(entry):
+        if line is None or (wanted and not line["made"]) or None in (line["script"], line["of"]):
             return False
-        return file_stamp(self.data / "mesh" / f"{entry['key']}.js") == line["script"]
+        return line["of"] == self._of(entry) and file_stamp(self.data / "mesh" / f"{entry['key']}.js") == line["script"]
 
     def keep_mesh(self, entry: dict[str, Any], *, made: bool) -> None:
         """Keeps that the script of a run's mesh was written; `made` where it holds more than why there is no mesh."""
@@ -123,7 +136,11 @@ class Known:
             found = json.loads(f"[{','.join(lines[:-1])}]")
             parts: dict[str, dict[str, Any]] = {kind: {} for kind in self.parts}
             for line in found:
+                if FIELDS[line["kind"]] - {*line} or ENTRY - {*line.get("entry", ENTRY)}:
+                    return
                 parts[line["kind"]][line["name"]] = line
+            if any(line["settings"] not in parts["settings"] for line in parts["run"].values()):
+                return
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return
         self.parts, self.read = parts, len(lines)

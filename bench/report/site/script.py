@@ -47,7 +47,7 @@ def write_script(path: Path, text: str) -> None:
     """Writes a script, unless the file has that text already."""
     content = text.encode("ascii")
     try:
-        if path.read_bytes() == content:
+        if not path.is_symlink() and path.read_bytes() == content:  # what a link leads to may change
             return
     except OSError:
         pass

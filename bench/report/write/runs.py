@@ -65,6 +65,7 @@ def _planned(results_dir: Path, data: Path, known: Known, there: set[str]) -> tu
     for path in plan_paths(results_dir):
         stamp = file_stamp(path)
         names = known.cells(path.parent.name, stamp)
+        there |= entries.keys()  # a cell that an earlier plan has as well
         missing = [name for name in names or () if name not in there]
         found = {name: known.entry(name, stamp) for name in missing}
         if names is None or None in found.values():
@@ -123,7 +124,7 @@ def _left_out(most: int | None) -> dict[str, str]:
 def _is_newer(path: Path, source: Path, key: str) -> bool:
     """Whether a mesh was made after its source, and the script holds a mesh and nothing else."""
     try:
-        if path.stat().st_mtime_ns <= source.stat().st_mtime_ns:
+        if path.is_symlink() or path.stat().st_mtime_ns <= source.stat().st_mtime_ns:
             return False
         head, tail = to_script("mesh", key, 0).split("0);")
         text = path.read_text(encoding="ascii")
