@@ -94,6 +94,8 @@ def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path):
     data = single_view_renderers.make(experiment).data
     verdict = single_view_renderers.answer(data, []).verdict
     assert verdict.endswith("shapes, one training each: car: IDR *1.50* (n = 3); sofa: IDR *0.500* (n = 3).")
+    named = data.assign(row=data["row"].where(data["row"] != "IDR", r"My \p{1} \1"))  # a label is no template
+    assert r"car: My \p{1} \1 *1.50* (n = 3)" in single_view_renderers.answer(named, []).verdict
     failed = data.assign(status=data["status"].where(data["row"] != "IDR", "empty"))
     assert "car: IDR *∞* (n = 3)" in single_view_renderers.answer(failed, []).verdict
     assert single_view_renderers.answer(data[data["row"] != "Newton"], []).verdict == ""

@@ -123,6 +123,11 @@ def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
     assert not list((tmp_path / "r").rglob("plan.json"))
 
 
+def test_a_sweep_that_cannot_be_has_no_sum(planned):
+    code, lines, err = planned(*OF_PRIOR, "-m", "dataset=sofa,plane,mesh")
+    assert code == 2 and "dataset.path" in err and not any("planned" in line for line in lines)
+
+
 @pytest.mark.parametrize("command", [OF_PRIOR, OF_NETWORK])
 def test_what_cannot_be_is_told(planned, command):
     code, out, err = planned(*command, "dataset=mesh", "dataset.path=none.ply")
