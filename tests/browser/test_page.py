@@ -167,7 +167,7 @@ def test_a_run_has_its_page(results, tab):
         "It ended as planned.",
         "Sum of two means.",
         "python -m bench task=completion",
-        'bench.run(["task=completion"',
+        "record = bench.run([",
         "runs = bench.load(",
         "in the loop",
     ):
