@@ -82,4 +82,5 @@ def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
 def test_the_answer_names_the_best_and_the_quickest(tmp_path):
     result = one_loss.make(compared(tmp_path))
     verdict = one_loss.answer(result.data, []).verdict
+    assert verdict.endswith("excludes 1 for *3 of 3* rows.")
     assert "(neus with mask, 30.0 s)" in verdict and "(dist with mask, 4.00 s)" in verdict

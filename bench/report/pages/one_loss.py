@@ -13,9 +13,9 @@ from bench.report.data import statistics
 from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, by_shape, family, loop_seconds, median_of_known, row_of, value_evaluations
-from bench.report.data.wins import gap
+from bench.report.data.wins import Gap, gap
 from bench.report.write import chart
-from bench.report.write.answer import Answer, chart_panel, series
+from bench.report.write.answer import Answer, chart_panel, excluding, series
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data, to_table
 
@@ -52,6 +52,7 @@ def make(experiment: Experiment) -> Result:
         Column("error", "Geometric mean", lambda line: line["error"].value, words=lambda line: str(line["error"])),
         *(Column(end, value=lambda line, end=end: getattr(line["error"], end)) for end in ("low", "high")),
         text("ratio", "Ratio to DIST", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
+        *(Column(f"ratio_{end}", value=lambda line, end=end: _end(line["ratio"], end)) for end in ("low", "high")),
         Column("evaluations", "Values", show=format.count),
         Column("seconds", "Loop", show=format.seconds),
         *(text(f"front_{cost}", f"Front, {unit}") for cost, unit in UNITS.items()),
@@ -80,6 +81,10 @@ def verdict(lines: list[Line]) -> list[str]:
     named = "; ".join(f"{line['row']} {line['ratio'].ratio}" for line in sure)
     said = f"The interval excludes 1 for {len(sure)} of {len(known)} ratios to DIST over all families"
     return [f"{said}: {named}." if sure else f"{said}."]
+
+
+def _end(ratio: Gap | None, end: str) -> float:
+    return math.nan if ratio is None else getattr(ratio.ratio, end)
 
 
 def _names(runs: Completions) -> list[str]:
@@ -150,6 +155,9 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
         f"Under one loss and tuned, the least error × 1000 is *{best['error']:.3g}* {named[0]}; the quickest row has "
         f"{quick['error']:.3g} {named[1]}."
     )
+    sure, all_known = excluding(whole, ["ratio"])
+    if all_known:
+        said += f" The interval of the ratio to DIST excludes 1 for *{sure} of {all_known}* rows."
     panels = []
     for cost, label in COSTS.items():
         points = [
