@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 GEMM_SIZE = 1024  # of the square matrices whose product is timed
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
+CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
 IMPOSSIBLE = 1.2  # times the machine's matrix product rate: above it, the clock did not wait for the device
 
 
@@ -45,8 +46,8 @@ def describe(device: torch.device) -> dict[str, Any]:
     """The environment as plain data for the record."""
     return {
         "commit": _git("rev-parse", "HEAD"),
-        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
-        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD")) else "",
+        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)),
+        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD", *CODE)) else "",
         "implicit_bench": _own_version(),
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},

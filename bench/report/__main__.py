@@ -32,13 +32,13 @@ def main(arguments: list[str]) -> None:
         results_dir = Path(given.get("results_dir", "results"))
         meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
         one_file = _one_file(given.get("one_file", "false"))
-        records = read_records(results_dir)[0]
+        records, unread = read_records(results_dir)
         frames = write_frame(records, results_dir)
         if len(frames) == 1:
             print(f"note: {NO_PARQUET}", file=sys.stderr)
         for path in (*frames, *write_paper(records, results_dir), *write_sweeps(records, results_dir)):
             print(path)
-        for problem in write_answers(results_dir):
+        for problem in [*(f"not read: {problem}" for problem in unread), *write_answers(results_dir)]:
             print(problem, file=sys.stderr)
         write_readme(results_dir)
         if one_file:

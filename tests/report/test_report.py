@@ -228,6 +228,13 @@ def test_command_refuses_what_it_does_not_know(argument, named, tmp_path, monkey
     assert not list((tmp_path / "results").iterdir())  # nothing is written before all is known to be sound
 
 
+def test_a_record_that_cannot_be_read_is_named(tmp_path, capsys):
+    (tmp_path / "runs" / "torn").mkdir(parents=True)
+    (tmp_path / "runs" / "torn" / "record.json").write_text('{"id": "to')
+    main([f"results_dir={tmp_path}"])
+    assert "not read: torn: " in capsys.readouterr().err
+
+
 def test_report_never_imports_torch():
     code = (
         "import pkgutil, importlib, sys, bench.report;"
