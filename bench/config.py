@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
@@ -227,14 +228,25 @@ def _build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str], t
         if OmegaConf.is_missing(node, key):
             raise ValueError(f"{name}.{key} must be given: set {name}.{key}=...")
     arguments = {str(key): node[key] for key in node if key not in RESERVED}
-    if not is_dataclass(cls):
-        return cls(**arguments)
-    names = [f.name for f in fields(cls)]
+    names = _argument_names(cls)
     for key in arguments:
-        if key not in names:
+        if names is not None and key not in names:
             new = renamed(f"{name}.{key}", [f"{name}.{known}" for known in names])
             raise ValueError(f"{name} has no key {key!r}{new or nearest(str(key), names)}")
-    return _typed(cls, arguments, name, packages)
+    return _typed(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
+
+
+def _argument_names(cls: type) -> list[str] | None:
+    """The arguments of a class, which may be the user's; None where it takes any, or does not say."""
+    if is_dataclass(cls):
+        return [f.name for f in fields(cls)]
+    try:
+        parameters = signature(cls).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    if any(p.kind is Parameter.VAR_KEYWORD for p in parameters):
+        return None
+    return [p.name for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)]
 
 
 def load(group: str, name: str, **arguments: Any) -> Any:

@@ -358,6 +358,8 @@ def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, m
     config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
     made, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
     assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
+    with pytest.raises(ValueError, match="renderer has no key 'sise': did you mean size"):
+        load("renderer", "custom", _target_="mypkg_of_mine.Mine", sise=3)
     with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': add its package"):
         other = compose_config(  # leave for the renderer is not leave for all
             "renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "dataset._target_=mypkg_of_mine.Mine"
