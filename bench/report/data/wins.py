@@ -1,7 +1,7 @@
 """Rows against each other: on how many of the runs that both have the one is better, and the ratio of their errors."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,6 +82,14 @@ def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
         statistics.lower(*map(statistics.shape_medians, (first, second))),
         len(first),
     )
+
+
+def excluding_one(ratios: Sequence[tuple[str, Interval]], of: str, *, said: str = "The interval") -> list[str]:
+    """A sentence with how many of the known ratios have an interval that excludes 1, and which; none without any."""
+    known = [(name, ratio) for name, ratio in ratios if ratio.known]
+    sure = [name for name, ratio in known if ratio.excludes(1)]
+    named = f": {'; '.join(sure)}" if sure else ""
+    return [f"{said} excludes 1 for {len(sure)} of {len(known)} ratios {of}{named}."] if known else []
 
 
 def duels(errors: Mapping[Row, Mapping[RunKey, float]]) -> list[Duel]:

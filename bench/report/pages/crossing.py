@@ -17,7 +17,18 @@ from bench.report.data.records import SCALE, by_shape
 from bench.report.write import chart
 from bench.report.write.answer import Answer, at_fewest_points, chart_panel, presets_of, series
 from bench.report.write.result import Result
-from bench.report.write.table import COMPLETION, FAMILY, LOOP, PRESET, Column, configured, text, to_data, to_table
+from bench.report.write.table import (
+    COMPLETION,
+    FAMILY,
+    LOOP,
+    PRESET,
+    Column,
+    configured,
+    estimate,
+    text,
+    to_data,
+    to_table,
+)
 
 PLACE = 32
 PLACE_FRONT = 35
@@ -101,8 +112,7 @@ def make_front(experiment: Experiment) -> Result:
     columns = [
         *(text("loss", "Loss of the mask"), text("renderer", "Renderer")),
         Column("evaluations", "Evaluations", show=format.count),
-        Column("error", "Error × 1000", lambda line: line["error"].value, words=lambda line: str(line["error"])),
-        *(Column(end, value=lambda line, end=end: getattr(line["error"], end)) for end in ("low", "high")),
+        *estimate("error", "Error × 1000"),
         text("front", "On the front"),
         PRESET,
     ]

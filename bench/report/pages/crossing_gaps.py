@@ -8,6 +8,7 @@ from bench.records import format
 from bench.report.data.completions import ERROR, EVERY, FAILURE
 from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
+from bench.report.data.wins import excluding_one
 from bench.report.write.answer import Answer, excluding
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data, to_table, whole
@@ -121,23 +122,18 @@ def _verdicts(lines: list[Line], losses: dict[str, str]) -> list[str]:
         for line in pooled
         if line[OWN] is not None and line[LOSS] is not None
     ]
-    under_one = {
-        f"{line['compared']} under {label}, {line[loss].ratio}": line[loss].ratio
+    under_one = [
+        (f"{line['compared']} under {label}, {line[loss].ratio}", line[loss].ratio)
         for line in pooled
         for loss, label in losses.items()
-        if line[loss] is not None and line[loss].ratio.known
-    }
-    sure = [name for name, ratio in under_one.items() if ratio.excludes(1)]
-    named = f": {'; '.join(sure)}" if sure else ""
-    said = (
-        f"Under one loss, the interval excludes 1 for {len(sure)} of {len(under_one)} ratios over all families{named}."
-    )
-    return [*own, said] if under_one else own
+        if line[loss] is not None
+    ]
+    return [*own, *excluding_one(under_one, "over all families", said="Under one loss, the interval")]
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The largest gap over all families, and its parts."""
-    whole = data[data["family"] == "all families"]
+    whole = data[data["family"] == EVERY]
     gap = whole.loc[whole["own"].idxmax()]
     said = (
         f"{gap['compared']}: *{format.number(gap['own'])}* {format.interval(gap['own_low'], gap['own_high'])} "
@@ -149,7 +145,7 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
 
 def answer_losses(data: pd.DataFrame, notes: list[str]) -> Answer:
     """How many ratios of losses exclude 1 over all families."""
-    whole = data[data["family"] == "all families"]
+    whole = data[data["family"] == EVERY]
     names = [name for name in data.columns[3:] if f"{name}_low" in data]
     sure, known = excluding(whole, names)
     largest = max((row[name], name, row["compared"]) for _, row in whole.iterrows() for name in names)

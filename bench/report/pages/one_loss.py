@@ -13,11 +13,11 @@ from bench.report.data import statistics
 from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, by_shape, family, loop_seconds, median_of_known, row_of, value_evaluations
-from bench.report.data.wins import Gap, gap
+from bench.report.data.wins import Gap, excluding_one, gap
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, excluding, series
 from bench.report.write.result import Result
-from bench.report.write.table import Column, text, to_data, to_table
+from bench.report.write.table import Column, estimate, text, to_data, to_table
 
 PLACE = 21
 READS = (Selection("one_loss", ("completion",), ("dataset", "task"), ("points",)),)
@@ -49,8 +49,7 @@ def make(experiment: Experiment) -> Result:
     columns = [
         *(text("family", "Family"), text("row", "Method")),
         *(Column(points, heading(points)) for points in runs.points),
-        Column("error", "Geometric mean", lambda line: line["error"].value, words=lambda line: str(line["error"])),
-        *(Column(end, value=lambda line, end=end: getattr(line["error"], end)) for end in ("low", "high")),
+        *estimate("error", "Geometric mean"),
         text("ratio", "Ratio to DIST", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
         *(Column(f"ratio_{end}", value=lambda line, end=end: _end(line["ratio"], end)) for end in ("low", "high")),
         Column("evaluations", "Values", show=format.count),
@@ -74,13 +73,8 @@ def make(experiment: Experiment) -> Result:
 
 def verdict(lines: list[Line]) -> list[str]:
     """The rows that differ from DIST over all families by their interval, in words."""
-    known = [line for line in lines if line["family"] == EVERY and line["ratio"] and line["ratio"].ratio.known]
-    if not known:
-        return []
-    sure = [line for line in known if line["ratio"].ratio.excludes(1)]
-    named = "; ".join(f"{line['row']} {line['ratio'].ratio}" for line in sure)
-    said = f"The interval excludes 1 for {len(sure)} of {len(known)} ratios to DIST over all families"
-    return [f"{said}: {named}." if sure else f"{said}."]
+    pooled = [(line["row"], line["ratio"].ratio) for line in lines if line["family"] == EVERY and line["ratio"]]
+    return excluding_one([(f"{row} {ratio}", ratio) for row, ratio in pooled], "to DIST over all families")
 
 
 def _end(ratio: Gap | None, end: str) -> float:

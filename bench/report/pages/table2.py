@@ -307,7 +307,7 @@ def answer_intervals(data: pd.DataFrame, notes: list[str]) -> Answer:
 
 def answer_wins(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The row whose least share of wins against another is largest."""
-    whole = data[data["family"] == "all families"]
+    whole = data[data["family"] == EVERY]
     least = whole.loc[whole.groupby("row")["probability"].idxmin().dropna()].sort_values("probability")
     best = least.iloc[-1]
     share = f"*{100 * best['probability']:.0f} %*"

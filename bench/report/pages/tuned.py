@@ -10,7 +10,7 @@ from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, he
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, median_of_known, value_evaluations
 from bench.report.data.statistics import geometric_mean
-from bench.report.data.wins import Gap, gap
+from bench.report.data.wins import Gap, excluding_one, gap
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
@@ -59,13 +59,9 @@ def make(experiment: Experiment) -> Result:
 
 def verdict(lines: list[dict[str, Any]]) -> list[str]:
     """Where a tuned setting is better or worse than the method's defaults by its interval, in words."""
-    tuned = [line for line in lines if line["tuned"] and line["gap"] is not None and line["gap"].ratio.known]
-    if not tuned:
-        return []
-    sure = [line for line in tuned if line["gap"].ratio.excludes(1)]
-    named = "; ".join(f"{line['row']} on {line['family']}, {line['gap'].ratio}" for line in sure)
-    said = f"The interval excludes 1 for {len(sure)} of {len(tuned)} ratios of tuned settings to the defaults"
-    return [f"{said}: {named}." if sure else f"{said}."]
+    tuned = [(line, line["gap"].ratio) for line in lines if line["tuned"] and line["gap"] is not None]
+    ratios = [(f"{line['row']} on {line['family']}, {ratio}", ratio) for line, ratio in tuned]
+    return excluding_one(ratios, "of tuned settings to the defaults")
 
 
 def _line(runs: Completions, name: str, row: Row) -> dict[str, Any]:

@@ -85,6 +85,12 @@ def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None)
     return Column(key, heading, value, show=word)
 
 
+def estimate(key: str, heading: str) -> tuple[Column, ...]:
+    """The column of an estimate that each line has under a key, with its interval for readers and `low`, `high`."""
+    value = Column(key, heading, lambda line: line[key].value, words=lambda line: str(line[key]))
+    return value, *(Column(end, value=lambda line, end=end: getattr(line[key], end)) for end in ("low", "high"))
+
+
 def shown(heading: str, words: Callable[[Any], str]) -> Column:
     """A column of the readable table only."""
     return Column("", heading, words=words)
