@@ -29,9 +29,11 @@ def main() -> int:
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there
         Sweep.end()
         from bench.report.write.html import write_index
+        from bench.report.write.sweeps import write_sweep
         from bench.run.summary import show_sweep
 
-        statuses = show_sweep(plan, write_index(plan.results_dir))
+        table = write_sweep(plan)
+        statuses = show_sweep(plan, write_index(plan.results_dir), table)
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)
 
 

@@ -151,7 +151,7 @@ def started(record: dict[str, Any]) -> datetime:
 
 
 def _check(record: dict[str, Any]) -> None:
-    """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`."""
+    """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`, or no status."""
     for name, classes in _fields().items():
         if name not in record:
             if name in LATER:
@@ -159,6 +159,8 @@ def _check(record: dict[str, Any]) -> None:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], classes):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
+    if record["status"] not in set(RunStatus):
+        raise ValueError(f"status in record.json must be one of {', '.join(RunStatus)}, found {record['status']!r}")
 
 
 @cache

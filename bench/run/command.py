@@ -66,7 +66,8 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
         if raised:
             raise raised[0]
     except KeyboardInterrupt as error:
-        return _tell(stopped_by(error), INTERRUPTED)
+        before = "" if begun or Sweep.plan is not None else "; nothing was run"
+        return _tell(stopped_by(error) + before, INTERRUPTED)
     except OverrideParseException as error:
         return _tell(_unreadable(error.override), USAGE)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too

@@ -83,8 +83,9 @@ def total(planned: int, left: Remaining, words: Words = RUNS) -> str:
         return text + ("" if left.cells else "; nothing is left to do")
     low, high = (sum(getattr(e, end) for e in known) / left.workers for end in ("low", "high"))
     whole = sum(expected.seconds for expected in known) / left.workers
-    text += f"; about {seconds(whole)} ({seconds(low)} to {seconds(high)}), {left.workers} at a time"
+    spread = f" ({seconds(low)} to {seconds(high)})" if any(e.n > 1 for e in known) else f" (of one {words.like} each)"
+    text += f"; about {seconds(whole)}{spread}, {left.workers} at a time"
     if unknown:
         text += f", and what the {unknown} take"
     memory = [expected.memory for expected in known if expected.memory is not None]
-    return text + (f"; at most +{size(max(memory))} of memory each" if memory else "")
+    return text + (f"; the largest took +{size(max(memory))} of memory" if memory else "")

@@ -48,8 +48,14 @@ def show(folder: Path, record: Record, index: Path) -> None:
     print(folder)
 
 
-def show_sweep(plan: Plan, index: Path) -> list[str]:
-    """Prints the outcome of a sweep, the plan's folder last, and gives the status of every planned cell."""
+def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
+    """Prints the outcome of a sweep, the plan's folder last, and gives the status of every planned cell.
+
+    Args:
+        plan: the sweep.
+        index: the report's page.
+        table: that of the sweep, if it has one of its own.
+    """
     statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]
     counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
     print(f"{len(plan.cells)} planned: {counts}")
@@ -58,6 +64,8 @@ def show_sweep(plan: Plan, index: Path) -> list[str]:
     failed = [(cell, record) for cell in plan.cells if (record := plan.record(cell)) and record["status"] != "ok"]
     for cell, record in failed[:1]:
         print(f"first failure: {index.parent / 'runs' / cell.id} ({record['status']}: {record['reason']})")
+    if table is not None:
+        print(f"table of this sweep: {table}")
     _print_next(index)
     print(plan.folder)
     return statuses

@@ -16,7 +16,7 @@ from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import Isolation, Rerun, check_names
-from bench.progress import display
+from bench.progress import display, notice
 from bench.records.expected import Remaining
 from bench.records.files import digest
 from bench.records.folder import identify, reusable
@@ -33,6 +33,8 @@ IN_LINE = {  # metrics in the line of a cell
     **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
 }
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
+COMPOSED = 0.17  # seconds that composing a cell takes
+SILENT = 3.0  # seconds above which a sweep says how long it plans
 
 
 class Refused(BaseException):
@@ -70,7 +72,7 @@ class Sweep:
 class Planner(Callback):
     """Hydra's callback that writes the plan before a sweep's first cell; see conf/config.yaml.
 
-    The plan composes every cell, which takes a fifth of a second each; Hydra's own check would do so once more.
+    The plan composes every cell, which takes `COMPOSED` each; Hydra's own check would do so once more.
     """
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
@@ -119,7 +121,10 @@ def make_plan(config: DictConfig) -> Plan:
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
     typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
     cells: list[PlannedCell] = []
-    for cell in combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task]):
+    swept = combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task])
+    if len(swept) * COMPOSED > SILENT:
+        notice(f"planning {len(swept)} cells, about {seconds(len(swept) * COMPOSED)}")
+    for cell in swept:
         composed = loader.load_sweep_config(config, cell)
         plain = _without_hydra(composed)
         check_names(plain)

@@ -42,6 +42,14 @@ def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["record.json"]
 
 
+def test_a_status_that_there_is_not_is_not_read(tmp_path):
+    folder = new_folder(tmp_path)
+    make_record(status="splendid").write(folder)
+    records, (problem,) = read_records(tmp_path)
+    assert records == []
+    assert "status in record.json must be one of ok, " in problem and "found 'splendid'" in problem
+
+
 @pytest.mark.parametrize("function", ["fsync", "replace"])
 def test_a_write_that_fails_leaves_the_old_record(tmp_path, monkeypatch, function):
     folder = new_folder(tmp_path)

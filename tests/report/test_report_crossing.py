@@ -119,8 +119,8 @@ def test_a_renderer_without_a_run_that_ended_ok_is_not_on_the_front(tmp_path):
 def test_losses_are_compared_with_each_renderer(tmp_path):
     found = line(crossing_gaps.make_losses(crossed(tmp_path, both=2.0)), family="plane")
     assert found["compared"] == "IDR's mask loss over DIST's mask loss"
-    assert (found["dist"], found["idr"]) == (pytest.approx(3), pytest.approx(6))
-    assert (found["dist_better"], found["shapes"]) == (0, 8)
+    assert (found["DIST"], found["IDR"]) == (pytest.approx(3), pytest.approx(6))
+    assert (found["DIST_better"], found["shapes"]) == (0, 8)
 
 
 def test_a_renderer_without_a_known_loss_has_no_own_gap(tmp_path):

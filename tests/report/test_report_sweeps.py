@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +13,7 @@ from bench.report.__main__ import main as report
 from bench.report.data.sweeps import numbers, read_sweeps
 from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
-from bench.report.write.sweeps import write_sweeps
+from bench.report.write.sweeps import write_sweep, write_sweeps
 from tests.report.test_report import record, write_run
 
 
@@ -58,6 +59,21 @@ def test_rows_are_what_varies_beside_shapes_and_seeds(tmp_path):
     assert found["chamfer_l2_low"].isna().all()  # two shapes give no interval
 
 
+def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
+    cells = [cell(r, seed=s) for r in ("dist", "dvr") for s in (0, 1)]
+    swept(tmp_path, [cell("dist", seed=9)], "completion-0")
+    plan = Plan("completion-1", tmp_path, cells)
+    plan.write()
+    for one in cells[:3]:  # the last was not run
+        ran(tmp_path, one, 0.001)
+    assert write_sweep(plan) == tmp_path / "sweeps" / "completion-1" / "table.md"
+    at_once = (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()
+    assert list(table(tmp_path)["failed"]) == [0, 1]
+    assert at_once == (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()  # as the report makes it
+    experiment = [replace(one, config=one.config | {"experiment": "table2"}) for one in cells]
+    assert write_sweep(Plan("table2-1", tmp_path, experiment)) is None  # a page shows it
+
+
 def test_six_shapes_have_an_interval(tmp_path):
     cells = [cell(r, index=i) for r in ("dist", "dvr") for i in range(6)]
     swept(tmp_path, cells)
@@ -77,7 +93,7 @@ def test_cells_that_failed_or_were_not_run_count_in_their_rows(tmp_path):
         ran(tmp_path, one, chamfer)
     found = table(tmp_path)
     assert list(found["failed"]) == [0, 2] and list(found["runs"]) == [3, 3]
-    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == -math.inf
+    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == 0
     assert found.loc["DVR", "steps_taken"] == 9  # neither direction is better
     assert found.loc["DVR", "reasons"].startswith("crashed: as planned; not_run: planned by sweep completion-1")
     assert math.isinf(found.loc["DVR", "ratio"])

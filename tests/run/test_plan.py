@@ -62,10 +62,34 @@ def test_what_is_there_is_reused_and_tells_of_the_others(results):
     assert [line.split("  ")[-1] for line in lines] == [
         "reused", "about 30.0 s (1 like run)", *["about 30.0 s (1 run of other renderers)"] * 2
     ]  # fmt: skip
-    assert whole == "4 planned: 3 to run, 1 reused; about 90.0 s (90.0 s to 90.0 s), 1 at a time"
+    assert whole == "4 planned: 3 to run, 1 reused; about 90.0 s (of one like run each), 1 at a time"
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
-    assert again.splitlines()[-1] == "4 planned: 4 to run; about 60.0 s (60.0 s to 60.0 s), 2 at a time"
+    assert again.splitlines()[-1] == "4 planned: 4 to run; about 60.0 s (of one like run each), 2 at a time"
+
+
+def test_only_several_like_runs_give_a_range(results):
+    for cell, seconds in zip(planned(results)[:2], (20.0, 40.0), strict=True):
+        write(results, cell, seconds)
+    *_, whole = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
+    assert whole == "4 planned: 2 to run, 2 reused; about 60.0 s (40.0 s to 80.0 s), 1 at a time"
+
+
+@pytest.mark.parametrize("silent", [0.0, 100.0])
+def test_a_sweep_that_is_planned_for_long_says_so(results, monkeypatch, silent):
+    monkeypatch.setattr(sweep, "SILENT", silent)
+    done = command(*SWEEP, "plan=true", f"results_dir={results}")
+    assert done.err.splitlines() == (["planning 4 cells, about 680 ms"] if silent == 0 else [])
+
+
+def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(results, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "check_plan", stopped)
+    done = command(*SWEEP, f"results_dir={results}")
+    assert (done.code, done.err) == (130, "error: stopped by Ctrl-C; nothing was run\n")
+    assert not results.exists()
 
 
 def test_a_single_run_is_planned_too(results):

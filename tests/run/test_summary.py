@@ -56,3 +56,5 @@ def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
     assert out[0] == "4 planned: 1 ok, 1 empty, 1 crashed, 1 not_run"
     assert out[2] == f"first failure: {tmp_path}/runs/b (empty: why)"
     assert out[-1] == str(plan.folder)
+    show_sweep(plan, tmp_path / "index.html", plan.folder / "table.md")
+    assert f"table of this sweep: {plan.folder}/table.md" in capsys.readouterr().out.splitlines()

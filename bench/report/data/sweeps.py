@@ -76,15 +76,14 @@ class RowNumbers:
 def read_sweeps(records: list[Record], results_dir: Path, tabled: Iterable[str] = ()) -> list[SweepRuns]:
     """The sweeps of a results folder, but those of experiments that have pages, whose names are `tabled`."""
     known = {record["folder"]: record for record in records}
-    found = [_sweep(plan, known, results_dir) for plan in read_plans(results_dir)[0]]
-    return [sweep for sweep in found if sweep and sweep.runs.selection.experiment not in tabled]
+    plans = [plan for plan in read_plans(results_dir)[0] if any(cell["id"] in known for cell in plan["cells"])]
+    found = [runs_of(plan, known, results_dir) for plan in plans]
+    return [sweep for sweep in found if sweep.runs.selection.experiment not in tabled]
 
 
-def _sweep(plan: dict[str, Any], known: dict[str, Record], results_dir: Path) -> SweepRuns | None:
-    """The sweep of a plan; cells that differ in nothing that changes a result have one run."""
+def runs_of(plan: dict[str, Any], known: dict[str, Record], results_dir: Path) -> SweepRuns:
+    """The sweep of a plan, some of whose runs are known; cells that differ in nothing that counts have one run."""
     cells = {cell["id"]: cell for cell in plan["cells"] if cell["id"] in known}
-    if not cells:
-        return None
     runs = [known[name] for name in cells]
     asked = [_asked(cell["overrides"]) for cell in cells.values()]
     keys = dict.fromkeys(key for one in asked for key in one)
@@ -161,9 +160,9 @@ def _middle(values: dict[RunKey, float]) -> Interval:
 
 
 def _shortfall(run: Record, metric: str) -> float:
-    """A metric of which more is better, as an error; infinite where the run failed."""
+    """A metric of which more is better, as an error; that of a run that failed is 0, the least such metrics can be."""
     value = measured(run, metric) if run["status"] == OK else None
-    return float("inf") if value is None or value != value else -value
+    return 0.0 if value is None or value != value else -value
 
 
 def _negated(interval: Interval) -> Interval:

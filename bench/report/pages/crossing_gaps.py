@@ -57,22 +57,23 @@ def make_losses(experiment: Experiment) -> Result:
     """Makes the page of the losses, with a line per pair of losses and family: their gap with each renderer."""
     crossed = Crossed(experiment)
     first, *others = crossed.losses
+    rows = {crossed.labels[renderer]: renderer for renderer in crossed.renderers}
     lines = [
         {"compared": f"{crossed.labels[loss]} over {crossed.labels[first]}", "family": name}
-        | {renderer: crossed.gap(name, ((renderer, loss),), ((renderer, first),)) for renderer in crossed.renderers}
+        | {row: crossed.gap(name, ((renderer, loss),), ((renderer, first),)) for row, renderer in rows.items()}
         for loss in others
         for name in (EVERY, *crossed.runs.families)
     ]
-    renderers = {renderer: crossed.labels[renderer] for renderer in crossed.renderers}
+    labels = {row: row for row in rows}
     return Result(
         experiment,
         "What the loss of the mask changes, with each renderer.",
         "Ratio of the errors under two losses, with the same renderer.",
         interval="95 % intervals over shapes (Student's, of logarithms)",
-        estimates=_ratios(lines, renderers),
+        estimates=_ratios(lines, labels),
         remarks=(RATIO, *LOSSES, ERROR, FAILURE),
-        data=to_data(_columns(renderers), lines),
-        table=to_table(_columns(renderers), lines),
+        data=to_data(_columns(labels), lines),
+        table=to_table(_columns(labels), lines),
     )
 
 

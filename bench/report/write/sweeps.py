@@ -1,14 +1,16 @@
 """Writes the table of each sweep that no page shows, beside its plan."""
 
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from bench.records import format
 from bench.records.metrics import SHOWN, Metric, better
+from bench.records.read import Plan, not_run, read_run
 from bench.report.data.records import definitions
 from bench.report.data.statistics import Interval
-from bench.report.data.sweeps import RowNumbers, SweepRuns, numbers, read_sweeps
+from bench.report.data.sweeps import RowNumbers, SweepRuns, numbers, read_sweeps, runs_of
 from bench.report.write.caption import OVER
 from bench.report.write.paper import SWEEPS, TABLE, page_names
 from bench.report.write.result import Result, write
@@ -17,8 +19,8 @@ from bench.report.write.table import Column, counted, shown, text, to_data, to_t
 MOST_VALUES = 6  # of a swept key that the caption lists
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
 FAILURE = (
-    "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: medians "
-    "are infinite where half of the runs failed."
+    "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: an "
+    "infinite error, or 0 of what is better higher. So medians are ∞ where half of the runs failed."
 )
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
@@ -28,6 +30,19 @@ def write_sweeps(records: list[dict[str, Any]], results_dir: Path) -> list[Path]
     sweeps = read_sweeps(records, results_dir, _tabled())
     places = [results_dir / SWEEPS / sweep.name / TABLE for sweep in sweeps]
     return [write(table_of(sweep), base, name=sweep.name)[0] for sweep, base in zip(sweeps, places, strict=True)]
+
+
+def write_sweep(plan: Plan) -> Path | None:
+    """Writes the table of a sweep that has ended, if it has no page; gives the path of its readable form."""
+    experiment = plan.cells[0].config.get("experiment")
+    if experiment and experiment in _tabled():
+        return None
+    plain, known = asdict(plan), {}
+    for cell in plain["cells"]:
+        record, _ = read_run(plan.results_dir / "runs" / cell["id"], plan.results_dir)
+        known[cell["id"]] = record or not_run(cell, plain)
+    write(table_of(runs_of(plain, known, plan.results_dir)), plan.folder / TABLE, name=plan.name)
+    return plan.folder / f"{TABLE}.md"
 
 
 def table_of(sweep: SweepRuns) -> Result:
