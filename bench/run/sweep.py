@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -33,7 +34,7 @@ IN_LINE = {  # metrics in the line of a cell
     **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
 }
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
-COMPOSED = 0.17  # seconds that composing a cell takes
+COMPOSED = 0.1  # seconds that composing a cell takes
 SILENT = 3.0  # seconds above which a sweep says how long it plans
 
 
@@ -43,6 +44,13 @@ class Refused(BaseException):
     def __init__(self, why: Exception) -> None:
         super().__init__(str(why))
         self.why = why
+
+
+class ReadOnce(CachingConfigRepository):
+    """The files of the configuration, each read once for all cells; Hydra's own repository is copied for each cell."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ReadOnce":
+        return self
 
 
 class Sweep:
@@ -117,7 +125,8 @@ def make_plan(config: DictConfig) -> Plan:
         HydraException, OmegaConfBaseException: where a cell cannot be composed.
         ValueError: where the sweep has no cell.
     """
-    loader = GlobalHydra.instance().config_loader()
+    loader: Any = GlobalHydra.instance().config_loader()
+    loader.repository = ReadOnce(loader.repository)
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
     typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
     cells: list[PlannedCell] = []
@@ -162,7 +171,7 @@ def workers_of(config: DictConfig) -> int:
 def combinations(texts: list[str]) -> list[list[str]]:
     """The overrides of each cell, from those of a sweep, such as `seed=0,1`, in the order in which Hydra runs them.
 
-    Together with `Planner` it is all that uses Hydra's sweeper, which is internal to Hydra.
+    Together with `Planner` and `ReadOnce` it is all that uses what is internal to Hydra's sweeps.
     """
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     return BasicSweeper.split_arguments(parser.parse_overrides(texts), None)[0]

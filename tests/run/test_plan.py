@@ -75,11 +75,18 @@ def test_only_several_like_runs_give_a_range(results):
     assert whole == "4 planned: 2 to run, 2 reused; about 60.0 s (40.0 s to 80.0 s), 1 at a time"
 
 
+def test_files_that_are_read_once_give_the_same_cells(results, monkeypatch):
+    once = planned(results)
+    monkeypatch.setattr(sweep, "ReadOnce", lambda repository: repository)
+    assert planned(results) == once
+    assert len({cell.id for cell in once}) == 4
+
+
 @pytest.mark.parametrize("silent", [0.0, 100.0])
 def test_a_sweep_that_is_planned_for_long_says_so(results, monkeypatch, silent):
     monkeypatch.setattr(sweep, "SILENT", silent)
     done = command(*SWEEP, "plan=true", f"results_dir={results}")
-    assert done.err.splitlines() == (["planning 4 cells, about 680 ms"] if silent == 0 else [])
+    assert done.err.splitlines() == (["planning 4 cells, about 400 ms"] if silent == 0 else [])
 
 
 def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(results, monkeypatch):
