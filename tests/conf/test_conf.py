@@ -322,6 +322,20 @@ def test_the_paper_experiment_has_the_papers_settings(compose_config):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("overrides", "iterations"),
+    [
+        (["task=completion", "task.optimiser.iterations=37"], 37),
+        (["task=stability", "stress=depth_noise", "task.fit.iterations=38"], 38),
+        (["task=single_view", "task.training.steps=39"], 39),
+        (["task=ablation"], 100),
+    ],
+)
+@pytest.mark.parametrize("renderer", ["neus", "volsdf", "volsdf_budget", "unisurf"])
+def test_a_volume_is_sharp_at_the_end_of_whatever_it_optimises(compose_config, renderer, overrides, iterations):
+    assert compose_config(f"renderer={renderer}", *overrides).renderer.sharpening == iterations
+
+
 def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_config):
     practical = ("renderer=naive", "renderer.gradient=practical")
     with pytest.raises(
