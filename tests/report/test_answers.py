@@ -9,7 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.report.pages import crossing_gaps, fig7, scans, speed, stability, table1, table2
+from bench.report.pages.completion import crossing_gaps, scans, table2
+from bench.report.pages.rendering import fig7, table1
+from bench.report.pages.speed import speed
+from bench.report.pages.stability import stability
 from bench.report.site.papers import papers, read_shown
 from bench.report.write.answer import Ranked, answered, chart_panel, excluding, ranked, series, write_answers
 from bench.report.write.paper import SMOKE, page_names

@@ -5,7 +5,9 @@ import io
 import pandas as pd
 
 from bench.pictures import style
-from bench.report.pages import crossing, speed, speed_curves, stability, stability_curves
+from bench.report.pages.completion import crossing
+from bench.report.pages.speed import speed, speed_curves
+from bench.report.pages.stability import stability, stability_curves
 from tests.report import test_report_crossing as of_crossing
 from tests.report import test_report_speed as of_speed
 from tests.report import test_report_stability as of_stability

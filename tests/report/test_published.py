@@ -2,7 +2,9 @@
 
 import pytest
 
-from bench.report.pages import table1, table2, table3
+from bench.report.pages.completion import table2
+from bench.report.pages.rendering import table1
+from bench.report.pages.views import table3
 
 # DIST, Table 1: steps, queries, time.
 TABLE1 = """

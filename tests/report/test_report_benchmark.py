@@ -2,7 +2,7 @@
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import benchmark
+from bench.report.pages.rendering import benchmark
 from tests.report.test_report_paper import told, write_run
 
 

@@ -5,7 +5,9 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import completion_gallery, misplaced_gallery, multiview_gallery, rerendering
+from bench.report.pages.completion import completion_gallery
+from bench.report.pages.images import rerendering
+from bench.report.pages.views import misplaced_gallery, multiview_gallery
 from bench.report.write.gallery import GAP, TILE, Block, Cell, draw, tile
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 

@@ -12,7 +12,9 @@ from bench.records.read import read_records
 from bench.report import pages as report_pages
 from bench.report.data.experiments import choose
 from bench.report.data.records import Row, base_renderer, row_of
-from bench.report.pages import speed, table1, table2
+from bench.report.pages.completion import table2
+from bench.report.pages.rendering import table1
+from bench.report.pages.speed import speed
 from bench.report.write import paper
 from bench.report.write.paper import find_paper, page_names, write_paper
 from tests.report.test_report_paper import DYNAMIC, NAIVE, coarse_pictures, costs, write_run  # noqa: F401, a fixture
@@ -112,9 +114,9 @@ def test_a_preset_that_nobody_listed_has_a_look_of_its_own():
 
 def test_a_page_is_found_by_its_file(tmp_path, monkeypatch):
     pages = tmp_path / "pages"
-    pages.mkdir()
+    (pages / "rendering").mkdir(parents=True)
     (pages / "mine.py").write_text(PAGE.format(place=5))
-    (pages / "table1.py").write_text("PLACE = 10\n")
+    (pages / "rendering" / "table1.py").write_text("PLACE = 10\n")  # in a room
     monkeypatch.setattr(paper, "PAGES", pages)
     monkeypatch.setattr(report_pages, "__path__", [str(pages), *report_pages.__path__])
     page_names.cache_clear()

@@ -12,7 +12,8 @@ from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment, choose
-from bench.report.pages import fig4, fig5, fig7, gradients, gradients_visibility, table1
+from bench.report.pages.completion import fig5
+from bench.report.pages.rendering import fig4, fig7, gradients, gradients_visibility, table1
 from bench.report.write import pictures
 from bench.report.write import result as tables
 from bench.report.write.html import write_index

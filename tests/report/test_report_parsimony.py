@@ -12,7 +12,7 @@ from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.data.parsimony import NETWORK, PARSIMONY, SETTINGS, scene_runs
 from bench.report.data.records import setting
-from bench.report.pages import parsimony, parsimony_auto
+from bench.report.pages.parsimony import parsimony, parsimony_auto
 from bench.report.write.paper import write_paper
 from bench.report.write.result import latex
 from tests.report.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture

@@ -4,7 +4,7 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import scans
+from bench.report.pages.completion import scans
 from tests.report.test_report_paper import write_run
 
 DRAGON, BUNNY = "scans/dragon", "scans/bunny"

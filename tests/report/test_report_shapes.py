@@ -7,7 +7,7 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages import dvr_figures, dvr_table2, photos, unseen_back
+from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
 from bench.report.write.paper import write_paper
 from bench.report.write.shapes import MOST_COLUMNS, history, scene_of
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture

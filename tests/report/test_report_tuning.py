@@ -11,8 +11,8 @@ from bench.records.read import read_records
 from bench.report.data import statistics
 from bench.report.data.experiments import choose
 from bench.report.data.tuning import TUNING, tunings
-from bench.report.pages import tuned as tuned_page
-from bench.report.pages import tuning
+from bench.report.pages.completion import tuned as tuned_page
+from bench.report.pages.completion import tuning
 from bench.tune.__main__ import main, write
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 

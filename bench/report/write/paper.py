@@ -32,19 +32,20 @@ a page reads; the README of `conf` lists the experiments and how long they take.
 def page_names() -> dict[str, tuple[str, str]]:
     """The names of all pages in their order, each with the module and the function that make it.
 
-    A file of `PAGES` makes the page of its name with `make`; its place among all pages is the number `PLACE`. Further
-    pages of the file have a suffix: `PLACE_COST` and `make_cost` are those of FILE_cost. The files are read as text,
-    not imported: they load matplotlib, which is not needed to find their output.
+    A file of `PAGES`, in any of its rooms, makes the page of its name with `make`; its place among all pages is the
+    number `PLACE`. Further pages of the file have a suffix: `PLACE_COST` and `make_cost` are those of FILE_cost. The
+    files are read as text, not imported: they load matplotlib, which is not needed to find their output.
 
     Raises:
         ValueError: where a file has no such number.
     """
     places: list[tuple[int, str, str, str]] = []
-    for path in PAGES.glob("[!_]*.py"):
+    for path in PAGES.rglob("[!_]*.py"):
+        module = ".".join(path.relative_to(PAGES).with_suffix("").parts)
         own = [(suffix.lower(), int(place)) for suffix, place in PLACE.findall(path.read_text(encoding="utf-8"))]
         if not own:
             raise ValueError(f"{path.name} must have a line such as PLACE = 10, its place among the pages; found none")
-        places += [(place, path.stem + suffix, path.stem, f"make{suffix}") for suffix, place in own]
+        places += [(place, path.stem + suffix, module, f"make{suffix}") for suffix, place in own]
     return {name: (module, function) for _, name, module, function in sorted(places)}
 
 

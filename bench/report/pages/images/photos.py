@@ -4,7 +4,7 @@ import pandas as pd
 
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions
-from bench.report.pages.dvr_table2 import TASKS
+from bench.report.pages.images.dvr_table2 import TASKS
 from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_curves, lines_of

@@ -10,7 +10,7 @@ from bench.pictures import style
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import SCALE, Record, Row, by_shape, grouped, setting
 from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
-from bench.report.pages.dvr_table1 import errors_of, over
+from bench.report.pages.single_view.dvr_table1 import errors_of, over
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, grouped, row_of
-from bench.report.pages import dvr_table2
+from bench.report.pages.images import dvr_table2
 from bench.report.write import pictures
 from bench.report.write.gallery import Block, Cell, draw, shown_alone
 from bench.report.write.result import Result

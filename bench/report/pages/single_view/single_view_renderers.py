@@ -9,7 +9,7 @@ import pandas as pd
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import RunKey
-from bench.report.pages.dvr_table1 import COMPARED, INTERVAL, RATIOS, RUNS, compared_lines, draw, over
+from bench.report.pages.single_view.dvr_table1 import COMPARED, INTERVAL, RATIOS, RUNS, compared_lines, draw, over
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, thousandfold, to_data, to_table

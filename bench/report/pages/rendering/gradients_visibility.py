@@ -11,7 +11,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, measured, row_of
-from bench.report.pages.gradients import READS as READS
+from bench.report.pages.rendering.gradients import READS as READS
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -23,7 +23,7 @@ from bench.report.data.parsimony import (
     measure_note,
     scene_runs,
 )
-from bench.report.pages.parsimony import SCENE, scene_table
+from bench.report.pages.parsimony.parsimony import SCENE, scene_table
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -2,7 +2,7 @@
 
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import ONE_WAY, Record, grouped, row_of
-from bench.report.pages import table3
+from bench.report.pages.views import table3
 from bench.report.write.gallery import FOUND, FRONT, START, TRUE, Block, Cell, Scene, draw, first_shapes
 from bench.report.write.result import Result
 from bench.report.write.shapes import scene_of

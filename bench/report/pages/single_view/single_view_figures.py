@@ -2,7 +2,7 @@
 
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, Row, error, row_of
-from bench.report.pages import dvr_table1
+from bench.report.pages.single_view import dvr_table1
 from bench.report.write.result import Result
 from bench.report.write.shapes import draw_pictures, scene_of
 from bench.report.write.table import FAMILY, IDENTITY, metrics, to_data

@@ -1,0 +1,1 @@
+"""Pages of shape and colour from photographs."""

@@ -1,0 +1,1 @@
+"""Pages of how much model a scene needs."""

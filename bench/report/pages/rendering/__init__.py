@@ -1,0 +1,1 @@
+"""Pages of one rendering: what it costs, how far it is off, and how true its gradients are."""

@@ -1,0 +1,1 @@
+"""Pages of shape from one image."""

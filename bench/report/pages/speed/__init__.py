@@ -1,0 +1,1 @@
+"""Pages of error over time."""

@@ -1,0 +1,1 @@
+"""Pages of shape and pose from views of known colours."""
