@@ -18,7 +18,7 @@ from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import read_records
 from bench.report.data.experiments import Experiment, choose, shared_loss
-from bench.report.data.tuning import ONE_LOSS, SPACE, TUNING, Tuning, left_out, tunings, unfinished
+from bench.report.data.subjects.tuning import ONE_LOSS, SPACE, TUNING, Tuning, left_out, tunings, unfinished
 
 SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS)}
 HEAD = """# @package _global_

@@ -6,7 +6,7 @@ from bench.models.candidates import by_size, candidate
 from bench.models.choice import choose
 from bench.models.model import Size
 from bench.pictures.size_chart import AXES
-from bench.report.data.parsimony import SIZES
+from bench.report.data.subjects.parsimony import SIZES
 from bench.setup.fields import SIZE_WORDS, ModelSettings
 from tests.models.test_models import FIT, GROWTH, VIEWS, an_error, evidence_of
 

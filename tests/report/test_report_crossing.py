@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.completions import EVERY
-from bench.report.data.crossing import CROSSING, Crossed
 from bench.report.data.experiments import choose
+from bench.report.data.subjects.completions import EVERY
+from bench.report.data.subjects.crossing import CROSSING, Crossed
 from bench.report.pages.completion import crossing, crossing_gaps
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 

@@ -3,8 +3,8 @@
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.completions import EVERY
 from bench.report.data.experiments import choose
+from bench.report.data.subjects.completions import EVERY
 from bench.report.pages.completion import one_loss
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 

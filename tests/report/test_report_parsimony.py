@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from bench.pictures.size_chart import KINDS
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.data.parsimony import NETWORK, PARSIMONY, SETTINGS, scene_runs
 from bench.report.data.records import setting
+from bench.report.data.subjects.parsimony import NETWORK, PARSIMONY, SETTINGS, scene_runs
 from bench.report.pages.parsimony import parsimony, parsimony_auto
 from bench.report.write.paper import write_paper
 from bench.report.write.result import latex

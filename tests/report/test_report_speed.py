@@ -11,7 +11,7 @@ import pytest
 from bench.records.read import read_records
 from bench.report.data.curves import history_of
 from bench.report.data.experiments import choose
-from bench.report.data.speed import COMPLETION, TARGET, TRIALS, settings
+from bench.report.data.subjects.speed import COMPLETION, TARGET, TRIALS, settings
 from bench.report.pages.speed import loss_chamfer, speed, speed_curves
 from bench.report.write.answer import write_answers
 from bench.report.write.html import write_index

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.atlas import STABILITY, atlas
 from bench.report.data.experiments import choose, named_by_rows, shared_loss
 from bench.report.data.records import row_of
+from bench.report.data.subjects.atlas import STABILITY, atlas
 from bench.report.pages.stability import stability, stability_curves, stability_failures
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture

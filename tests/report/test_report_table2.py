@@ -11,9 +11,9 @@ from scipy import stats
 
 from bench.pictures import style
 from bench.records.read import read_records
-from bench.report.data import oracle
-from bench.report.data.completions import POINTS
 from bench.report.data.experiments import choose
+from bench.report.data.subjects import oracle
+from bench.report.data.subjects.completions import POINTS
 from bench.report.pages.completion import priors, table2
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from bench.records.read import read_records
 from bench.report.data import statistics
 from bench.report.data.experiments import choose
-from bench.report.data.tuning import TUNING, tunings
+from bench.report.data.subjects.tuning import TUNING, tunings
 from bench.report.pages.completion import tuned as tuned_page
 from bench.report.pages.completion import tuning
 from bench.tune.__main__ import main, write

@@ -1,8 +1,8 @@
 """Figs. 20 to 22 of DIST: completed shapes in pictures, over the sparsity of the depth image."""
 
-from bench.report.data.completions import POINTS, TABLE2, heading
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, grouped, row_of, setting
+from bench.report.data.subjects.completions import POINTS, TABLE2, heading
 from bench.report.write.gallery import TRUE, Block, Cell, Scene, draw, first_shapes
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, configured, to_data

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
-from bench.report.data.completions import ERROR, EVERY, FAILURE, heading
-from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, by_shape
+from bench.report.data.subjects.completions import ERROR, EVERY, FAILURE, heading
+from bench.report.data.subjects.crossing import CROSSING, LOSSES, Crossed
 from bench.report.write import chart
 from bench.report.write.answer import Answer, at_fewest_points, chart_panel, presets_of, series
 from bench.report.write.result import Result

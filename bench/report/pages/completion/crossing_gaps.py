@@ -5,10 +5,10 @@ from typing import Any
 import pandas as pd
 
 from bench.records import format
-from bench.report.data.completions import ERROR, EVERY, FAILURE
-from bench.report.data.crossing import CROSSING, LOSSES, Crossed
 from bench.report.data.experiments import Experiment
-from bench.report.data.wins import excluding_one
+from bench.report.data.subjects.completions import ERROR, EVERY, FAILURE
+from bench.report.data.subjects.crossing import CROSSING, LOSSES, Crossed
+from bench.report.data.subjects.wins import excluding_one
 from bench.report.write.answer import Answer, excluding
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data, to_table, whole

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
-from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, by_shape, family, loop_seconds, median_of_known, row_of, value_evaluations
-from bench.report.data.wins import Gap, excluding_one, gap
+from bench.report.data.subjects.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
+from bench.report.data.subjects.wins import Gap, excluding_one, gap
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, excluding, series
 from bench.report.write.result import Result

@@ -12,8 +12,8 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
-from bench.report.data.oracle import PRIORS
 from bench.report.data.records import Record, definitions, measured
+from bench.report.data.subjects.oracle import PRIORS
 from bench.report.write import chart, pictures
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -14,11 +14,21 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records.record import NOT_RUN
-from bench.report.data import statistics, wins
-from bench.report.data.completions import ERROR, EVERY, POINTS, TABLE2, Cell, Completions, heading, shapes_per_cell
+from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
-from bench.report.data.oracle import LABEL, NOTE, oracles
 from bench.report.data.records import SCALE, Row, RunKey, by_shape, grouped, iterations_of, row_of
+from bench.report.data.subjects import wins
+from bench.report.data.subjects.completions import (
+    ERROR,
+    EVERY,
+    POINTS,
+    TABLE2,
+    Cell,
+    Completions,
+    heading,
+    shapes_per_cell,
+)
+from bench.report.data.subjects.oracle import LABEL, NOTE, oracles
 from bench.report.write import chart
 from bench.report.write.answer import Answer, at_fewest_points
 from bench.report.write.caption import undefined

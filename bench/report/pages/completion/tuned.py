@@ -6,11 +6,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.pictures import style
-from bench.report.data.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Row, median_of_known, value_evaluations
 from bench.report.data.statistics import geometric_mean
-from bench.report.data.wins import Gap, excluding_one, gap
+from bench.report.data.subjects.completions import ERROR, EVERY, FAILURE, Completions, heading, shapes_per_cell
+from bench.report.data.subjects.wins import Gap, excluding_one, gap
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

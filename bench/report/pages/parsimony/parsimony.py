@@ -16,7 +16,8 @@ from bench.pictures import style
 from bench.pictures.size_chart import AXES, FLOPS, KINDS, CandidateResult, panel
 from bench.records import format
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import (
+from bench.report.data.records import grouped
+from bench.report.data.subjects.parsimony import (
     PARSIMONY,
     SIZES,
     SceneRun,
@@ -29,7 +30,6 @@ from bench.report.data.parsimony import (
     scene_runs,
     spread,
 )
-from bench.report.data.records import grouped
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.pictures.size_chart import KINDS
 from bench.records import format
-from bench.report.data import parsimony
 from bench.report.data.experiments import Experiment
-from bench.report.data.parsimony import (
+from bench.report.data.subjects import parsimony
+from bench.report.data.subjects.parsimony import (
     COSTS,
     FAILED,
     NOT_REACHED,

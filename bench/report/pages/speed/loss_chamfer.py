@@ -10,7 +10,7 @@ from bench.report.data import statistics
 from bench.report.data.curves import history_of, spearman
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, by_shape, run_key
-from bench.report.data.speed import COMPLETION, SEED, Setting, main_settings, settings, sizes
+from bench.report.data.subjects.speed import COMPLETION, SEED, Setting, main_settings, settings, sizes
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

@@ -13,7 +13,17 @@ from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment, together
 from bench.report.data.records import grouped
-from bench.report.data.speed import SEED, TRIALS, Placed, Setting, front_line, left_out, resolution, sizes, trials
+from bench.report.data.subjects.speed import (
+    SEED,
+    TRIALS,
+    Placed,
+    Setting,
+    front_line,
+    left_out,
+    resolution,
+    sizes,
+    trials,
+)
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, runs_of, series
 from bench.report.write.caption import undefined

@@ -13,8 +13,8 @@ from bench.records import format
 from bench.report.data.curves import HISTORY, history_of
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, Row, loop_seconds
-from bench.report.data.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
 from bench.report.data.statistics import FEWEST_SHAPES, kaplan_meier
+from bench.report.data.subjects.speed import COMPLETION, TARGET, Setting, main_settings, settings, sizes
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, series
 from bench.report.write.result import Result

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data.atlas import FAILED, STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
+from bench.report.data.subjects.atlas import FAILED, STABILITY, Atlas, Cell, atlas, title
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import curves
-from bench.report.data.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, grouped
 from bench.report.data.statistics import clopper_pearson
+from bench.report.data.subjects.atlas import STABILITY, Atlas, Cell, atlas, title
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result

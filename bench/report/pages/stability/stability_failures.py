@@ -9,9 +9,9 @@ from matplotlib.patches import Patch
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data.atlas import STABILITY, Atlas, atlas, title
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, Row
+from bench.report.data.subjects.atlas import STABILITY, Atlas, atlas, title
 from bench.report.write import chart, pictures
 from bench.report.write.result import Result
 from bench.report.write.table import Column, text, to_data

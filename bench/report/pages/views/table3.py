@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.oracle import LABEL, NOTE, oracles
 from bench.report.data.records import (
     ONE_WAY,
     SCALE,
@@ -26,6 +25,7 @@ from bench.report.data.records import (
     value_evaluations,
 )
 from bench.report.data.statistics import Interval, bootstrap, interquartile_mean, median, share
+from bench.report.data.subjects.oracle import LABEL, NOTE, oracles
 from bench.report.write import chart
 from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result

@@ -1,6 +1,5 @@
 """The runs of the crossing: errors of every renderer under every loss of the mask."""
 
-from bench.report.data.completions import Completions
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
     Record,
@@ -13,7 +12,8 @@ from bench.report.data.records import (
     value_evaluations,
 )
 from bench.report.data.statistics import geometric_mean
-from bench.report.data.wins import Gap, gap
+from bench.report.data.subjects.completions import Completions
+from bench.report.data.subjects.wins import Gap, gap
 
 CROSSING = Selection("crossing", ("completion",), ("dataset", "task", "silhouette"), ("points",))
 OWN = {  # the loss of each renderer's paper; the naive one and newton have that of DIST

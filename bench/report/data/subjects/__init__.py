@@ -1,0 +1,1 @@
+"""What single pages and their neighbours read of records: by the question that they answer."""
