@@ -169,6 +169,8 @@ def test_every_cell_of_an_experiment_composes_and_builds(compose_config, paths, 
     elif key in ("renderer", "method"):
         scaled = {name: config.scale.reconstruction[name] for name in ("iterations", "dvr_doublings")}
         sizes = [f"scale.reconstruction.{name}={value}" for name, value in scaled.items()]  # schedules follow these
+        if "fit" in config.task:  # of a stress
+            sizes += [f"task.optimiser.iterations={config.task.fit.iterations}"]
         alone = compose_config(swept, *draw, *sizes)
         assert config.label == alone.label
         assert build_part(config, "renderer") == build_part(alone, "renderer")
