@@ -62,10 +62,10 @@ def test_what_is_there_is_reused_and_tells_of_the_others(results):
     assert [line.split("  ")[-1] for line in lines] == [
         "reused", "about 30.0 s (1 like run)", *["about 30.0 s (1 run of other renderers)"] * 2
     ]  # fmt: skip
-    assert whole == "4 planned: 3 to run, 1 reused; about 90.0 s (of one like run each), 1 at a time"
+    assert whole == "4 planned: 3 to run, 1 reused; about 90.0 s (n = 1 each), 1 at a time"
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
-    assert again.splitlines()[-1] == "4 planned: 4 to run; about 60.0 s (of one like run each), 2 at a time"
+    assert again.splitlines()[-1] == "4 planned: 4 to run; about 60.0 s (n = 1 each), 2 at a time"
 
 
 def test_only_several_like_runs_give_a_range(results):

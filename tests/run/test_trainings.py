@@ -111,7 +111,7 @@ def test_a_sweep_is_listed_with_its_sum(planned, tmp_path, monkeypatch):
     monkeypatch.setattr(trainings, "_with_work", lambda _: {"steps": 5})
     code, lines, err = planned(*OF_PRIOR, "-m", "dataset=sofa,sphere", "seed=0,1")
     assert (code, err, len(lines)) == (0, "", 3)  # seeds of a run share a prior
-    assert lines[2] == "2 planned: 1 to train, 1 there already; about 30.0 s (of one like training on record each), 1 at a time"
+    assert lines[2] == "2 planned: 1 to train, 1 there already; about 30.0 s (n = 1 each), 1 at a time"
     assert not (tmp_path / "r" / "sweeps").exists()
 
 
