@@ -83,7 +83,7 @@ def total(planned: int, left: Remaining, words: Words = RUNS) -> str:
         return text + ("" if left.cells else "; nothing is left to do")
     low, high = (sum(getattr(e, end) for e in known) / left.workers for end in ("low", "high"))
     whole = sum(expected.seconds for expected in known) / left.workers
-    spread = f" ({seconds(low)} to {seconds(high)})" if any(e.n > 1 for e in known) else f" (n = 1 each)"
+    spread = f" ({seconds(low)} to {seconds(high)})" if any(e.n > 1 for e in known) else " (n = 1 each)"
     text += f"; about {seconds(whole)}{spread}, {left.workers} at a time"
     if unknown:
         text += f", and what the {unknown} take"
