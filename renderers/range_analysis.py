@@ -32,7 +32,7 @@ class RangeAnalysis:
         out, no surface that is longer on a ray than `least_segment` is missed. Those of a deep, wide network are
         loose: rays are then cut to the least segments everywhere.
     Deviates from the paper: segments double after an empty one, in place of 1.5 times; a segment of the least length
-        that is not certified is a hit only where the sign changes.
+        that is not certified is a hit only where the sign changes, and so is one that is certified.
 
     Args:
         least_segment: in scene units; a shorter one is not cut any more.
@@ -103,7 +103,7 @@ class RangeAnalysis:
             far = near + length
             value = torch.full_like(near, torch.nan).index_put((asked,), field(some[asked].at(far[asked])))
             cast.note(active[asked], far[asked], value[asked])
-            crossed = shortest & ~empty & (value <= 0)
+            crossed = (empty | shortest) & (value <= 0)  # of an empty one: values are too coarse for its bounds
             onward = (empty | shortest) & ~crossed
             done = onward & (far >= leave)
             cast.far[active], cast.far_value[active] = far, torch.where(crossed, value, cast.far_value[active])

@@ -103,11 +103,23 @@ def test_a_thin_plate_is_found():
 
 
 def test_a_field_that_breaks_its_promise_loses_its_certificate():
-    """A distance times 40 with nothing stated: the promise of a distance is taken, and its hits are passed."""
-    steep = Shape(lambda p: 40 * box((0.5, 0.5, 0.005))(p), Kind.DISTANCE, None)
-    ray = Rays(vector((0.01, 0.02, -2))[None], normalize(vector((0.02, 0.03, 1))[None], dim=-1))
-    assert not RENDERER.render(steep, ray).hit.any()
-    assert RENDERER.render(replace(steep, lipschitz=40.0), ray).hit.all()
+    """A distance times 40 with nothing stated: the promise of a distance is taken, and most of its hits are passed."""
+    steep = Shape(lambda p: 40 * box((0.5, 0.5, 0.0005))(p), Kind.DISTANCE, None)
+    starts = torch.stack([torch.linspace(-0.4, 0.4, 50), torch.full((50,), 0.02), torch.full((50,), -2.0)], -1).double()
+    rays = Rays(starts, normalize(vector((0.02, 0.03, 1)).expand(50, 3), dim=-1))
+    assert RENDERER.render(steep, rays).hit.sum() < 10
+    assert RENDERER.render(replace(steep, lipschitz=40.0), rays).hit.all()
+
+
+@pytest.mark.parametrize("step", [0.0005, 0.002])
+def test_values_that_are_coarser_than_the_bounds_give_a_hit_where_they_change_sign(step):
+    """A value of 0 at the end of a segment that was certified to be empty."""
+    exact = sphere(0.5)
+    rounded = Shape(lambda p: (exact(p) / step).round() * step, exact.kind, exact.lipschitz)
+    rendering, truth = RENDERER.render(rounded, around(400)), RENDERER.render(exact, around(400))
+    assert rendering.hit.sum() > 100
+    assert (rendering.hit == truth.hit).sum() > 395  # but at the outline
+    assert exact(rendering.points[rendering.hit]).abs().max() <= step
 
 
 def test_bounds_are_counted_by_their_products():
