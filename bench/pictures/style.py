@@ -81,6 +81,8 @@ KNOWN = {
     "dist_step_back": Look("#8b2252", "v", "-."),
     "dist_step_floor": Look("#b8860b", "<", "--"),
     "dist_slope_bound": Look("#66a61e", ">", "-."),
+    "dist_keinert": Look("#a6761d", "8", (0, (3, 1, 1, 1))),
+    "dist_auto_relaxed": Look("#17becf", "H", ":"),
     "dist_official_clamp": _OFFICIAL_DIST,
     "dist_official": _OFFICIAL_DIST,
     "dvr": _DVR,

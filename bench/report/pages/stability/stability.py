@@ -116,10 +116,11 @@ def make_cost(experiment: Experiment) -> Result:
 
 @style.styled
 def draw(grid: Atlas) -> Figure:
-    """Draws the heat map: red where a renderer breaks at a mild severity, green where it does not break."""
-    figure, ((axes,),) = chart.sheet(0.19 * len(grid.axes) + 1.7)
+    """Draws the heat map: red where a renderer breaks at a mild severity, blue where it does not break."""
+    width = max(style.WIDTH, 0.39 * len(grid.rows) + 2.2)  # inches: a number has room in its cell
+    figure, ((axes,),) = chart.sheet(0.19 * len(grid.axes) + 1.7, width=width)
     shades = np.array([[grid.cell(axis, row).shade for row in grid.rows] for axis in grid.axes])
-    shown = axes.imshow(np.ma.masked_invalid(shades), cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
+    shown = axes.imshow(np.ma.masked_invalid(shades), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
     axes.set_facecolor("#f2f2f2")
     for line, axis in enumerate(grid.axes):
         for row, cell in grid.on(axis):
