@@ -148,6 +148,18 @@ def test_a_failed_run_stands_last_with_its_status_in_words(results, tab):
     assert page.locator("#machines").count() == 0  # it has no machine, which is not another one
 
 
+def test_metrics_without_a_better_direction_rank_nothing(tmp_path, tab):
+    for number in range(4):
+        metrics = {"breakdown": 0.1 * number, "trials": 5 + number}
+        made.write(tmp_path, number, task="stability", metrics=metrics, metrics_start={})
+    write_index(tmp_path)
+    page = tab(tmp_path).open()
+    assert rows_of(page).count() == 4 and names_of(page) == sorted(names_of(page))
+    assert set(page.locator("#board-list .rank").all_inner_texts()[1:]) == {"–"}
+    page.get_by_label("Renderer", exact=True).select_option("dvr")
+    assert names_of(page) == ["DVR"]
+
+
 def test_times_of_several_machines_are_flagged(tmp_path, tab):
     for number, threads in enumerate((1, 2)):
         made.write(tmp_path, number, environment={"cpu": "Some CPU", "threads": threads, "device": "cpu"})

@@ -169,7 +169,10 @@
 
   /* The order of the query, or by the first metric with the best on top. */
   function orderOf(state, columns) {
-    const column = columns.find(({key}) => key === state.sort) || columns.find(({first}) => first) || columns[0];
+    const column =
+      columns.find(({key}) => key === state.sort) ||
+      columns.find(({first}) => first) ||
+      columns.find(({sortable}) => sortable); // by name, where no metric has a better direction
     const down = state.sort === column.key && state.order ? state.order === "down" : Boolean(column.down);
     return {key: column.key, down};
   }
