@@ -48,6 +48,7 @@ def strange(tmp_path_factory):
     """Runs in which every text is an attack, with pictures, curves, meshes and tables whose texts are, too."""
     results = tmp_path_factory.mktemp("strange") / "results"
     for number, attack in enumerate(ATTACKS):
+        made.write(results, number, folder=f"status-{number}", status=attack)  # not read, and named
         folder = FOLDERS[number] if number < len(FOLDERS) else f"run-{number}"
         path = made.write(
             results,
@@ -57,7 +58,7 @@ def strange(tmp_path_factory):
                 field: attack
                 for field in ("id", "task", "renderer", "dataset", "scene", "reason", "method", "code", "config_hash")
             },
-            status="ok" if number % 2 else attack,
+            status="ok" if number % 2 else "crashed",
             notes=[attack, MALICE],
             log=[attack],
             overrides=[f"task={attack}", attack],
@@ -158,6 +159,8 @@ def test_each_run_of_a_stranger_is_shown_as_text(strange, tab):
     text = page.locator("#board-list").text_content()
     for attack in ATTACKS:
         assert attack in text
+    unread = page.locator("#not-read").text_content()
+    assert unread.count("status in record.json must be one of") == len(ATTACKS) and "hacked" in unread
     page = one.open(page.evaluate("implicitBench.runs.link(0)"))
     page.get_by_role("heading", name="Make it again").wait_for()
     assert "hacked" in page.locator("main").text_content()
