@@ -32,7 +32,8 @@ class RangeAnalysis:
         out, no surface that is longer on a ray than `least_segment` is missed. Those of a deep, wide network are
         loose: rays are then cut to the least segments everywhere.
     Deviates from the paper: segments double after an empty one, in place of 1.5 times; a segment of the least length
-        that is not certified is a hit only where the sign changes, and so is one that is certified.
+        that is not certified is a hit only where the sign changes. A certified one at whose end the value is not
+        positive is a hit too.
 
     Args:
         least_segment: in scene units; a shorter one is not cut any more.
@@ -99,12 +100,13 @@ class RangeAnalysis:
             middle = near + length / 2
             low, _ = bounds(some.at(middle), length[:, None] / 2 * some.directions)
             empty, shortest = low > 0, length <= self.least_segment
-            asked = (empty | shortest).nonzero().squeeze(-1)  # where the ray goes on, or ends
+            uncut = empty | shortest
+            asked = uncut.nonzero().squeeze(-1)  # where the ray goes on, or ends; no value elsewhere
             far = near + length
             value = torch.full_like(near, torch.nan).index_put((asked,), field(some[asked].at(far[asked])))
             cast.note(active[asked], far[asked], value[asked])
-            crossed = (empty | shortest) & (value <= 0)  # of an empty one: values are too coarse for its bounds
-            onward = (empty | shortest) & ~crossed
+            crossed = value <= 0  # at the end of an empty one too, where values are coarser than its bounds
+            onward = uncut & ~crossed
             done = onward & (far >= leave)
             cast.far[active], cast.far_value[active] = far, torch.where(crossed, value, cast.far_value[active])
             status = torch.where(crossed, Status.HIT, torch.where(done, Status.MISS, Status.OUT_OF_STEPS))

@@ -40,6 +40,7 @@ class RunStatus(StrEnum):
     REFUSED = "refused"
 
 
+_STATUSES = frozenset(RunStatus)
 PICTURES = ("summary.png", "strip.png", "failure.png")  # of a run: the first that it has is looked at first
 NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no record.json
 
@@ -159,7 +160,7 @@ def _check(record: dict[str, Any]) -> None:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], classes):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
-    if record["status"] not in set(RunStatus):
+    if record["status"] not in _STATUSES:
         raise ValueError(f"status in record.json must be one of {', '.join(RunStatus)}, found {record['status']!r}")
 
 

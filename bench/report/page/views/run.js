@@ -129,7 +129,7 @@
         ? element(
             "details",
             null,
-            element("summary", null, log.length === 1 ? "The last line of its log" : `The last ${log.length} lines of its log`),
+            element("summary", null, `The last ${log.length === 1 ? "line" : `${log.length} lines`} of its log`),
             element("pre", null, log.join("\n")),
           )
         : null,
