@@ -63,8 +63,3 @@ STATUSES = {
         "The command of the sweep runs what is missing, and reuses what is there.",
     ),
 }
-
-
-def said(status: str) -> Said:
-    """What a status means and what helps; a status of another version of this program is not known."""
-    return STATUSES.get(status, Said("This status is not known here."))

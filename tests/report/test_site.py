@@ -11,7 +11,7 @@ import pytest
 
 from bench.records.names import differences
 from bench.records.record import NOT_RUN, RunStatus
-from bench.records.statuses import STATUSES, said
+from bench.records.statuses import STATUSES
 from bench.report.data.names import Nameable, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
@@ -97,7 +97,6 @@ def test_no_text_can_end_a_script_or_a_line():
 def test_each_status_has_words_and_all_but_ok_a_remedy():
     assert set(STATUSES) == {*RunStatus, NOT_RUN}
     assert [status for status, words in STATUSES.items() if not words.remedy] == [RunStatus.OK]
-    assert said("a later one").meaning == "This status is not known here."
 
 
 def test_each_task_has_words():

@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.statuses import said
+from bench.records.statuses import STATUSES
 from bench.report.data.records import Record
 from bench.report.site.columns import number
 from bench.report.site.files import ALT, Folder
@@ -30,7 +30,7 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
     return {
         "asked": asked(record),
         "reason": record["reason"],
-        "said": said(record["status"])._asdict(),
+        "said": STATUSES[record["status"]]._asdict(),
         "notes": [text(note) for note in record["notes"]],
         "log": [text(line) for line in record.get("log") or []],
         "metrics": _metrics(record),
