@@ -494,6 +494,16 @@ def test_fig5_says_whether_its_loss_has_normals(tmp_path, task, said):
     assert said in told(fig5.make(chosen(tmp_path, "fig5")))
 
 
+@pytest.mark.parametrize(
+    ("silhouette", "said"),
+    [({"_label_": "DIST's mask loss"}, "rows can be compared by it"), ({}, "different rows cannot be compared")],
+)
+def test_fig5_says_whether_losses_can_be_compared(tmp_path, silhouette, said):
+    settings = {"silhouette": silhouette}
+    write_curve(write_run(tmp_path, "fig5", PARALLEL, settings=settings), [4, 3, 2, 1], {0: 0.4, 2: 0.1, 3: 0.2})
+    assert said in told(fig5.make(chosen(tmp_path, "fig5")))
+
+
 def test_fig5_data_holds_runs_medians_and_correlation(completions):
     data = fig5.make(chosen(completions, "fig5")).data
     runs = data[(data["kind"] == "run") & (data["row"] == PARALLEL)]

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import curves
-from bench.report.data.experiments import Experiment, Selection
+from bench.report.data.experiments import Experiment, Selection, shared_loss
 from bench.report.data.records import SCALE, Record, Row, setting
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, presets_of, series
@@ -26,8 +26,6 @@ SCALES = {"total": 1.0, "chamfer_l2": SCALE}
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
     "not used by it. Seconds are those of the optimisation loop.",
-    "Each row's loss contains the silhouette loss of its renderer (the paper's in the rows with a plus), so losses of "
-    "different rows cannot be compared; Chamfer distances can.",
     "ρ is Spearman's rank correlation between loss and Chamfer over the n iterations of a row's runs that have both; "
     "points of one run are not independent, so it is no test of significance.",
 )
@@ -65,13 +63,21 @@ def make(experiment: Experiment) -> Result:
 
 
 def _loss(experiment: Experiment) -> str:
-    """A note on the terms of the loss."""
+    """A note on the terms of the loss, and on whether those of different rows can be compared."""
+    compared = (
+        "It is the same for every row, so that rows can be compared by it."
+        if shared_loss(experiment.records)
+        else "Each row's loss contains the silhouette loss of its renderer (the paper's in the rows with a plus), so "
+        "losses of different rows cannot be compared; Chamfer distances can."
+    )
     weight = setting(experiment.requested(), "task", "normal_weight")
     if weight:
         width = setting(experiment.requested(), "task", "normal_width")
         terms = f"depths, normals over {width} scene units (weight {weight:g}) and the silhouette"
-        return f"The loss has {terms}, as the paper's Fig. 5; at a point, normals of a ReLU network would move no code."
-    return "The loss has depths and the silhouette; the paper's Fig. 5 has normals as well."
+        said = f"{terms}, as the paper's Fig. 5; at a point, normals of a ReLU network would move no code"
+    else:
+        said = "depths and the silhouette; the paper's Fig. 5 has normals as well"
+    return f"The loss has {said}. {compared}"
 
 
 @style.styled
