@@ -155,7 +155,7 @@ class _Cast:
 
 
 def _promised(field: Field) -> Bounds:
-    """Bounds from what a distance promises: its Lipschitz bound, or 1; of a bound, whether they are positive."""
+    """Bounds by the field's Lipschitz bound, or by 1 where it states none; of a `BOUND` the lower one's sign holds."""
     steepest = 1.0 if field.lipschitz is None else field.lipschitz
 
     def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:

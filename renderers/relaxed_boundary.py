@@ -15,7 +15,9 @@ from renderers.march import Front, Stepping, march
 from renderers.rendering import Capabilities, Rendering, Status, Volume, assemble
 from renderers.silhouette import CrossEntropy
 
-CANDIDATE = 1.5  # bands: a distance's least sample is at most 1.16 times the least value that its ray passes
+CANDIDATE = (
+    1.5  # of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value
+)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The style of all pictures and figures: width, type size, and each preset's colour, marker and line."""
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -64,7 +65,7 @@ _MESH = Look("#8a8a8a", "d", "-.")
 _NEWTON, _NEUS, _NEUS_BUDGET = Look("#1b9e77", "h", (0, (1, 1))), Look("#e7298a", ">"), Look("#f59cc6", ">", "--")
 _VOLSDF, _UNISURF = Look("#e69f00", "P"), Look("#7a4a00", "X", "-.")
 _RELAXED_BOUNDARY, _RANGE_ANALYSIS = Look("#66a61e", "*"), Look("#2f6f8f", "8", "--")
-# By preset: a file of conf/renderer or conf/method. For presets that are not here see `look`.
+# By preset: a file of conf/renderer, or of conf/method where it has not its renderer's. For others see `look`.
 KNOWN = {
     "naive": _NAIVE,
     "naive_serial": _NAIVE,
@@ -100,35 +101,19 @@ KNOWN = {
     "range_analysis": _RANGE_ANALYSIS,
     "mesh_proxy": _MESH,
     "deepsdf": Look("#009e73", "P", "-."),
-    "dist_mask": _DIST,
     "dist_depth": _LIGHT_DIST,
     "dist_mask_paper": _PAPER_DIST,
     "dist_depth_paper": _PAPER_DIST_DEPTH,
     "dist_mask_official": _OFFICIAL_DIST,
-    "dvr_mask": _DVR,
-    "idr_mask": _IDR,
     "naive_mask": _NAIVE_OF_METHODS,
-    "newton_mask": _NEWTON,
-    "neus_mask": _NEUS,
-    "neus_budget_mask": _NEUS_BUDGET,
-    "volsdf_mask": _VOLSDF,
-    "unisurf_mask": _UNISURF,
-    "relaxed_boundary_mask": _RELAXED_BOUNDARY,
-    "range_analysis_mask": _RANGE_ANALYSIS,
     "mesh_mask": _MESH,
     "multiview_dist": _LIGHT_DIST,
     "multiview_restarts": _DIST,
     "multiview_paper": _PAPER_DIST_DEPTH,
-    "multiview_dvr": _DVR,
-    "multiview_idr": _IDR,
     "multiview_naive": _NAIVE_OF_METHODS,
     "multiview_mesh": _MESH,
-    "rgb_newton": _NEWTON,
     "rgbd_newton": Look("#0b5e45", "H"),
-    "rgb_dist": _DIST,
-    "rgb_idr": _IDR,
     "rgb_naive": _NAIVE_OF_METHODS,
-    "rgb_dvr": _DVR,
     "rgbd_dvr": Look("#8b1e3f", "v"),
     "dvr_paper": Look("#e7a1ab", "^", "--"),
     "dvr_paper_depth": Look("#b56576", "v", "--"),
@@ -140,17 +125,12 @@ KNOWN = {
     "stereo_5": Look("#3f6d10", ">", "--"),
     "pose_dist": _LIGHT_DIST,
     "pose_dist_starts": _DIST,
-    "pose_dvr": _DVR,
-    "pose_idr": _IDR,
-    "single_view_by_newton": _NEWTON,
-    "single_view_by_idr": _IDR,
-    "single_view_by_dist": _DIST,
-    "single_view_by_dvr": _DVR,
     "single_view_by_neus": _NEUS_BUDGET,
     "pose_icp_point": Look("#8fbc5a", "v", "--"),
     "pose_icp_plane": Look("#e69f00", "d", "--"),
     "pose_icp_plane_starts": Look("#b36b00", "P", "-."),
 }
+OF_METHOD = re.compile(r"^(multiview|rgb|pose|single_view_by)_|_mask$")  # what a method's name adds to its renderer's
 _COLOURS = (
     *("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#b8860b", "#8b2252", "#2f6f8f", "#556b2f", "#c04000"),
 )
@@ -160,8 +140,9 @@ _LINES = ("-", "--", "-.", (0, (1, 1)))
 
 def look(preset: str) -> Look:
     """The look of a row, which depends on its preset alone, so that it is the same in every figure and report."""
-    if preset in KNOWN:
-        return KNOWN[preset]
+    for name in (preset, OF_METHOD.sub("", preset)):
+        if name in KNOWN:
+            return KNOWN[name]
     drawn = crc32(preset.encode("utf-8", "backslashreplace"))
     picks = ((drawn >> shift) % len(choices) for shift, choices in ((0, _COLOURS), (8, _MARKERS), (16, _LINES)))
     colour, marker, line = picks

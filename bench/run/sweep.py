@@ -56,7 +56,7 @@ class ReadOnce(CachingConfigRepository):
 class Sweep:
     """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs.
 
-    What a command does with a cell that is no run is `other`; it is None where the cells are runs.
+    `other` gets each cell of a sweep whose cells are no runs (`bench.train`, `bench.prior`); else it is None.
     """
 
     plan: Plan | None = None

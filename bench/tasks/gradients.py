@@ -55,7 +55,7 @@ DEFINITIONS = {
     "supersampled image, in which visibility changes; a pixel is the mean over task.supersampling^2 rays",
     "image_spread": "standard deviation of that gradient between the rays of a pixel, over the length of the true one: "
     "of one ray per pixel, it is the noise",
-    "values_per_ray": "field values for it",
+    "values_per_ray": "field values per ray that this gradient takes",
 }
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS, NOT_RUN
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
@@ -182,15 +183,8 @@ def _worst(tables: list[Table], split: str, draws: list[int], runs: list[RunKey]
 
 def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]]:
     """The values of some of a method's draws, by dotted key, in which the configurations of any of its draws differ."""
-    every = [dict(_flat(record["config"])) for record in among]
+    every = [flat(record["config"]) for record in among]
     varies = [name for name in every[0] if len({str(each.get(name)) for each in every}) > 1]
     names = [name for name in varies if name.partition(".")[0] not in {*OTHER, *NEUTRAL_KEYS}]
-    flat = [dict(_flat(record["config"])) for record in records]
-    return [{name: each[name] for name in names} for each in flat]
-
-
-def _flat(node: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    items = []
-    for key, value in node.items():
-        items += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
-    return items
+    chosen = [flat(record["config"]) for record in records]
+    return [{name: each[name] for name in names} for each in chosen]

@@ -14,10 +14,12 @@
     nan: ["bad", "?"],
     diverged: ["bad", "↗"],
     empty: ["bad", "∅"],
+    crashed: ["bad", "✕"],
+    refused: ["bad", "✕"],
   };
 
   function badge(status) {
-    const [tone, mark] = KINDS[status] || ["bad", "✕"];
+    const [tone, mark] = KINDS[status];
     return element(
       `span.status.${tone}`,
       null,

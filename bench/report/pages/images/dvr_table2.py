@@ -36,7 +36,7 @@ NOTES = (
 )
 COLUMNS = (
     text("method", "Method"),
-    *(Column(name, heading, show=thousandfold) for name, heading in (("seen_accuracy", "Accuracy"),)),
+    Column("seen_accuracy", "Accuracy", show=thousandfold),
     Column("seen_completeness", "Completeness", show=thousandfold),
     Column("seen_chamfer_l1", "Chamfer-L1, seen", show=thousandfold),
     Column("chamfer_l1", "all", show=thousandfold),

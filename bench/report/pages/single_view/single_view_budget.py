@@ -129,7 +129,7 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
             if budget != largest and part.index.equals(budgets[largest].index)
         ]
     known = [ratio for ratio in ratios if ratio.known]
-    beyond = sum(not ratio.low <= 1 <= ratio.high for ratio in known)
+    beyond = sum(ratio.excludes(1) for ratio in known)
     of_largest = f"{largest[0]} shapes with {largest[1]} images each"
     verdict = f"The interval excludes 1 for *{beyond} of {len(known)}* ratios to the training on {of_largest}."
     return Answer("How many shapes, and images of each, does a training need?", verdict if known else "")
