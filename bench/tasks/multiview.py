@@ -65,6 +65,7 @@ class Multiview:
     scale: float
     degrees: float
     shift: float
+    similarity: bool
     optimiser: OptimiserSettings
 
     takes_field: ClassVar[bool] = True
@@ -93,6 +94,11 @@ class Multiview:
         """The number of starts, and the iterations of each one's trial."""
         return StartSettings(self.starts, self.trial)
 
+    @property
+    def sought(self) -> bool:
+        """Whether a similarity is optimised as well."""
+        return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
+
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
         apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
@@ -110,8 +116,8 @@ class Multiview:
         Raises:
             BadInput: for settings that need a prior, and for too few photographs.
         """
-        if self.scale != 1 or self.degrees or self.shift or self.starts > 1:
-            raise BadInput("task.scale, degrees, shift and starts need a prior: set field=prior")
+        if self.sought or self.starts > 1:
+            raise BadInput("task.scale, degrees, shift, similarity and starts need a prior: set field=prior")
         scene_seed = scene.seed(seed)
         photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
@@ -139,7 +145,7 @@ class Multiview:
             2 * given.per_step * scene.view.mask.numel(),
             device,
             initial=codes,
-            misplaced=self._misplaced(generator) if self.scale != 1 or self.degrees or self.shift else None,
+            misplaced=self._misplaced(generator) if self.sought else None,
             trial=self.trial,
             photographs=given.colours.cpu().numpy(),
             compared_at=self.optimiser.iterations,  # where images are no longer blurred

@@ -147,13 +147,13 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
 
 
 def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
-    for task in ({"degrees": 20.0}, {}, {"shift": 0.1}, {"scale": 0.8}):
+    for task in ({"degrees": 20.0}, {}, {"similarity": True}, {"shift": 0.1}, {"scale": 0.8}):
         many_views(tmp_path, "fig12", "DIST", task=task, found=UP if task else RIGHT)
     result = made(tmp_path, misplaced_gallery)
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "DIST"]
-    assert columns == ["0.8 times as large", "in place", "turned by 20°", "shifted by 0.1", "truth"]
-    assert [found["DIST", column] for column in columns[:2]] == [COLOURS[UP], COLOURS[RIGHT]]
+    assert columns == ["0.8 times as large", "in place", "known place", "turned by 20°", "shifted by 0.1", "truth"]
+    assert [found["DIST", column] for column in columns[:3]] == [COLOURS[UP], COLOURS[UP], COLOURS[RIGHT]]
     assert {found["start", column] for column in columns[:-1]} == {COLOURS[RIGHT]}
     assert found["start", "truth"] == COLOURS[TOWARDS]
 

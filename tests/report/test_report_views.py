@@ -160,7 +160,8 @@ def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_pat
     placed = {"shift": 0.0, "degrees": 0.0, "scale": 1.0}
     for index, chamfer in enumerate((0.5, 0.99, 1.01, None)):
         found(tmp_path, "fig12", "DIST", chamfer, index=index, **placed | {"degrees": 20.0})
-    found(tmp_path, "fig12", "DIST", 0.2, **placed)
+    found(tmp_path, "fig12", "DIST", 0.2, **placed | {"similarity": True})
+    found(tmp_path, "fig12", "DIST", 4.0, **placed)  # its place is known: another problem, in no panel
     found(tmp_path, "fig12", "DIST", 0.2, **placed | {"degrees": 20.0, "shift": 0.1})  # two: in no panel
     result = made(tmp_path, fig12)
     table = result.table.set_index("Condition")
@@ -168,7 +169,9 @@ def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_pat
     assert table.loc["rotation (degrees): 20", "Median"] == "1.00"
     neutral = ["shift (scene units): 0", "rotation (degrees): 0", "size / true size: 1"]
     assert table.loc[neutral, "Success"].tolist() == ["1 of 1 (n = 1)"] * 3
-    assert len(table) == 4
+    assert table.loc["place known", "Median"] == "4.00"
+    assert len(table) == 5
+    assert not any(4.0 in line.get_ydata() for axis in result.figure.axes for line in axis.lines)
     assert all(1.0 in line.get_ydata() for axis in result.figure.axes for line in axis.lines[-1:])
 
 

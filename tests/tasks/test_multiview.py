@@ -26,7 +26,7 @@ PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
     images=PLAINLY, focal=1.0, views_per_step=4, neighbour=1, visible=1e-3, photometric_weight=5.0,
     code=CodePenalty(0.0, "sum"), start_scale=0.0, starts=1, trial=3, coarse_blur=0.0,
-    scale=1.0, degrees=0.0, shift=0.0, optimiser=OptimiserSettings(30, 0.01, "constant"),
+    scale=1.0, degrees=0.0, shift=0.0, similarity=False, optimiser=OptimiserSettings(30, 0.01, "constant"),
 )  # fmt: skip
 
 
@@ -99,6 +99,12 @@ def test_a_misplaced_ball_is_put_back(scene):
     assert problem.similarity[:3].norm() < 0.3 * first[:3].norm()
     assert problem.similarity[6].abs() < 0.3 * first[6]
     assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
+
+
+def test_a_similarity_is_sought_in_place_where_that_is_asked_for(scene):
+    assert problem_of(scene).similarities == []
+    problem = problem_of(scene, similarity=True)
+    assert problem.similarity.tolist() == [0.0] * 7 and problem.similarities[0].requires_grad
 
 
 def test_a_longer_focal_length_shows_a_larger_ball(scene):

@@ -14,7 +14,7 @@ UNITS = {"shift": "shifted by {:g}", "degrees": "turned by {:g}°", "scale": "{:
 NOTES = (
     "The shape is the one with the least number, not a chosen one. Normals are red, green and blue (right, up, towards "
     "the camera) of the mesh that is judged, seen from the first photograph's side. Units of a shift: scene units.",
-    "Start: the shape of the random code, misplaced; “in place”, where no similarity is optimised.",
+    "Start: the shape of the random code, misplaced; at “known place” no similarity is optimised.",
     "DIST, Fig. 24, shows photographs of real chairs, and what PMO makes of them; these shapes are synthetic.",
 )
 
@@ -50,10 +50,11 @@ def _block(name: str, records: list[Record], scene: Scene) -> Block:
 
 
 def _place(record: Record) -> tuple[float, ...]:
-    """How far off a run's start is, in each condition; all are neutral where it is in place."""
-    return tuple(one.of(record) - one.neutral for one in fig12.CONDITIONS)
+    """How far off a run's start is, in each condition, and whether its place is known."""
+    return (*(one.of(record) - one.neutral for one in fig12.CONDITIONS), fig12.place_known(record))
 
 
 def _words(place: tuple[float, ...]) -> str:
-    found = [UNITS[one.key].format(off + one.neutral) for one, off in zip(fig12.CONDITIONS, place, strict=True) if off]
-    return "\n".join(found) or "in place"
+    *offs, known = place
+    found = [UNITS[one.key].format(off + one.neutral) for one, off in zip(fig12.CONDITIONS, offs, strict=True) if off]
+    return "\n".join(found) or ("known\nplace" if known else "in place")
