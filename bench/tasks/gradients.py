@@ -30,14 +30,15 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Blurred, Renderer, Rendering
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
-OTHER_SURFACE = 0.01  # scene units: a hit further from the true one is on another surface, and is not evaluated
+NEAR = 0.01  # scene units within which a hit is on the true hit's surface
+BETWEEN = 32  # places from a hit to the true one at which it is asked whether they are on one surface
 
 DEFINITIONS = {
     "BAND": "angle between ray and inward normal: frontal to 30 degrees, oblique to 70, grazing beyond; silhouette: "
     "pixels next to the outline; colour: frontal and oblique pixels, of which not distances but colours are compared, "
     "a row per pixel and channel (DVR, Eqs. 3 to 8): those of a random smooth paint of the point and the normal there",
     "pixels, excluded": "pixels evaluated; pixels drawn but not evaluated, since visibility changes there, the root is "
-    "not found again, or the renderer does not hit that surface",
+    "not found again, or the renderer hits nothing or another surface; a hit that is off on the same surface counts",
     "code_cosine, camera_cosine": "cosine between a pixel's gradient of distance and the true one, median over pixels; "
     "code: along task.directions orthogonal directions, camera: six rigid motions (scene units, radians)",
     "code_pooled_cosine, camera_pooled_cosine": "cosine between the concatenated gradients of all pixels of the band "
@@ -137,7 +138,7 @@ class Gradients:
             subject.decoder, subject.code, directions, camera=subject.camera, pixels=pixels, distance=distance
         )
         by_code, by_camera, found, hit = subject.gradients(pixels)
-        valid = truth.valid & hit & ((found - distance).abs() < OTHER_SURFACE)
+        valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
         numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
         if valid.any():
             numbers |= _compare((by_code @ directions)[valid], truth.code[valid], "code")
@@ -161,7 +162,7 @@ class Gradients:
             subject.decoder, subject.code, directions, paint, camera=subject.camera, pixels=pixels, distance=distance
         )
         by_code, by_camera, by_weight, found, hit = subject.colour_gradients(pixels, paint)
-        valid = truth.valid & hit & ((found - distance).abs() < OTHER_SURFACE)
+        valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
         numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
         if valid.any():
             numbers |= _compare((by_code @ directions)[valid].flatten(0, 1), truth.code[valid].flatten(0, 1), "code")
@@ -210,6 +211,16 @@ class Subject:
         """Raises Unsupported where the renderer cannot do this."""
         check_kind(self.renderer, self.decoder.at(self.code))
         check_field_gradient(self.renderer)
+
+    def same_surface(
+        self, pixels: Int[Tensor, " m"], found: Float[Tensor, " m"], distance: Float[Tensor, " m"]
+    ) -> Bool[Tensor, " m"]:
+        """Whether hits are on the surface of the true ones: near, or the field falls all the way from them to there."""
+        rays = self.camera.rays().flat()[pixels]
+        between = torch.lerp(found[:, None], distance[:, None], torch.linspace(0, 1, BETWEEN, dtype=found.dtype))
+        with torch.no_grad():
+            falls = (self.decoder.at(self.code)(rays.at_each(between)).abs().diff(dim=1) <= 0).all(dim=1)
+        return ((found - distance).abs() < NEAR) | falls
 
     def gradients(
         self, pixels: Int[Tensor, " m"]
