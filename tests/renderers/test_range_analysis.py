@@ -80,19 +80,22 @@ def around(count: int) -> Rays:
     return Rays(origins, normalize(targets - origins, dim=-1))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_first_hit_of_a_network_is_missed(seed):
+@pytest.mark.parametrize(("seed", "lost"), list(enumerate((74, 52, 103, 49))))
+def test_no_first_hit_of_a_network_is_missed(seed, lost):
     """Its values are no lengths, so that sphere tracing loses hits; the certificate loses none."""
     field, rays = network(seed), around(400)
     truth = trace(field, rays, lipschitz=steepest(field, radius=1.0, margin=3.0), least_step=1e-4, radius=1.0)
-    found = RENDERER.render(field, rays)
+    asked, marching = Counts(), Counts()
+    found = RENDERER.render(Meter(field, asked), rays)
     hits = truth.status == Status.HIT
     assert hits.sum() > 30
     assert (found.status[hits] == Status.HIT).all()
-    assert (found.distance - truth.distance)[hits].abs().max() < 1e-6
+    assert (found.distance - truth.distance)[hits].abs().max() < 1e-7
     assert not (found.hit & ~hits & (truth.status != Status.STARTED_INSIDE)).any()
-    marched = load("renderer", "idr").render(field, rays)
-    assert ((marched.distance - truth.distance).abs()[hits] > 0.01).sum() + (~marched.hit[hits]).sum() > 0
+    marched = load("renderer", "idr").render(Meter(field, marching), rays)
+    off = (marched.distance - truth.distance).abs() > 0.01
+    assert int((hits & (off | ~marched.hit)).sum()) == pytest.approx(lost, abs=2)
+    assert 6 < asked.value / marching.value < 8.5
 
 
 def test_a_thin_plate_is_found():
