@@ -28,8 +28,11 @@ MOST_SCENES = 3
 NOTES = (
     "Users of NeuS report weights in front of the surface and a bumpy back where no photograph looks. All photographs "
     "are from within 45 degrees of one direction; pictures are from the opposite one.",
-    "All rows share one field (4 layers of 128, a distance). The loss of the mask is the renderer's own for NeuS, and "
-    "IDR's cross entropy for the others.",
+    "All rows share one field (4 layers of 128, a distance). A row's name says its loss of the mask; without one it is "
+    "the renderer's own. Two rows that differ in both compare both at once: read a renderer under two losses, or two "
+    "renderers under one.",
+    "The early weight is that of held-out photographs, which are from the same side, and with masks: weights in front "
+    "of the surface where no photograph looks are not in it.",
 )
 COLUMNS = (
     text("method", "Method"),
@@ -63,7 +66,7 @@ def make(experiment: Experiment) -> Result:
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
-    """The rows by how much bumpier than the truth their unseen sides are."""
+    """Renderers and losses of the mask by how much bumpier than the truth the unseen sides are."""
     bumps = data.assign(unseen_roughness=data["unseen_roughness"].clip(lower=0.0))  # smoother than the truth is no bump
     verdict = ranked(bumps, "unseen_roughness").said("roughness beyond the truth's where no photograph looks", unit="°")
-    return Answer("Who leaves bumps on the side that no photograph shows?", verdict)
+    return Answer("What leaves bumps on the side that no photograph shows?", verdict)
