@@ -254,3 +254,13 @@ def test_the_contract_of_contributing_holds(made, tmp_path):
         env={**os.environ, "PYTHONPATH": paths}, check=False,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stdout[-3000:]
+
+
+SETTINGS_OF_SPEED = re.compile(r"(dist_alpha|dist_epsilon|dist_steps|dvr_fixed)_")  # the README has these with a star
+
+
+@pytest.mark.parametrize("group", ["renderer", "experiment"])
+def test_the_page_of_choices_names_every_file(group):
+    names = {path.stem for path in (ROOT / "conf" / group).glob("[!_]*.yaml")}
+    said = set(re.findall(r"`([a-z0-9_]+)`", text_of("conf/README.md")))
+    assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= said

@@ -126,11 +126,11 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
         best = blurred.loc[blurred["image_cosine"].idxmax()]
         said.append(
             f"{best['row']} has a cosine of *{best['image_cosine']:.2f}* and a scale of {best['image_scale']:.2f} "
-            f"at a blur of {best['blur']:g}"
+            f"at a blur of {best['blur']:g} scene units"
         )
     if len(sharp):
         said.append(
-            f"renderers that differentiate hits alone have at most {sharp['image_cosine'].max():.2f} and "
-            f"{sharp['image_scale'].max():.2f}"
+            f"renderers that differentiate hits alone have at most {sharp['image_cosine'].max():.3g} and "
+            f"{sharp['image_scale'].max():.3g}"
         )
     return Answer("Does what comes into view have a gradient?", f"{'; '.join(said)}." if said else "")

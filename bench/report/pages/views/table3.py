@@ -42,7 +42,8 @@ NOTES = (
     "Error: mean squared distance from points of the true surface to the nearest of the found one, in that direction "
     "only, in squared scene units, times 1000. A run that did not end ok counts as infinite (a cross at the edge); "
     "times and evaluations are over the other runs.",
-    "All runs start from random codes, one per shape, the same for each method.",
+    "All runs start from random codes, one per shape, the same for each method. “End / start” is the median of the "
+    "shapes' ratios, “End / oracle” the ratio of the medians. Failed: did not end ok, however far it ended.",
     NOTE + " Dotted: three times its error.",
     "“Published” is DIST, Table 3: 50 shapes of PMO's renderings of ShapeNet, with another prior and metric scale, so "
     "it cannot be compared directly with the measured rows.",
