@@ -1,10 +1,12 @@
 """Photographs from one side: what renderers make of the side that none of them shows, and where their weights lie."""
 
+import math
+
 import pandas as pd
 
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import definitions, grouped
-from bench.report.write.answer import Answer, ranked
+from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_pictures, lines_of, scene_of
 from bench.report.write.table import (
@@ -66,7 +68,11 @@ def make(experiment: Experiment) -> Result:
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
-    """Renderers and losses of the mask by how much bumpier than the truth the unseen sides are."""
-    bumps = data.assign(unseen_roughness=data["unseen_roughness"].clip(lower=0.0))  # smoother than the truth is no bump
-    verdict = ranked(bumps, "unseen_roughness").said("roughness beyond the truth's where no photograph looks", unit="°")
-    return Answer("What leaves bumps on the side that no photograph shows?", verdict)
+    """Renderers and losses of the mask whose unseen sides are no bumpier than the truth's, and the bumpiest one."""
+    bumps = data["unseen_roughness"].where(data["status"] == "ok", math.inf).dropna()
+    medians = bumps.groupby(data["row"], sort=False).median()
+    smooth, worst = list(medians.index[medians <= 0]), medians.idxmax() if len(medians) else None
+    said = [f"No bumpier than the truth, by their medians: {'; '.join(smooth)}."] if smooth else []
+    if worst is not None and 0 < medians[worst] < math.inf:
+        said.append(f"The bumpiest, by *{medians[worst]:.1f}°* more than the truth: {worst}.")
+    return Answer("What leaves bumps on the side that no photograph shows?", " ".join(said))
