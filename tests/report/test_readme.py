@@ -90,8 +90,8 @@ def test_readme_tells_how_many_predictions_hold():
     )
     said = (
         f"Of the {known} predictions of that run, {known - outside} lie in the measured interval and {outside} "
-        f"outside: {gap} of {of_gap} of `gap`, for which the formula does not hold, {weak} of {of_weak} of `weak distance`, "
-        f"{outside - gap - weak} others."
+        f"outside: {gap} of {of_gap} of `gap`, for which the formula does not hold, {weak} of {of_weak} of "
+        f"`weak distance`, {outside - gap - weak} others."
     )
     assert said in " ".join((ROOT / "README.md").read_text().split())
 
