@@ -53,7 +53,7 @@ def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per row and pictures from behind."""
     scenes = list(grouped(experiment.records, scene_of))
     figure, missing = draw_pictures(
-        experiment, list(experiment.rows()), scenes[:MOST_SCENES], {"back_truth": "true normals"}, side="back_"
+        experiment, list(experiment.rows()), scenes[:MOST_SCENES], {"back_truth": "true normals"}, 9, side="back_"
     )
     return Result(
         experiment,
