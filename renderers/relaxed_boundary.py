@@ -15,9 +15,8 @@ from renderers.march import Front, Stepping, march
 from renderers.rendering import Capabilities, Rendering, Status, Volume, assemble
 from renderers.silhouette import CrossEntropy
 
-CANDIDATE = (
-    1.5  # of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value
-)
+# Of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value.
+CANDIDATE = 1.5
 
 
 @dataclass(frozen=True)
@@ -112,8 +111,7 @@ class RelaxedBoundary:
         front = Front.on_sphere(rays, radius=self.sphere_radius, samples=1)
         stepping = Stepping(self.epsilon, 1.0, None, None, active_only=True, careful_split=False)
         passed, least = front.distance.clone(), torch.full_like(front.distance, torch.inf)
-        last = torch.full((3, len(least)), torch.nan, dtype=least.dtype, device=least.device)
-        places, values = last.clone(), last.clone()  # of each ray's last three samples
+        places = values = torch.full_like(least, torch.nan).expand(3, -1)  # of each ray's last three samples
         for _ in range(self.steps):
             if not bool(front.active.any()):
                 break

@@ -46,9 +46,7 @@ def test_neus_is_unbiased_and_volsdf_is_not(case):
     assert abs(error(fine, case, 0.01)) < 5e-4
     weight = fine.with_blur(0.01).render(case.field(), case.rays()).volume
     assert weight.distance[weight.weight.argmax()].item() == pytest.approx(case.distance, abs=2.5e-4)
-    off = error(
-        replace(VOLSDF, fine_samples=512), case, 0.01
-    )  # behind the surface, or, seen at a slant, in front of it
+    off = error(replace(VOLSDF, fine_samples=512), case, 0.01)  # behind the surface; at a slant, in front of it
     assert off == pytest.approx({1.0: 0.36, 0.8: 0.06, 0.28: -4.06}[case.cosine], abs=0.02)
 
 

@@ -105,7 +105,7 @@ def _succeeded(record: Record) -> bool:
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     """The shares of successes of each row, over all conditions but known places."""
     off = pd.concat([data[one.key] != one.neutral for one in CONDITIONS], axis=1).any(axis=1)
-    data = data[off | data.get("similarity", pd.Series(False, data.index)).eq(True)]
+    data = data[off | data["similarity"].eq(True)]
     right = (data["status"] == "ok") & (SCALE * data[ONE_WAY] < SUCCESS)
     counts = right.groupby(data["row"], sort=False).agg(["sum", "count"])
     said = "; ".join(f"{row} *{int(own['sum'])} of {own['count']}*" for row, own in counts.iterrows())
