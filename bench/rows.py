@@ -68,7 +68,7 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
 def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     """The methods with a search space, to be swept over: of the kind `space` the spaces.
 
-    Of another kind, the settings that have been written to the folder of that name; of `tuned`, each behind its method.
+    Of the kind `tuned`, the settings that have been written to the folder of that name, each behind its method.
 
     Args:
         without: names of methods that are left out.

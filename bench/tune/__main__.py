@@ -1,8 +1,8 @@
 """`python -m bench.tune --into conf/method/tuned`: writes each method's best drawn setting as a file of its own.
 
-It reads the runs of `+experiment=tuning`, or of `--experiment`. The best draw is that with the smallest geometric mean
-of Chamfer distances on the validation shapes, of those with the fewest failures; the test shapes take no part in the
-choice.
+It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
+on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice. With
+`--experiment tuning_one_loss` the draw that is best over all methods is written, as one file for all of them.
 """
 
 import argparse
@@ -12,20 +12,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from omegaconf import OmegaConf
 
 from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import read_records
 from bench.report.data.experiments import Experiment, choose, shared_loss
-from bench.report.data.subjects.tuning import ONE_LOSS, SPACE, TUNING, Tuning, left_out, tunings, unfinished
+from bench.report.data.records import Record
+from bench.report.data.subjects.tuning import (
+    ONE_LOSS,
+    SPACE,
+    TUNING,
+    Tuning,
+    best_of_all,
+    left_out,
+    tunings,
+    unfinished,
+)
 
 SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS)}
+SHARED = "_one_loss"  # the file with the setting that all methods share
 HEAD = """# @package _global_
-# Draw {draw} of {draws} of method/space/{method}: geometric mean of Chamfer x 1000 on {runs} validation runs
+# Draw {draw} of {draws} of method/{space}: geometric mean of Chamfer x 1000 {over}
 # at scale={scale} of {families}{loss}: {best}, of the median draw {middle}.
 # Written by `python -m bench.tune` from runs of commit {commit}; do not edit.
-defaults:
+"""
+BASE = """defaults:
   - /method/{method}
   - _self_
 
@@ -33,10 +46,11 @@ defaults:
 
 
 def write(results_dir: Path, folder: Path, *, name: str = TUNING.experiment) -> list[str]:
-    """Writes a file per method of the experiment of that name to the folder, and gives a line for each.
+    """Writes a file per method of the experiment of that name to the folder, or one for all; gives a line for each.
 
     Raises:
-        ValueError: where runs of the tuning are missing, or have not ended.
+        ValueError: where runs of the tuning are missing, or have not ended; where one file is asked for methods whose
+            drawn settings differ.
     """
     experiment = choose(read_records(results_dir)[0], SELECTIONS[name], results_dir)
     if experiment is None:
@@ -58,36 +72,57 @@ def write(results_dir: Path, folder: Path, *, name: str = TUNING.experiment) -> 
             raise ValueError(
                 f"runs name the method {method.method!r}, which is no name of a file: leave these runs out"
             )
+    files = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment) for m in found]
     folder.mkdir(parents=True, exist_ok=True)
     lines = left_out(experiment, found)
-    for method in found:
-        path = folder / f"{method.method}.yaml"
-        write_text(path, _text(method, experiment))
-        chosen = ", ".join(f"{name} {number(value)}" for name, value in method.settings[method.best].items())
-        lines.append(f"{path}: {chosen}")
+    for stem, settings, text in files:
+        path = folder / f"{stem}.yaml"
+        write_text(path, text)
+        lines.append(f"{path}: " + ", ".join(f"{name} {number(value)}" for name, value in settings.items()))
     return lines
 
 
-def _text(method: Tuning, experiment: Experiment) -> str:
-    """The content of a method's file."""
+def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], str]:
+    """The name, the settings and the content of a method's file."""
     records = [record for record in experiment.records if record["method"] == SPACE + method.method]
+    over = f"on {method.validation.shape[1]} validation runs"
+    head = _head(method, records, method.best, method.scores, space=f"space/{method.method}", over=over)
+    settings = method.settings[method.best]
+    body = _yaml({"label": f"{method.label}, tuned"}, settings)
+    return method.method, settings, head + BASE.format(method=method.method) + body
+
+
+def _shared(methods: list[Tuning], experiment: Experiment) -> tuple[str, dict[str, Any], str]:
+    """The name, the settings and the content of the file of all methods."""
+    best, first = best_of_all(methods), methods[0]
+    over = f"on {first.validation.shape[1]} validation runs\n# of each of {_names(m.method for m in methods)},"
+    scores = np.mean([method.scores for method in methods], axis=0)
+    head = _head(first, experiment.records, best, scores, space="_drawn", over=over)
+    return SHARED, first.settings[best], head + _yaml({}, first.settings[best])
+
+
+def _head(
+    method: Tuning, records: list[Record], best: int, scores: Float[np.ndarray, " draws"], *, space: str, over: str
+) -> str:
+    """What was drawn, chosen, and from which runs."""
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
-    head = HEAD.format(
-        draw=method.draws[method.best],
-        draws=len(method.draws),
-        method=method.method,
-        runs=method.validation.shape[1],
-        best=number(np.exp(method.scores[method.best])),
-        middle=number(np.exp(np.median(method.scores))),
+    return HEAD.format(
+        **{"draw": method.draws[best], "draws": len(method.draws), "space": space, "over": over},
+        best=number(np.exp(scores[best])),
+        middle=number(np.exp(np.median(scores))),
         scale=_names(record["config"]["scale"]["name"] for record in records),
         families=_names(record["config"]["dataset"]["name"] for record in records),
         commit=_names(commits),
         loss=f", all under {loss}" if (loss := _names([shared_loss(records)])) else "",
     )
-    node = OmegaConf.create({"label": f"{method.label}, tuned"})
-    for name, value in method.settings[method.best].items():
+
+
+def _yaml(first: dict[str, Any], settings: dict[str, Any]) -> str:
+    """Settings by dotted key, behind other keys, as YAML."""
+    node = OmegaConf.create(first)
+    for name, value in settings.items():
         OmegaConf.update(node, name, value)
-    return head + OmegaConf.to_yaml(node)
+    return OmegaConf.to_yaml(node)
 
 
 def _names(found: Iterable[Any]) -> str:
@@ -98,10 +133,13 @@ def _names(found: Iterable[Any]) -> str:
 def main(arguments: list[str]) -> int:
     """Writes the files and prints a line for each."""
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__.split("\n\n")[1])
-    kind = "which sweep is read"
+    kind = "which sweep is read; of tuning_one_loss one setting is written for all methods"
     parser.add_argument("--experiment", choices=SELECTIONS, default=TUNING.experiment, help=kind)
     parser.add_argument("--results", type=Path, default=Path("results"), metavar="FOLDER", help="results folder")
-    folder = "where the files go: conf/method/tuned to use them as +method=tuned/NAME; without it, RESULTS/tuned"
+    folder = (
+        "where the files go: conf/method/tuned to use them as +method=tuned/NAME, conf/method for that of "
+        "tuning_one_loss; without it, RESULTS/tuned"
+    )
     parser.add_argument("--into", type=Path, metavar="FOLDER", help=folder)
     options = parser.parse_args(arguments)
     try:

@@ -97,7 +97,7 @@ def build_part(config: DictConfig, part: str):
 def test_no_yaml_lies_where_it_is_not_looked_for():
     assert {path.relative_to(CONF) for path in CONF.rglob("*.yaml")} == {
         path.relative_to(CONF)
-        for folder in (".", "*", "hydra/launcher", "method/space", "method/tuned", "method/one_loss")
+        for folder in (".", "*", "hydra/launcher", "method/space", "method/tuned")
         for path in CONF.glob(f"{folder}/*.yaml")
     }
     assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]

@@ -182,7 +182,7 @@ SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf
 
 def own_methods(folder: Path) -> None:
     """Two methods with search spaces, of which one has been tuned."""
-    files = {"": "label: Mine\n", "space": SPACE, "tuned": "label: Mine, tuned\n", "one_loss": "label: Mine, tuned\n"}
+    files = {"": "label: Mine\n", "space": SPACE, "tuned": "label: Mine, tuned\n"}
     for name, of in (("mine_mask", files), ("mine_untuned", {"": files[""], "space": SPACE})):
         for part, text in of.items():
             path = folder / "method" / part / f"{name}.yaml"
@@ -202,9 +202,6 @@ def test_the_tuning_has_all_spaces_but_slow_ones_and_the_methods_that_were_tuned
     assert methods.index("tuned/mine_mask") == methods.index("mine_mask") + 1
     assert "mine_untuned" not in methods
     assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_mask"}
-    plan, _ = swept("+experiment=one_loss", "task.points=20", "scale=smoke", folder=tmp_path / "own")
-    methods = {cell.method for cell in plan.cells}
-    assert "one_loss/mine_mask" in methods and {name.split("/")[0] for name in methods} == {"one_loss"}
 
 
 def test_slow_methods_join_the_tuning_by_the_command_that_its_file_names(swept):

@@ -22,9 +22,9 @@ def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
                 write_run(
                     results,
                     "one_loss",
-                    f"{renderer} with mask, tuned",
+                    f"{renderer} with mask",
                     **{"task": "completion", "dataset": name, "renderer": renderer},
-                    **{"method": f"one_loss/{renderer}_mask", "status": "ok" if ok else "empty"},
+                    **{"method": f"{renderer}_mask", "status": "ok" if ok else "empty"},
                     metrics={"chamfer_l2": error} if ok else {},
                     evaluations={"value": values},
                     seconds={"forward": seconds / 2, "backward": seconds / 2},

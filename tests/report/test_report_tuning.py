@@ -145,16 +145,45 @@ def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
     assert set(node) == {"defaults", "label", "task", "renderer"}
 
 
-def test_another_sweep_is_read_by_its_name_and_needs_no_test_shapes(tmp_path, capsys):
+def test_under_one_loss_the_draw_that_is_best_over_all_methods_is_written_as_one_file(tmp_path, capsys):
     hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
-    drawn(tmp_path, experiment="tuning_one_loss", errors={"validation": VALIDATION}, silhouette=hinge)
-    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 1
+    under = {"experiment": "tuning_one_loss", "silhouette": hinge}
+    drawn(tmp_path, errors={"validation": VALIDATION}, **under)
+    drawn(tmp_path, method="idr_mask", errors={"validation": (4.0, 9.0, 3.0, 1.5)}, **under)  # best is 1 or 3 alone
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "one")]) == 1
     capsys.readouterr()
     named = ["--experiment", "tuning_one_loss"]
     assert main([*named, "--results", str(tmp_path), "--into", str(tmp_path / "one")]) == 0
-    text = (tmp_path / "one" / "dist_mask.yaml").read_text()
-    assert "# Draw 1 of 4" in text and "of sofa, all under DIST's mask loss: 1.00, of the median draw" in text
-    assert OmegaConf.load(tmp_path / "one" / "dist_mask.yaml").renderer.steps == 11
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["_one_loss.yaml"]
+    text = (tmp_path / "one/_one_loss.yaml").read_text()
+    assert (
+        "# Draw 3 of 4 of method/_drawn" in text
+        and "on 6 validation runs\n# of each of dist_mask and idr_mask," in text
+    )
+    assert "of sofa, all under DIST's mask loss: 1.73, of the median draw 3.00" in text
+    assert OmegaConf.to_container(OmegaConf.load(tmp_path / "one/_one_loss.yaml")) == {
+        "task": {"optimiser": {"learning_rate": 0.02}},
+        "renderer": {"steps": 13},
+    }
+
+
+def test_under_one_loss_a_failed_run_counts_before_errors(tmp_path):
+    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}}
+    drawn(tmp_path, **errors)
+    drawn(tmp_path, method="idr_mask", failed={("validation", 1, 2)}, **errors)
+    write(tmp_path, tmp_path, name="tuning_one_loss")
+    assert OmegaConf.load(tmp_path / "_one_loss.yaml").task.optimiser.learning_rate == 0.02
+
+
+def test_one_setting_is_refused_where_methods_drew_settings_of_their_own(tmp_path):
+    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}}
+    drawn(tmp_path, **errors)
+    drawn(tmp_path, method="idr_mask", **errors)
+    for path in tmp_path.glob("runs/*/record.json"):
+        if "space/idr_mask" in (text := path.read_text()):
+            path.write_text(text.replace('"steps"', '"samples"'))
+    with pytest.raises(ValueError, match="sweep over methods without a search space"):
+        write(tmp_path, tmp_path, name="tuning_one_loss")
 
 
 def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):

@@ -130,6 +130,21 @@ def tunings(experiment: Experiment) -> list[Tuning]:
     return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
 
 
+def best_of_all(methods: list[Tuning]) -> int:
+    """The place of the draw that is best over all methods: by its failures, then by the mean logarithmic error.
+
+    Raises:
+        ValueError: where methods have drawn settings that the others do not share.
+    """
+    if any(method.settings != methods[0].settings for method in methods):
+        raise ValueError(
+            "the methods differ in their drawn settings, and one setting is asked for all of them: sweep over methods "
+            "without a search space of their own"
+        )
+    scores, failures = (np.mean([getattr(m, name) for m in methods], axis=0) for name in ("scores", "failures"))
+    return int(np.lexsort((scores, failures))[0])
+
+
 def left_out(experiment: Experiment, methods: list[Tuning]) -> list[str]:
     """A note of the draws that some runs have, and that no method is read on; none where there are none."""
     used = {draw for method in methods for draw in method.draws}

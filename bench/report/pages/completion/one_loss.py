@@ -1,4 +1,4 @@
-"""Every renderer under one loss of the mask, each at its tuned setting: errors, ratios, and error over cost."""
+"""Every renderer under one loss of the mask, at one tuned setting: errors, ratios, and error over cost."""
 
 import math
 from typing import Any
@@ -21,10 +21,8 @@ from bench.report.write.table import Column, estimate, text, to_data, to_table
 
 PLACE = 21
 READS = (Selection("one_loss", ("completion",), ("dataset", "task"), ("points",)),)
-FOLDER = "one_loss/"  # of the presets that `python -m bench.tune` writes
-REFERENCE = "one_loss/dist_mask"
-QUESTION = "How do all renderers compare under one loss, each tuned?"
-TUNED = ", tuned"  # end of the name of every row
+REFERENCE = "dist_mask"
+QUESTION = "How do all renderers compare under one loss and one setting?"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}
 UNITS = {"evaluations": "values", "seconds": "seconds"}
 NOTES = (
@@ -33,11 +31,10 @@ NOTES = (
     "On a front, filled in the figure: no other row has a smaller error for a smaller cost. A bound of range analysis "
     "counts as three field values; seconds depend on the machine.",
     "Under this loss a renderer is its hits, their distances and the least value along each ray. Opacities and bands "
-    "take no part, so that Relaxed boundary is IDR with more steps: what these two differ by is the noise of the "
-    "choice of settings and of the fits, which the intervals, over shapes, do not contain.",
-    "Settings: conf/method/one_loss, chosen on validation shapes by `python -m bench.tune` under the same loss; their "
-    "first lines say from which runs. At desk these are 6 draws, each on 4 runs of sofas and planes from 20 points. "
-    "What a search space has for a renderer's own loss (`mask_sharpness`, `occupancy_width`) has no effect here.",
+    "take no part, so that Relaxed boundary is IDR with more steps.",
+    "Rates and weights, one setting for all rows: conf/method/_one_loss.yaml, the draw that is best over some of the "
+    "methods on validation shapes (`python -m bench.tune`); its first lines say from which runs. What only one "
+    "renderer has, such as samples and sharpness, stands at its default.",
 )
 Line = dict[str, Any]
 
@@ -60,7 +57,7 @@ def make(experiment: Experiment) -> Result:
     ]
     return Result(
         experiment,
-        "Every renderer under one loss, each at its tuned setting.",
+        "Every renderer under one loss, at one tuned setting.",
         "Median error at each number of given depth points, the geometric mean of all errors, and the median cost.",
         interval="95 % intervals over shapes (Student's, of logarithms)",
         estimates=[line["error"] for line in lines],
@@ -101,7 +98,7 @@ def _line(experiment: Experiment, runs: Completions, name: str, row: Row) -> Lin
     reference = next((other for other in runs.rows if other.preset == REFERENCE), row)
     failures = [runs.failures(each, row) for each in families]
     return {
-        **{"family": name, "row": row.name.removesuffix(TUNED), "preset": row.preset.removeprefix(FOLDER)},
+        **{"family": name, "row": row.name, "preset": row.preset},
         **{points: _median(runs, families, row, points) for points in runs.points},
         "error": statistics.geometric(errors) if errors else statistics.Interval(math.nan, math.nan, math.nan),
         "ratio": None if row == reference else gap(*runs.pair(name, row, reference, finite=True)),
@@ -146,8 +143,8 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     best, quick = whole.loc[whole["error"].idxmin()], whole.loc[whole["seconds"].idxmin()]
     named = [f"({row['row']}, {format.seconds(row['seconds'])})" for row in (best, quick)]
     said = (
-        f"Under one loss and tuned, the least error × 1000 is *{best['error']:.3g}* {named[0]}; the quickest row has "
-        f"{quick['error']:.3g} {named[1]}."
+        f"Under one loss and one setting, the least error × 1000 is *{best['error']:.3g}* {named[0]}; the quickest row "
+        f"has {quick['error']:.3g} {named[1]}."
     )
     sure, all_known = excluding(whole, ["ratio"])
     if all_known:
