@@ -289,8 +289,12 @@ def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | li
     try:
         flat = OmegaConf.merge(schema, given)
     except OmegaConfBaseException as error:
-        wanted = _type_name(types.get(str(error.full_key).split(".")[0], ""))
-        raise ValueError(f"{name}.{error.full_key}: {str(error).splitlines()[0]} (expected {wanted})") from None
+        key = str(error.full_key).split(".")[0]
+        wanted = types.get(key, "")
+        if get_args(wanted)[1:] == (...,) and not OmegaConf.is_list(arguments[key]):
+            raise ValueError(f"{name}.{key} must be a list: write {name}.{key}=[{arguments[key]}]") from None
+        text = str(error).splitlines()[0]
+        raise ValueError(f"{name}.{error.full_key}: {text} (expected {_type_name(wanted)})") from None
     values: Any = OmegaConf.to_container(flat)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
     values |= {

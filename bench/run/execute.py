@@ -23,7 +23,7 @@ from bench.records.record import Record, RunStatus
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
-from bench.tasks.task import TakesField, Task
+from bench.tasks.task import Checks, TakesField, Task
 from renderers.checks import BadInput
 
 INTERVAL = 0.05  # least seconds between two messages on progress
@@ -112,6 +112,8 @@ def built(config: DictConfig, progress: Report) -> tuple[Task, RunInputs]:
         inputs = set_up(config, progress)
         if not inputs.field.of_prior and not isinstance(task, TakesField):
             raise ValueError(f"the task {type(task).__name__} does not take field={config.field}: leave it out")
+        if isinstance(task, Checks):
+            task.check(inputs)
     except (ValueError, OSError) as error:
         raise BadInput(reason_of(error)) from error
     return task, inputs

@@ -65,6 +65,9 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     single = OmegaConf.is_missing(HydraConfig.get().job, "num")
     if single and (config.plan or config.isolation == Isolation.process):  # a sweep's cells were checked before
         _check(config)
+    if single and HydraConfig.get().sweeper.get("params"):
+        whole = HydraConfig.get().runtime.choices["experiment"]
+        notice(f"note: this is one run; all runs of the table are python -m bench -m +experiment={whole}")
     if config.plan:
         return RunStatus.OK
     try:

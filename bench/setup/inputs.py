@@ -73,15 +73,21 @@ class RunInputs:
         with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
 
-    def fitted(self) -> Prior:
-        """The prior with the code of the scene's shape alone.
+    @property
+    def trained_code(self) -> int:
+        """The place of the scene's shape among the codes of the prior.
 
         Raises:
             BadInput: where the prior was not trained on that shape.
         """
         if self.trained is None:
-            raise BadInput("task renders a network at a shape it was fitted to: add +experiment=fitted")
-        return Prior(self.prior.decoder, self.prior.codes[self.trained : self.trained + 1])
+            raise BadInput("the task renders a network at the shape that it was fitted to: add +experiment=fitted")
+        return self.trained
+
+    def fitted(self) -> Prior:
+        """The prior with the code of the scene's shape alone; raises as `trained_code` does."""
+        code = self.trained_code
+        return Prior(self.prior.decoder, self.prior.codes[code : code + 1])
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from bench.machine.environment import gemm_peak, seconds_at_peak
 from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import counted
 from bench.tasks import workbench
 from bench.tasks.workbench import Clocked, Workbench
@@ -60,6 +60,10 @@ class Ablation:
         check_at_least("task.repeats", self.repeats, 1, "3 show the spread")
         check_at_least("task.smallest", self.smallest, 1, "8 always finishes")
         check_positive("task.wrong", self.wrong, "0.02 is 1 % of the unit sphere")
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput without a network that was fitted to the scene's shape."""
+        _ = inputs.trained_code
 
     def execute(self, run: RunContext) -> None:
         """Measures costs and errors, and writes them to the record, images.npz and a picture."""

@@ -8,7 +8,7 @@ from bench.evaluate.reference import reference_for
 from bench.machine.environment import using_threads
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.tasks import workbench
 from bench.tasks.workbench import Clocked, Workbench
 from renderers.checks import check_at_least, check_positive
@@ -51,6 +51,10 @@ class Benchmark:
         check_at_least("task.threads", self.threads, 1, "1 is steadiest")
         check_at_least("task.rounds", self.rounds, 1, "5 show the spread")
         check_positive("task.wrong", self.wrong, "0.02 is 1 % of the unit sphere")
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput without a network that was fitted to the scene's shape."""
+        _ = inputs.trained_code
 
     def execute(self, run: RunContext) -> None:
         """Writes the costs and errors of all renderers to the record, each under its name."""

@@ -19,7 +19,7 @@ from bench.evaluate.finite_differences import (
 )
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.records.record import RunStatus
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import slopes_at
 from bench.solve.problem import check_field_gradient, check_kind
 from renderers.boundary import check_gradients, rendered
@@ -90,6 +90,10 @@ class Gradients:
             if float(f"{blur:.0e}") != blur:
                 raise ValueError(f"task.blurs must have one digit each, not {blur:g}: it is part of a metric's name")
         check_positive("task.outline_shift", self.outline_shift, "0.1 moves it within a pixel")
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput without a network that was fitted to the scene's shape."""
+        _ = inputs.trained_code
 
     def execute(self, run: RunContext) -> None:
         """Compares the gradients, and fills the record."""

@@ -143,6 +143,11 @@ class Pose(PoseTask):
         StartSettings(self.starts, self.trial).check(self.optimiser.iterations)
         super().__post_init__()
 
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput where the shape is to be known by a network that was not fitted to it."""
+        if self.shape == "prior" and inputs.field.of_prior:
+            _ = inputs.trained_code
+
     def execute(self, run: RunContext) -> None:
         """Optimises the pose, and evaluates it before and after.
 

@@ -1,8 +1,8 @@
-"""The protocols of a task: `Task` for all, `TakesField` for tasks that accept any field for the unknown shape."""
+"""The protocols of a task: `Task` for all; `TakesField` where any field will do, `Checks` for others."""
 
 from typing import ClassVar, Protocol, runtime_checkable
 
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 
 
 @runtime_checkable
@@ -23,3 +23,12 @@ class TakesField(Protocol):
     """A task that works with any field, as set by `field=`, in place of a prior's code."""
 
     takes_field: ClassVar[bool]
+
+
+@runtime_checkable
+class Checks(Protocol):
+    """A task that not all inputs will do for, which is told before anything slow, and by `plan=true`."""
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput for inputs that the task cannot use."""
+        ...

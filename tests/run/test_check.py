@@ -63,6 +63,23 @@ def test_a_process_of_its_own_finds_the_same(plain):
     assert [bool(reason) for reason in found] == [False, True, True, True, True]
 
 
+@pytest.mark.parametrize("task", ["ablation", "benchmark", "gradients", "pose"])
+def test_a_task_on_a_fitted_network_is_refused_without_one(plain, task):
+    shape = ("task.shape=prior",) if task == "pose" else ()
+    cells = [plain(f"task={task}", *shape), plain("+experiment=fitted", f"task={task}", *shape)]
+    assert [reason[-24:] for reason in refusals(cells, Isolation.off)] == ["to: add +experiment=fitted"[-24:], ""]
+
+
+def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
+    shown = command("+experiment=fig10_start", "plan=true", *SMALL, f"results_dir={tmp_path}")
+    assert "this is one run" in shown.err and "python -m bench -m +experiment=fig10_start" in shown.err
+    whole = [
+        command(*args, "plan=true", *SMALL, f"results_dir={tmp_path}")
+        for args in (["-m", "+experiment=fig10_start"], [])
+    ]
+    assert [done.code for done in whole] == [0, 0] and not any("one run" in done.err for done in whole)
+
+
 def test_a_single_run_is_checked_before_what_its_run_alone_takes_is_loaded(plain):
     modules = needed(plain("renderer=dvr", "task=pose", "dataset=sphere"))
     assert modules == ["bench", "bench.run.execute", "bench.tasks.pose", "renderers", "datasets.families"]
