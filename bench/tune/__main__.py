@@ -95,7 +95,8 @@ def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], s
 def _shared(methods: list[Tuning], experiment: Experiment) -> tuple[str, dict[str, Any], str]:
     """The name, the settings and the content of the file of all methods."""
     best, first = best_of_all(methods), methods[0]
-    over = f"on {first.validation.shape[1]} validation runs\n# of each of {_names(m.method for m in methods)},"
+    names = ", ".join(method.method for method in methods)
+    over = f"on {first.validation.shape[1]} validation runs\n# of each of {names},"
     scores = np.mean([method.scores for method in methods], axis=0)
     head = _head(first, experiment.records, best, scores, space="_drawn", over=over)
     return SHARED, first.settings[best], head + _yaml({}, first.settings[best])

@@ -157,8 +157,7 @@ def test_under_one_loss_the_draw_that_is_best_over_all_methods_is_written_as_one
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["_one_loss.yaml"]
     text = (tmp_path / "one/_one_loss.yaml").read_text()
     assert (
-        "# Draw 3 of 4 of method/_drawn" in text
-        and "on 6 validation runs\n# of each of dist_mask and idr_mask," in text
+        "# Draw 3 of 4 of method/_drawn" in text and "on 6 validation runs\n# of each of dist_mask, idr_mask," in text
     )
     assert "of sofa, all under DIST's mask loss: 1.73, of the median draw 3.00" in text
     assert OmegaConf.to_container(OmegaConf.load(tmp_path / "one/_one_loss.yaml")) == {
