@@ -135,20 +135,18 @@ class Gradients:
         distance: Float[Tensor, " m"],
         directions: Float[Tensor, "code_length directions"],
     ) -> dict[str, float]:
-        """The metrics of one band."""
+        """The metrics of distances in one band."""
         if not pixels.numel():
-            return {"pixels": 0, "excluded": 0}
+            return _compared({}, pixels.bool())
         truth: Differences = differences(
             subject.decoder, subject.code, directions, camera=subject.camera, pixels=pixels, distance=distance
         )
-        by_code, by_camera, found, hit = subject.gradients(pixels)
+        (by_code, by_camera), found, hit = subject.gradients(pixels)
         valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
-        numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
-        if valid.any():
-            numbers |= _compare((by_code @ directions)[valid], truth.code[valid], "code")
-            if subject.renderer.capabilities.ray_gradient:
-                numbers |= _compare(by_camera[valid], truth.camera[valid], "camera")
-        return numbers
+        pairs = {"code": (by_code.squeeze(1) @ directions, truth.code)}
+        if subject.renderer.capabilities.ray_gradient:
+            pairs["camera"] = (by_camera.squeeze(1), truth.camera)
+        return _compared(pairs, valid)
 
     def _evaluate_colours(
         self,
@@ -160,20 +158,17 @@ class Gradients:
     ) -> dict[str, float]:
         """The metrics of colours at the hits."""
         if not pixels.numel():
-            return {"pixels": 0, "excluded": 0}
+            return _compared({}, pixels.bool())
         paint = Paint.drawn(generator)
         truth = colour_differences(
             subject.decoder, subject.code, directions, paint, camera=subject.camera, pixels=pixels, distance=distance
         )
-        by_code, by_camera, by_weight, found, hit = subject.colour_gradients(pixels, paint)
+        (by_code, by_camera, by_weight), found, hit = subject.gradients(pixels, paint)
         valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
-        numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
-        if valid.any():
-            numbers |= _compare((by_code @ directions)[valid].flatten(0, 1), truth.code[valid].flatten(0, 1), "code")
-            numbers |= _compare(by_weight[valid].flatten(0, 1), truth.texture[valid].flatten(0, 1), "texture")
-            if subject.renderer.capabilities.ray_gradient:
-                numbers |= _compare(by_camera[valid].flatten(0, 1), truth.camera[valid].flatten(0, 1), "camera")
-        return numbers
+        pairs = {"code": (by_code @ directions, truth.code), "texture": (by_weight, truth.texture)}
+        if subject.renderer.capabilities.ray_gradient:
+            pairs["camera"] = (by_camera, truth.camera)
+        return _compared(pairs, valid)
 
     def _evaluate_outline(
         self, subject: "Subject", pixels: Int[Tensor, " m"], directions: Float[Tensor, "code_length directions"]
@@ -227,22 +222,34 @@ class Subject:
         return ((found - distance).abs() < NEAR) | falls
 
     def gradients(
-        self, pixels: Int[Tensor, " m"]
-    ) -> tuple[Float[Tensor, "m code_length"], Float[Tensor, "m 6"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
-        """For each pixel the gradients of its distance for code and camera, the distance, and whether it hits."""
+        self, pixels: Int[Tensor, " m"], paint: Paint | None = None
+    ) -> tuple[list[Float[Tensor, "m seen _"]], Float[Tensor, " m"], Bool[Tensor, " m"]]:
+        """For each pixel the gradients of what is seen, the distance, and whether it hits.
+
+        What is seen is the distance, or with a paint the three colours of it at the renderer's points, by the field's
+        gradients there, as a reconstruction asks for them. Its gradients are those for code, camera and paint.
+        """
         code = self.code.clone().requires_grad_(True)
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        weights = [] if paint is None else [paint.weights.clone().requires_grad_(True)]
         rays = self.camera.moved(twist).rays().flat()
-        rendering = rendered(self.renderer, Meter(self.decoder.at(code), self.counts), rays[pixels])
-        by_code = torch.zeros(len(pixels), len(code), dtype=torch.float64)
-        by_camera = torch.zeros(len(pixels), 6, dtype=torch.float64)
-        for row in rendering.hit.nonzero().squeeze(-1).tolist():
-            found = torch.autograd.grad(rendering.distance[row], (code, twist), retain_graph=True, allow_unused=True)
-            check_gradients(self.renderer, *found)
-            for table, gradient in zip((by_code, by_camera), found, strict=True):
-                if gradient is not None:
-                    table[row] = gradient
-        return by_code, by_camera, rendering.distance.detach(), rendering.hit
+        field = Meter(self.decoder.at(code), self.counts)
+        rendering = rendered(self.renderer, field, rays[pixels])
+        rows = rendering.hit.nonzero().squeeze(-1)
+        seen = rendering.distance[rows, None]
+        if paint is not None:
+            points = rendering.points[rows]
+            seen = Paint(*weights)(points, slopes_at(field, points)) if len(rows) else seen.expand(-1, 3)
+        parameters = (code, twist, *weights)
+        tables = [torch.zeros(len(pixels), seen.shape[1], len(one), dtype=torch.float64) for one in parameters]
+        for place, row in enumerate(rows.tolist()):
+            for part, output in enumerate(seen[place]):
+                found = torch.autograd.grad(output, parameters, retain_graph=True, allow_unused=True)
+                check_gradients(self.renderer, *found[:2])
+                for table, gradient in zip(tables, found, strict=True):
+                    if gradient is not None:
+                        table[row, part] = gradient
+        return tables, rendering.distance.detach(), rendering.hit
 
     def image_gradients(
         self, rays: Rays, directions: Float[Tensor, "code_length directions"]
@@ -258,41 +265,6 @@ class Subject:
         (gradient,) = torch.autograd.grad(_seen(rendering, rays), shift, weights, create_graph=True)
         columns = [torch.autograd.grad(part, weights, retain_graph=True)[0] for part in gradient]
         return torch.stack(columns, dim=-1)
-
-    def colour_gradients(
-        self, pixels: Int[Tensor, " m"], paint: Paint
-    ) -> tuple[
-        Float[Tensor, "m 3 code_length"],
-        Float[Tensor, "m 3 6"],
-        Float[Tensor, "m 3 weights"],
-        Float[Tensor, " m"],
-        Bool[Tensor, " m"],
-    ]:
-        """For each pixel the gradients of its colours for code, camera and paint, the distance, and whether it hits.
-
-        The colours are those of the paint at the renderer's points, by the field's gradients there, as a
-        reconstruction asks for them.
-        """
-        code, weights = (one.clone().requires_grad_(True) for one in (self.code, paint.weights))
-        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        rays = self.camera.moved(twist).rays().flat()
-        field = Meter(self.decoder.at(code), self.counts)
-        rendering = rendered(self.renderer, field, rays[pixels])
-        tables = [torch.zeros(len(pixels), 3, len(one), dtype=torch.float64) for one in (code, twist, weights)]
-        rows = rendering.hit.nonzero().squeeze(-1)
-        points = rendering.points[rows]
-        if len(rows):
-            normals = slopes_at(field, points)
-            colours = Paint(weights)(points, normals)
-            for place, row in enumerate(rows.tolist()):
-                for channel in range(3):
-                    found = torch.autograd.grad(
-                        colours[place, channel], (code, twist, weights), retain_graph=True, allow_unused=True
-                    )
-                    for table, gradient in zip(tables, found, strict=True):
-                        if gradient is not None:
-                            table[row, channel] = gradient
-        return *tables, rendering.distance.detach(), rendering.hit
 
 
 def _visibility(
@@ -322,6 +294,16 @@ def _seen(rendering: Rendering, rays: Rays) -> Float[Tensor, "*rays"]:
         return torch.where(rendering.hit, rendering.distance, leave)
     beside = rendering.volume.distance - leave.flatten()[rendering.volume.ray]
     return leave + rendering.volume.summed(beside, leave.numel()).view(leave.shape)
+
+
+def _compared(
+    pairs: dict[str, tuple[Float[Tensor, "m *seen _"], Float[Tensor, "m *seen _"]]], valid: Bool[Tensor, " m"]
+) -> dict[str, float]:
+    """The metrics of the valid pixels' gradients, found and true, and how many are valid."""
+    numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
+    for name, (found, true) in pairs.items() if valid.any() else ():
+        numbers |= _compare(found[valid].flatten(0, -2), true[valid].flatten(0, -2), name)
+    return numbers
 
 
 def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str) -> dict[str, float]:
