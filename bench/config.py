@@ -291,7 +291,7 @@ def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | li
     except OmegaConfBaseException as error:
         key = str(error.full_key).split(".")[0]
         wanted = types.get(key, "")
-        if get_args(wanted)[1:] == (...,) and not OmegaConf.is_list(arguments[key]):
+        if get_args(wanted)[1:] == (...,) and isinstance(arguments[key], str | int | float):
             raise ValueError(f"{name}.{key} must be a list: write {name}.{key}=[{arguments[key]}]") from None
         text = str(error).splitlines()[0]
         raise ValueError(f"{name}.{error.full_key}: {text} (expected {_type_name(wanted)})") from None

@@ -74,8 +74,10 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
         without: names of methods that are left out.
 
     Raises:
-        ValueError: for such a name that has no search space.
+        ValueError: for such a name that has no search space, and for another kind.
     """
+    if kind not in ("space", "tuned"):
+        raise ValueError(f"${{methods:KIND}} has the kinds space and tuned, not {kind!r}")
     folders = [folder / "method" for folder in _folders(_root_.hydra.runtime)]
     names = sorted({path.stem for folder in folders for path in (folder / "space").glob("*.yaml")})
     if unknown := {*without} - {*names}:

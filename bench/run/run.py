@@ -66,8 +66,7 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
     if single and (config.plan or config.isolation == Isolation.process):  # a sweep's cells were checked before
         _check(config)
     if single and HydraConfig.get().sweeper.get("params"):
-        whole = HydraConfig.get().runtime.choices["experiment"]
-        notice(f"note: this is one run; all runs of the table are python -m bench -m +experiment={whole}")
+        notice("note: this is one run; with -m in the command it is all runs of the table")
     if config.plan:
         return RunStatus.OK
     try:

@@ -73,8 +73,7 @@ class RunInputs:
         with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
 
-    @property
-    def trained_code(self) -> int:
+    def check_fitted(self) -> int:
         """The place of the scene's shape among the codes of the prior.
 
         Raises:
@@ -85,8 +84,8 @@ class RunInputs:
         return self.trained
 
     def fitted(self) -> Prior:
-        """The prior with the code of the scene's shape alone; raises as `trained_code` does."""
-        code = self.trained_code
+        """The prior with the code of the scene's shape alone; raises as `check_fitted` does."""
+        code = self.check_fitted()
         return Prior(self.prior.decoder, self.prior.codes[code : code + 1])
 
 

@@ -63,7 +63,7 @@ class Ablation:
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
-        _ = inputs.trained_code
+        inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
         """Measures costs and errors, and writes them to the record, images.npz and a picture."""

@@ -54,7 +54,7 @@ class Benchmark:
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
-        _ = inputs.trained_code
+        inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
         """Writes the costs and errors of all renderers to the record, each under its name."""

@@ -93,7 +93,7 @@ class Gradients:
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
-        _ = inputs.trained_code
+        inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
         """Compares the gradients, and fills the record."""
@@ -245,7 +245,8 @@ class Subject:
         for place, row in enumerate(rows.tolist()):
             for part, output in enumerate(seen[place]):
                 found = torch.autograd.grad(output, parameters, retain_graph=True, allow_unused=True)
-                check_gradients(self.renderer, *found[:2])
+                if paint is None:
+                    check_gradients(self.renderer, *found)
                 for table, gradient in zip(tables, found, strict=True):
                     if gradient is not None:
                         table[row, part] = gradient
@@ -301,7 +302,9 @@ def _compared(
 ) -> dict[str, float]:
     """The metrics of the valid pixels' gradients, found and true, and how many are valid."""
     numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
-    for name, (found, true) in pairs.items() if valid.any() else ():
+    if not valid.any():
+        return numbers
+    for name, (found, true) in pairs.items():
         numbers |= _compare(found[valid].flatten(0, -2), true[valid].flatten(0, -2), name)
     return numbers
 

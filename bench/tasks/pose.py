@@ -146,7 +146,7 @@ class Pose(PoseTask):
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput where the shape is to be known by a network that was not fitted to it."""
         if self.shape == "prior" and inputs.field.of_prior:
-            _ = inputs.trained_code
+            inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
         """Optimises the pose, and evaluates it before and after.

@@ -31,10 +31,11 @@ NOTES = (
     "On a front, filled in the figure: no other row has a smaller error for a smaller cost. A bound of range analysis "
     "counts as three field values; seconds depend on the machine.",
     "Under this loss a renderer is its hits, their distances and the least value along each ray. Opacities and bands "
-    "take no part, so that Relaxed boundary is IDR with more steps.",
+    "take no part, so that Relaxed boundary is IDR with more steps: what these two differ by is close to the noise of "
+    "the fits, which the intervals, over shapes, do not contain.",
     "Rates and weights, one setting for all rows: conf/method/_one_loss.yaml, the draw that is best over some of the "
-    "methods on validation shapes (`python -m bench.tune`); its first lines say from which runs. What only one "
-    "renderer has, such as samples and sharpness, stands at its default.",
+    "methods on validation shapes (`python -m bench.tune`); its first lines say from which runs. What "
+    "belongs to a renderer, such as steps, samples and sharpness, stands at its default.",
 )
 Line = dict[str, Any]
 
