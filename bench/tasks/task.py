@@ -1,4 +1,4 @@
-"""The protocols of a task: `Task` for all; `TakesField` where any field will do, `Checks` for others."""
+"""The protocols of a task: `Task` for all; `TakesField` where any field will do, `Checks` where not all inputs will."""
 
 from typing import ClassVar, Protocol, runtime_checkable
 

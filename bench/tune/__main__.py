@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from omegaconf import OmegaConf
 
 from bench.records.files import is_plain_name, write_text
@@ -25,8 +24,8 @@ from bench.report.data.subjects.tuning import (
     SPACE,
     TUNING,
     Tuning,
-    best_of_all,
     left_out,
+    pooled,
     tunings,
     unfinished,
 )
@@ -86,7 +85,7 @@ def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], s
     """The name, the settings and the content of a method's file."""
     records = [record for record in experiment.records if record["method"] == SPACE + method.method]
     over = f"on {method.validation.shape[1]} validation runs"
-    head = _head(method, records, method.best, method.scores, space=f"space/{method.method}", over=over)
+    head = _head(method, records, space=f"space/{method.method}", over=over)
     settings = method.settings[method.best]
     body = _yaml({"label": f"{method.label}, tuned"}, settings)
     return method.method, settings, head + BASE.format(method=method.method) + body
@@ -94,23 +93,20 @@ def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], s
 
 def _shared(methods: list[Tuning], experiment: Experiment) -> tuple[str, dict[str, Any], str]:
     """The name, the settings and the content of the file of all methods."""
-    best, first = best_of_all(methods), methods[0]
-    names = ", ".join(method.method for method in methods)
-    over = f"on {first.validation.shape[1]} validation runs\n# of each of {names},"
-    scores = np.mean([method.scores for method in methods], axis=0)
-    head = _head(first, experiment.records, best, scores, space="_drawn", over=over)
-    return SHARED, first.settings[best], head + _yaml({}, first.settings[best])
+    all_of_them = pooled(methods)
+    over = f"on {methods[0].validation.shape[1]} validation runs\n# of each of {all_of_them.method},"
+    head = _head(all_of_them, experiment.records, space="_drawn", over=over)
+    settings = all_of_them.settings[all_of_them.best]
+    return SHARED, settings, head + _yaml({}, settings)
 
 
-def _head(
-    method: Tuning, records: list[Record], best: int, scores: Float[np.ndarray, " draws"], *, space: str, over: str
-) -> str:
+def _head(method: Tuning, records: list[Record], *, space: str, over: str) -> str:
     """What was drawn, chosen, and from which runs."""
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
     return HEAD.format(
-        **{"draw": method.draws[best], "draws": len(method.draws), "space": space, "over": over},
-        best=number(np.exp(scores[best])),
-        middle=number(np.exp(np.median(scores))),
+        **{"draw": method.draws[method.best], "draws": len(method.draws), "space": space, "over": over},
+        best=number(np.exp(method.scores[method.best])),
+        middle=number(np.exp(np.median(method.scores))),
         scale=_names(record["config"]["scale"]["name"] for record in records),
         families=_names(record["config"]["dataset"]["name"] for record in records),
         commit=_names(commits),

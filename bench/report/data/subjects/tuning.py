@@ -130,8 +130,8 @@ def tunings(experiment: Experiment) -> list[Tuning]:
     return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
 
 
-def best_of_all(methods: list[Tuning]) -> int:
-    """The place of the draw that is best over all methods: by its failures, then by the mean logarithmic error.
+def pooled(methods: list[Tuning]) -> Tuning:
+    """The draws of methods that drew the same settings as those of one, with the runs of all of them.
 
     Raises:
         ValueError: where methods have drawn settings that the others do not share.
@@ -141,8 +141,18 @@ def best_of_all(methods: list[Tuning]) -> int:
             "the methods differ in their drawn settings, and one setting is asked for all of them: sweep over methods "
             "without a search space of their own"
         )
-    scores, failures = (np.mean([getattr(m, name) for m in methods], axis=0) for name in ("scores", "failures"))
-    return int(np.lexsort((scores, failures))[0])
+    return replace(
+        methods[0],
+        method=", ".join(method.method for method in methods),
+        label=", ".join(method.label for method in methods),
+        validation=np.concatenate([method.validation for method in methods], axis=1),
+        test=np.concatenate([method.test for method in methods], axis=1),
+        failures=np.sum([method.failures for method in methods], axis=0),
+        failed=sum(method.failed for method in methods),
+        runs=sum(method.runs for method in methods),
+        test_runs=[run for method in methods for run in method.test_runs],
+        evaluations=[median_of_known(each) for each in zip(*(method.evaluations for method in methods), strict=True)],
+    )
 
 
 def left_out(experiment: Experiment, methods: list[Tuning]) -> list[str]:
