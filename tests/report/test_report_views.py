@@ -152,7 +152,8 @@ def test_figure_10_varies_one_condition_at_a_time(tmp_path):
     result = made(tmp_path, fig10)
     medians = dict(zip(result.table["Condition"], result.table["Median"], strict=True))
     focal, noise = (one.label for one in fig10.CONDITIONS)
-    assert medians == {f"{focal}: 0.5": "3.00", f"{focal}: 1": "1.00", f"{noise}: 1": "1.00", f"{noise}: 2": "5.00"}
+    shown = {f"{focal}: 0.5": 3, f"{focal}: 1": 1, f"{noise}: 1": 1, f"{noise}: 2": 5}
+    assert medians == {condition: f"{value}.00 (n = 1)" for condition, value in shown.items()}
     assert len(result.data) == 4
 
 
@@ -166,10 +167,10 @@ def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_pat
     result = made(tmp_path, fig12)
     table = result.table.set_index("Condition")
     assert table.loc["rotation (degrees): 20", "Success"] == "2 of 4 (n = 4)"  # a failed run is no success
-    assert table.loc["rotation (degrees): 20", "Median"] == "1.00"
+    assert table.loc["rotation (degrees): 20", "Median"] == "1.00 (n = 4)"
     neutral = ["shift (scene units): 0", "rotation (degrees): 0", "size / true size: 1"]
     assert table.loc[neutral, "Success"].tolist() == ["1 of 1 (n = 1)"] * 3
-    assert table.loc["place known", "Median"] == "4.00"
+    assert table.loc["place known", "Median"] == "4.00 (n = 1)"
     assert len(table) == 5
     assert not any(4.0 in line.get_ydata() for axis in result.figure.axes for line in axis.lines)
     assert all(1.0 in line.get_ydata() for axis in result.figure.axes for line in axis.lines[-1:])
@@ -221,14 +222,14 @@ def test_few_shapes_are_drawn_as_points_and_six_as_a_band(tmp_path):
     axis = result.figure.axes[0]
     small = [line for line in axis.lines if line.get_markersize() == 2]
     assert sorted(small[0].get_ydata()) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert result.table["95 % interval"].tolist() == ["(n = 5)"] * len(result.table)
+    assert result.table["Median"].tolist() == ["3.00 (n = 5)"] * len(result.table)
     assert "fewer than six shapes: points, no interval" in result.caption
     for focal in (0.5, 1.0):
         found(tmp_path, "fig10", "DIST", 6.0, index=5, focal=focal)
     result = made(tmp_path, fig10)
     axis = result.figure.axes[0]
     assert not [line for line in axis.lines if line.get_markersize() == 2] and axis.collections
-    assert result.table["95 % interval"].tolist() == ["[1.00, 6.00]"] * len(result.table)
+    assert result.table["Median"].tolist() == ["3.50 [1.00, 6.00]"] * len(result.table)
     assert "95 % bootstrap intervals over shapes." in result.caption  # one seed: no word of seeds
 
 

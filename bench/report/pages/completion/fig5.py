@@ -155,9 +155,11 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     ends = medians.sort_values("iteration").groupby("row", sort=False)["chamfer_l2"].last().sort_values()
     if not len(ends):
         return Answer("What is gained in each iteration?")
+    fewest, most = int(medians["n"].min()), int(medians["n"].max())
+    more = f" at least, {most} at most" if most > fewest else ""
     said = (
         f"{ends.index[0]} ends with the lowest median error, *{format.number(ends.iloc[0], SCALE)}* (Chamfer × "
-        f"1000), {ends.index[-1]} with {format.number(ends.iloc[-1], SCALE)}."
+        f"1000), {ends.index[-1]} with {format.number(ends.iloc[-1], SCALE)}; n = {fewest} runs a row{more}."
     )
     panels, presets = [], presets_of(data)
     for value, label, factor in (("total", "loss", 1.0), ("chamfer_l2", "Chamfer × 1000", SCALE)):

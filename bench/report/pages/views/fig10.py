@@ -10,7 +10,7 @@ from bench.report.data.records import ONE_WAY
 from bench.report.write.answer import Answer
 from bench.report.write.conditions import draw
 from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, Column, configured, metrics, shown, text, to_data, to_table
+from bench.report.write.table import FAMILY, IDENTITY, configured, estimate, metrics, text, to_data, to_table
 
 PLACE = 50
 CONDITIONS = (
@@ -29,8 +29,8 @@ RUNS = (
     *metrics(ONE_WAY, "chamfer_l2"),
 )
 COLUMNS = (
-    *(text("family", "Family"), text("method", "Method"), text("condition", "Condition"), Column("median", "Median")),
-    shown("95 % interval", lambda line: line["error"].ends()),
+    *(text("family", "Family"), text("method", "Method"), text("condition", "Condition")),
+    *estimate("error", "Median"),
 )
 
 
@@ -38,8 +38,7 @@ def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per family, method and value of a condition."""
     errors = {cell: middle(records) for cell, records in cells(experiment, CONDITIONS).items()}
     lines = [
-        {"family": name, "method": row.name, "condition": f"{one.label}: {value:g}"}
-        | {"median": error.value, "error": error}
+        {"family": name, "method": row.name, "condition": f"{one.label}: {value:g}", "error": error}
         for (name, row, one, value), error in errors.items()
     ]
     return Result(

@@ -16,11 +16,10 @@ from bench.report.write.result import Result
 from bench.report.write.table import (
     FAMILY,
     IDENTITY,
-    Column,
     configured,
     counted,
+    estimate,
     metrics,
-    shown,
     text,
     to_data,
     to_table,
@@ -49,8 +48,7 @@ RUNS = (
 )
 COLUMNS = (
     *(text("family", "Family"), text("method", "Method"), text("condition", "Condition"), text("success", "Success")),
-    Column("median", "Median"),
-    shown("95 % interval", lambda line: line["error"].ends()),
+    *estimate("error", "Median"),
 )
 
 
@@ -88,8 +86,8 @@ def place_known(record: Record) -> bool:
 
 
 def _line(name: str, row: Row, condition: str, records: Sequence[Record], found: Interval) -> dict[str, Any]:
-    line = {"family": name, "method": row.name, "condition": condition, "success": _successes(records)}
-    return line | {"median": found.value, "error": found}
+    told = {"family": name, "method": row.name, "condition": condition, "success": _successes(records)}
+    return told | {"error": found}
 
 
 def _successes(records: Sequence[Record]) -> str:
