@@ -170,6 +170,7 @@ def check_links(results_dir: Path) -> None:
 def _sound(cell: dict[str, Any]) -> bool:
     """Whether the fields of a planned cell have their types, and its id leads to no other folder."""
     texts = all(isinstance(cell[name], str) for name in TEXTS)
+    texts = texts and isinstance(cell["overrides"], list) and all(isinstance(one, str) for one in cell["overrides"])
     return texts and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
 
 
@@ -192,7 +193,7 @@ def _line(text: str) -> dict[str, Any]:
 
 def not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:
     """A record in place of a planned cell's run that does not exist."""
-    given = {name: cell[name] for name in ("id", "task", "renderer", "dataset", "seed", "config", "method")}
+    given = {name: cell[name] for name in (*TEXTS, "seed", "config", "overrides")}
     reason = f"planned by sweep {plan['name']}; the same command runs it"
     record = Record(**given, started=plan["asked"], asked=plan["asked"], status=NOT_RUN, reason=reason)
     return asdict(record) | {"folder": cell["id"]}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bench.records.names import differences
+from bench.records.read import not_run
 from bench.records.record import NOT_RUN, RunStatus
 from bench.records.statuses import STATUSES
 from bench.report.data.names import Nameable, names
@@ -114,13 +115,15 @@ def test_what_was_asked_is_a_sentence():
 
 def test_the_command_is_what_was_typed_and_safe_to_paste():
     typed = ["task=completion", "renderer.steps=40", "results_dir=elsewhere", "label=$(rm -rf ~)"]
-    line, _ = command(record("x", overrides=typed), Path("my results"))
+    line = command(record("x", overrides=typed), Path("my results"))
     assert shlex.split(line) == ["python", "-m", "bench", *typed[:2], typed[3], "results_dir=my results"]
-    older, remark = command(record("x", method="dist_mask"), Path("results"))
-    assert older == "python -m bench task=completion renderer=dist dataset=sofa +method=dist_mask seed=0"
-    assert "config.yaml has all the settings" in remark
-    stressed = command(record("x", dataset="wires", config={"stress": {"name": "wires"}}), Path("results"))[0]
-    assert "stress=wires" in stressed and "dataset" not in stressed
+
+
+def test_a_planned_cell_has_the_command_that_its_sweep_planned():
+    plan = {"name": "fig5-1", "asked": "2026-01-01"}
+    cell = {"id": "a", "task": "completion", "renderer": "dist", "dataset": "car", "seed": 0, "method": ""}
+    planned = not_run(cell | {"config": {}, "overrides": ["+experiment=fig5", "index=1"]}, plan)
+    assert command(planned, Path("results")) == "python -m bench +experiment=fig5 index=1"
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):

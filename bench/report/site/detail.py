@@ -26,7 +26,6 @@ TOP = ("label", "field", "split", "index", "seed", "device", "threads", "experim
 def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
     """The data of a run's page; the list has its name, scene and status."""
     files = folder.links()
-    typed, remark = command(record, results_dir)
     return {
         "asked": asked(record),
         "reason": record["reason"],
@@ -40,8 +39,7 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "files": files,
         "pictures": [[name, folder.link(name), ALT.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
-        "command": typed,
-        "remark": remark,
+        "command": command(record, results_dir),
         "again": lines_again(record, results_dir),
         "python": lines_open(record, results_dir / "runs" / folder.name, files),
     }

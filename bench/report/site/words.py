@@ -29,11 +29,6 @@ TASKS = {
 LEFT_OUT = ("results_dir", "rerun")  # of a command, which stands for any folder
 WIDEST = 90  # letters of overrides on one line
 MOST_SHOWN = 4  # metrics that the lines print
-TYPED = "As it was typed. Configurations are code: read one that is not yours first."
-NOT_TYPED = (
-    "This record is of a version that did not keep its command: these are its choices, and config.yaml has all the "
-    "settings."
-)
 
 
 def asked(record: Record) -> str:
@@ -53,11 +48,10 @@ def asked(record: Record) -> str:
     return f"{said}: {', '.join(filter(None, parts))}."
 
 
-def command(record: Record, results_dir: Path) -> tuple[str, str]:
-    """The command that makes the run again, for a shell, and a remark on how sure it is."""
+def command(record: Record, results_dir: Path) -> str:
+    """The command that makes the run again, for a shell."""
     folder = [] if _default(results_dir) else [f"results_dir={results_dir.as_posix()}"]
-    remark = TYPED if record.get("overrides") else NOT_TYPED
-    return shlex.join(["python", "-m", "bench", *_overrides(record), *folder]), remark
+    return shlex.join(["python", "-m", "bench", *_overrides(record), *folder])
 
 
 def lines_again(record: Record, results_dir: Path) -> str:
@@ -99,19 +93,8 @@ def _quoted(text: str) -> str:
 
 
 def _overrides(record: Record) -> list[str]:
-    """What the command line set; of an older record, which does not have it, its choices."""
-    typed = [str(override) for override in record.get("overrides") or []]
-    if typed:
-        return [override for override in typed if override.partition("=")[0] not in LEFT_OUT]
-    config = record["config"]
-    seen = "stress" if config.get("stress") else "dataset"  # a stress takes the dataset's place in a record
-    known = {"task": record["task"], "renderer": record["renderer"], seen: record["dataset"]}
-    known |= {"scale": setting(config, "scale", "name")}
-    known |= {key: config.get(key) for key in ("experiment", "method")}
-    known |= {"method": record.get("method")}
-    known |= {key: config.get(key) for key in ("split", "index")} | {"seed": record["seed"]}
-    added = ("experiment", "method")
-    return [f"{'+' * (key in added)}{key}={value}" for key, value in known.items() if value not in (None, "")]
+    """What the command line set, or what a sweep has planned."""
+    return [text for text in map(str, record.get("overrides") or []) if text.partition("=")[0] not in LEFT_OUT]
 
 
 def _default(results_dir: Path) -> bool:

@@ -71,14 +71,14 @@
       "button.cell",
       {
         type: "button",
-        "aria-label": `${data.axes[line].title}, ${data.rows[place]}: ${found.full}`,
+        "aria-label": `${data.axes[line].title}, ${data.rows[place]}: ${words(found)}`,
         click: (event) => {
           for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
           event.currentTarget.setAttribute("aria-pressed", "true");
           open(data, line, place, opened);
         },
       },
-      found.status === "unsupported" ? "–" : found.short,
+      found.short,
     );
     if (found.shade !== null) {
       const step = Math.min(SHADES.length - 1, Math.floor(found.shade * SHADES.length));
@@ -86,6 +86,10 @@
       button.style.color = step < 2 || step > 4 ? "#fff" : "#1c2430";
     }
     return button;
+  }
+
+  function words(found) {
+    return found.status === "unsupported" ? found.status : found.full;
   }
 
   /* Arrow keys go from cell to cell. */
@@ -113,7 +117,7 @@
       element(
         "p",
         null,
-        `Breaks: ${found.full}${found.status === "ok" ? ` ${axis.unit}` : ""}. `,
+        `Breaks: ${words(found)}. `,
         found.reason || "",
         run === undefined
           ? element("span.soft", null, " Its run is not among these results.")

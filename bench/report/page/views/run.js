@@ -79,7 +79,7 @@
       section(
         "Make it again",
         code(detail.command, "Copy the command"),
-        element("p.soft", null, detail.remark, " From Python:"),
+        element("p.soft", null, "Configurations are code: read one that is not yours first. From Python:"),
         code(detail.again, "Copy the lines that make it again"),
       ),
       section("Open it in Python", code(detail.python, "Copy the lines that open it")),

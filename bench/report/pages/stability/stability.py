@@ -50,6 +50,8 @@ COLUMNS = (  # of an axis and a cell
     text("axis", value=lambda line: line[0]),
     text("group", value=lambda line: str(line[1].stress("group"))),
     text("unit", value=lambda line: str(line[1].stress("sweep", "unit"))),
+    text("short", value=lambda line: line[1].short()),
+    text("full", value=lambda line: line[1].full(line[1].stress("sweep", "unit"))),
     *through(lambda line: line[1].record, *IDENTITY),
 )
 COSTS = (
@@ -274,24 +276,9 @@ def _cells(data: pd.DataFrame) -> dict[str, Any]:
 
 
 def _cell(run: pd.Series) -> dict[str, Any]:
-    status, level = str(run["status"]), run["level"]
-    known = status == "ok" and pd.notna(level)
-    low, high = (
-        format.number(None if pd.isna(run[f"breakdown_{end}"]) else run[f"breakdown_{end}"]) for end in ("low", "high")
-    )
-    short = ("at once" if level < 0 else "none" if level > 1 else format.number(run["breakdown"])) if known else status
-    words = {"at once": "at once, at the mildest severity", "none": "not at the severest"}
-    full = words.get(short, f"{short} ({low} to {high})" if known and "–" not in (low, high) else short)
-    reason = "" if pd.isna(run["reason"]) else str(run["reason"])
-    shade = min(max(float(level), 0.0), 1.0) if known else None
-    return {
-        "short": short,
-        "full": full,
-        "shade": shade,
-        "status": status,
-        "reason": reason,
-        "folder": str(run["folder"]),
-    }
+    known = run["status"] == "ok" and pd.notna(run["level"])
+    told = {name: "" if pd.isna(run[name]) else str(run[name]) for name in ("short", "full", "status", "reason")}
+    return told | {"shade": min(max(float(run["level"]), 0.0), 1.0) if known else None, "folder": str(run["folder"])}
 
 
 def answer_cost(data: pd.DataFrame, notes: list[str]) -> Answer:
