@@ -30,7 +30,7 @@ from renderers.checks import check_at_least, check_choice
 
 UNCOUNTED = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
-    "foreground in each iteration, nor second derivatives"
+    "foreground in each iteration, in a volume one per sample with a weight, nor second derivatives"
 }
 
 

@@ -135,7 +135,7 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
 
 
 def mask_loss(rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
-    """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.3)."""
+    """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.2)."""
     opacity = rendering.opacity.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
     return -torch.where(mask, opacity, 1 - opacity).log().sum() / max(mask.numel(), 1)
 

@@ -26,7 +26,7 @@ from renderers.volumes.integrate import (
 class NeuS:
     """Opacity from how a sigmoid of the distance falls from one sample to the next.
 
-    Source: NeuS (Wang et al. 2021, arXiv 2106.10689), Eq. 13 (opacity of an interval), Sec. 3.3 and supplement
+    Source: NeuS (Wang et al. 2021, arXiv 2106.10689), Eq. 13 (opacity of an interval), Sec. 3.2 and supplement
         (samples by importance, each round with a sigmoid twice as sharp; the mask's cross entropy).
     Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
         into view or leaves it has a part, as wide as the sigmoid.
@@ -91,7 +91,7 @@ class NeuS:
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The cross entropy of the opacity (Sec. 3.3)."""
+        """The cross entropy of the opacity (Sec. 3.2)."""
         return self.mask_weight * mask_loss(rendering, mask)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:

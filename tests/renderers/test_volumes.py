@@ -74,6 +74,16 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
         assert sharp / len(entry) > (0.9 if error_bound == 0.1 else 0.5)  # others are sampled for more
 
 
+@pytest.mark.parametrize(("renderer", "least"), [(VOLSDF, 1.0), (load("renderer", "volsdf_budget"), 0.6)])
+def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(renderer, least):
+    rays = parallel(12).flat()
+    entry, leave, meets = sphere_span(rays)
+    for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
+        found = renderer.bounded(field, rays[meets], entry[meets], leave[meets])
+        reached = torch.cat([(width == renderer.width).flatten() for _, _, width in found])
+        assert len(reached) == int(meets.sum()) and reached.double().mean() >= least
+
+
 def area_rates(renderer, radius: float, side: int = 400) -> tuple[float, float, float]:
     """The area that is seen of a sphere, its derivative towards the radius, and the noise of a ray's."""
     leaf = torch.tensor(radius, dtype=torch.float64, requires_grad=True)
