@@ -13,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.hints import nearest, renamed
+from bench.hints import nearest
 from bench.rows import LABEL, ROWS, register_resolvers
 from bench.targets import LEAVE, find_class
 from datasets.dataset import SPLIT_STRIDE, Split
@@ -129,8 +129,7 @@ def check_names(config: DictConfig) -> None:
     names = [item.name for item in fields(Config)]
     for key in map(str, config):
         if key not in names:
-            what = f"{key}/{config[key]}" if isinstance(config[key], str) else key
-            raise ValueError(f"unknown key {key!r}{renamed(what) or nearest(key, names)}")
+            raise ValueError(f"unknown key {key!r}{nearest(key, names)}")
     if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
         raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
     loss, task = config.get("silhouette") or {}, config.get("task") or {}
@@ -231,8 +230,7 @@ def _build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str], t
     names = _argument_names(cls)
     for key in arguments:
         if names is not None and key not in names:
-            new = renamed(f"{name}.{key}", [f"{name}.{known}" for known in names])
-            raise ValueError(f"{name} has no key {key!r}{new or nearest(str(key), names)}")
+            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
     return _typed(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
 
 

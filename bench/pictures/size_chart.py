@@ -60,8 +60,8 @@ class Candidates:
 
     @property
     def measure(self) -> str:
-        """The measure of size by which the choice is made; older records have none, and theirs is by free numbers."""
-        return self.metrics.get("recommended_by", "free")
+        """The measure of size by which the choice is made."""
+        return self.metrics.get("recommended_by", "stored")
 
     @property
     def footprint(self) -> float:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, check_names, register
-from bench.hints import nearest, renamed
+from bench.hints import nearest
 from bench.run.check import check_apart
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
@@ -160,18 +160,15 @@ def _explain(error: Exception) -> str:
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
             known = [option for option in cause.options or [] if not option.startswith("_")]  # others build on these
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
-            hint = renamed(f"{group}/{name}") or nearest(name, known)
-            return what + hint + (own if "/" in name or "." in name else "")
+            return what + nearest(name, known) + (own if "/" in name or "." in name else "")
     message = " ".join(str(error).split())
     if isinstance(error, ConfigCompositionException):
         if found := re.search(r"Could not override '([^']+)'", message):
             if (CONF / found[1]).is_dir():
                 return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
-            known = _known_keys()
-            return f"unknown key {found[1]!r}" + (renamed(found[1], known) or nearest(found[1], known))
+            return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
-            new = renamed(f"{found[1]}/{found[2]}")
-            return f"unknown {found[1]} {found[2]!r}" + (new or nearest(found[2], _choices(found[1])))
+            return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))
         if error.__cause__ is not None:
             detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
             return f"{message}: {detail}" if detail not in message else message

@@ -1,6 +1,5 @@
 """What a page is, and how rows are told apart: by presets, and in older records by labels."""
 
-import json
 import subprocess
 import sys
 from importlib import import_module
@@ -14,7 +13,6 @@ from bench.report.data.experiments import choose
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.pages.completion import table2
 from bench.report.pages.rendering import table1
-from bench.report.pages.speed import speed
 from bench.report.write import paper
 from bench.report.write.paper import find_paper, page_names, write_paper
 from tests.report.test_report_paper import DYNAMIC, NAIVE, coarse_pictures, costs, write_run  # noqa: F401, a fixture
@@ -57,15 +55,6 @@ def record(**changed) -> dict:
 )
 def test_a_row_is_its_preset_under_a_name(changed, preset, name):
     assert row_of(record(**changed)) == Row(preset, name)
-
-
-def test_rows_of_older_records_are_told_apart_by_label():
-    older = [record(config={"label": label}) for label in ("DIST with mask", "DIST", "+ dynamic", None)]
-    for one in older:
-        del one["method"]
-    names = ["DIST with mask", "DIST", "+ dynamic", "dist"]
-    assert [row_of(one).name for one in older] == names
-    assert [row_of(one).preset for one in older] == ["dist_mask", "DIST", "dist_dynamic", "dist"]
 
 
 @pytest.mark.parametrize(
@@ -148,22 +137,3 @@ def test_finding_the_files_loads_no_page():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
-
-
-def test_records_of_the_former_speed_experiment_are_tabulated(tmp_path):
-    """Schema 1 before presets: one experiment of both tasks, renderers by family, settings by label."""
-    for label, renderer in (("dist", "dist"), ("dist, alpha 1", "dist"), ("dvr, n 64", "dvr")):
-        for task, metrics in (("completion", {"chamfer_l2": 1e-3}), ("ablation", {"error_p95": 0.01, "queries": 9})):
-            times = {"forward": 1.0, "backward": 1.0}
-            metrics = {**metrics, "forward_seconds": 0.5}
-            folder = write_run(
-                tmp_path, "speed_accuracy", label, task=task, metrics=metrics, seconds=times, renderer=renderer
-            )
-            older = json.loads((folder / "record.json").read_text())
-            del older["method"]
-            (folder / "record.json").write_text(json.dumps(older))
-    records = read_records(tmp_path)[0]
-    made = speed.make_front(*(choose(records, selection, tmp_path) for selection in speed.READS))
-    assert list(made.data["setting"]) == ["dist", "dist, alpha 1", "dvr, n 64"] * 2
-    assert list(made.data["renderer"]) == ["dist", "dist", "dvr"] * 2
-    assert list(made.data["trial"]) == ["completing a shape"] * 3 + ["rendering an image"] * 3

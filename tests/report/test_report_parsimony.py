@@ -189,30 +189,18 @@ def test_need_over_what_the_best_single_part_leaves(four):
 
 
 PAGES = (parsimony.make, parsimony.make_flops, parsimony.make_needs)
-# As records were before sizes were told apart: NAME.parameters are the free numbers, NAME.bytes of the stored ones.
-OLDER = {"recommended_by": ..., "recommended_free": ..., "recommended_stored": ..., "recommended_bytes": ...}
-OLDER |= {"saved_free": ..., "saved_stored": ..., "saved_bytes": PAPERS / 13_824, "saved_parameters": PAPERS / 3000}
-OLDER |= {"recommended_parameters": 3000, "auto.stored": ..., "frugal.stored": ...}
 
 
-def older(results, scene) -> None:
-    """A run of an older record, whose choice was by free numbers."""
-    names = ("box", "grid_24")
-    sizes = {f"{name}.{size}": ... for name in names for size in ("free", "stored")}
-    sizes |= {f"{name}.parameters": SIZES[name] for name in names}
-    climbed(results, scene, {"box": 8, "grid_24": 0.5}, needs="grid_24", **OLDER, **sizes)
+def by_free_numbers(results, scene) -> None:
+    """A run whose choice was by free numbers."""
+    climbed(results, scene, {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
 
 
-def test_older_records_have_their_sizes_and_their_measure(tmp_path):
-    older(tmp_path, "car")
+def test_a_choice_by_free_numbers_is_told(tmp_path):
+    by_free_numbers(tmp_path, "car")
     made = parsimony.make(chosen(tmp_path))
-    cells = made.table.set_index("Scene").loc["car"]
-    assert (cells["Stored numbers"], cells["Free numbers"], cells["Size of the file"]) == ("13,824", "3,000", "55.3 kB")
-    assert (cells["Saved stored numbers"], cells["Saved free numbers"]) == ("133×", "613×")
     assert "free numbers" in made.title and "The size of a field is its free numbers." in made.notes
     assert made.figure.axes[0].get_xlabel() == "free numbers"
-    data = parsimony.make_needs(chosen(tmp_path)).data
-    assert (data["recommended_stored"].item(), data["recommended_free"].item()) == (13_824, 3000)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -225,7 +213,7 @@ def test_captions_and_notes_say_by_which_size_the_choice_is(four, page):
 
 
 def test_choices_by_different_sizes_are_told(tmp_path):
-    older(tmp_path, "car")
+    by_free_numbers(tmp_path, "car")
     climbed(tmp_path, "box", {"sphere": 7, "box": 0.5}, needs="box")
     told = "not the same for all scenes: stored numbers for box; free numbers for car."
     for page in (*PAGES, parsimony_auto.make):

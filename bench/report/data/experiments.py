@@ -25,7 +25,6 @@ class Selection:
         tasks: tasks of the runs.
         varies: keys of the configuration, in addition to `ROW_KEYS`, in which the runs differ.
         cell: settings of the task in which runs of one row differ.
-        former: name of the experiment in older records.
         setup: parts of the setup that captions name, where they are known.
         splits: whether runs of one task on several splits are read together.
     """
@@ -34,7 +33,6 @@ class Selection:
     tasks: tuple[str, ...]
     varies: tuple[str, ...] = ()
     cell: tuple[str, ...] = ()
-    former: str = ""
     setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
     splits: bool = False
 
@@ -127,8 +125,9 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ex
     requested last, since different settings under one name would become one row. Rows can come from different machines,
     which a note says.
     """
-    names = {selection.experiment, selection.former} - {""}
-    found = [r for r in records if r["config"].get("experiment") in names and r["task"] in selection.tasks]
+    found = [
+        r for r in records if r["config"].get("experiment") == selection.experiment and r["task"] in selection.tasks
+    ]
     if not found:
         return None
     found.sort(key=started)

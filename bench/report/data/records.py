@@ -13,17 +13,6 @@ from bench.records.record import row_name
 SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
 OURS = "renderers."  # beginning of the targets of this project's renderers
-# Presets of older records, which have none, by their labels.
-FORMER = {
-    "Naive sphere tracing": "naive_serial",
-    "+ practical grad.": "naive_practical",
-    "+ parallel": "naive_practical_parallel",
-    "+ dynamic": "dist_dynamic",
-    "+ aggressive": "dist_aggressive",
-    "+ coarse-to-fine": "dist_coarse_to_fine",
-    "+ coarse-to-fine, 100 steps": "dist_coarse_to_fine_100",
-    "DIST with mask": "dist_mask",
-}
 Record = dict[str, Any]
 RunKey = tuple[Any, ...]  # solid, view, seed, and further conditions, such as the number of points
 Item, Key = TypeVar("Item"), TypeVar("Key", bound=Hashable)
@@ -44,12 +33,10 @@ class Row:
 
 
 def row_of(record: Record) -> Row:
-    """The row of a record. Older records have no presets: they are identified by their labels."""
+    """The row of a record."""
     config = record["config"]
     name = str(record.get("row") or row_name(config, record["renderer"]))
-    if "method" in record:
-        return Row(record["method"] or record["renderer"], name)
-    return Row(FORMER.get(name, name), name)
+    return Row(record.get("method") or record["renderer"], name)
 
 
 def base_renderer(record: Record) -> str:
@@ -65,7 +52,7 @@ def family(record: Record) -> str:
 
 
 def iterations_of(record: Record) -> int | None:
-    """The number of the optimiser's iterations, which older records have among the task's settings."""
+    """The number of the optimiser's iterations, which a task without an optimiser has among its own settings."""
     config = record["config"]
     return setting(config, "task", "optimiser", "iterations") or setting(config, "task", "iterations")
 

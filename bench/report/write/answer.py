@@ -16,7 +16,6 @@ import pandas as pd
 from bench.pictures import style
 from bench.records.files import plain, write_text
 from bench.records.format import number
-from bench.report.data.records import FORMER
 from bench.report.data.statistics import median
 from bench.report.write.paper import FOLDER, page_names, read_page
 
@@ -141,7 +140,7 @@ def chart_panel(title: str, x: str, y: str, series: list[dict[str, Any]], **more
 
 def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any]:
     """A series of a chart with the colour and marker that its preset has in every figure."""
-    look = style.look(FORMER.get(preset, preset))
+    look = style.look(preset)
     marks = {"colour": look.colour, "symbol": look.marker} | more
     return {"name": name, "x": _rounded(x), "y": _rounded(y), **marks}
 

@@ -67,7 +67,7 @@ def _tabled() -> set[str]:
     """The names of the experiments that pages read."""
     pages = {module for module, _ in page_names().values()}
     read = [selection for page in pages for selection in import_module(f"bench.report.pages.{page}").READS]
-    return {name for selection in read for name in (selection.experiment, selection.former) if name}
+    return {selection.experiment for selection in read}
 
 
 def _headings(names: list[str]) -> dict[str, Metric]:

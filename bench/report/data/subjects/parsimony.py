@@ -31,7 +31,6 @@ NAMING: tuple[tuple[Callable[[Record], Any], str], ...] = (  # parts of a scene'
 )
 
 
-FLOAT = 4  # bytes of a number
 SIZES = ("stored", "free", "bytes")
 
 
@@ -125,29 +124,9 @@ def scene_runs(experiment: Experiment) -> list[SceneRun]:
     runs = []
     for record in experiment.records:
         name = ", ".join([short[family(record)], *(words.format(part(record)) for part, words in naming)])
-        record = record | {"metrics": sized(record["metrics"])}
         runs.append(SceneRun(name, record, Candidates.of(record["metrics"] if record["status"] == "ok" else {})))
     size = f"recommended_{measure_of(runs)}"
     return sorted(runs, key=lambda run: (not run.ok, run.number(size) or 0, run.name))
-
-
-def sized(metrics: dict[str, Any]) -> dict[str, Any]:
-    """The metrics with the sizes that older records lack.
-
-    These have NAME.parameters, the free numbers, and NAME.bytes, of all stored numbers; they chose by the former.
-    """
-    known = dict(metrics)
-    for name in [key.removesuffix(".parameters") for key in metrics if key.endswith(".parameters")]:
-        known[f"{name}.free"] = known.pop(f"{name}.parameters")
-        if (size := known.get(f"{name}.bytes")) is not None:
-            known[f"{name}.stored"] = size // FLOAT
-    if "recommended_parameters" in known:
-        chosen = known["recommended_field"]
-        del known["recommended_parameters"]
-        known |= {f"recommended_{size}": known.get(f"{chosen}.{size}") for size in SIZES}
-    if "saved_parameters" in known:
-        known |= {"saved_free": known.pop("saved_parameters"), "saved_stored": known.get("saved_bytes")}
-    return known
 
 
 def measure_of(runs: list[SceneRun]) -> str:
@@ -168,8 +147,7 @@ def measure_note(runs: list[SceneRun]) -> str:
 def named_settings(experiment: Experiment) -> dict[str, float]:
     """The settings that captions name; nan where the configuration lacks one."""
     requested = experiment.requested()
-    config = {"models": requested.get("ladder"), **requested}  # the node's name in older records
-    found = {name: setting(config, *path) for name, path in SETTINGS.items()}
+    found = {name: setting(requested, *path) for name, path in SETTINGS.items()}
     known = {name: math.nan if value is None else value for name, value in found.items()}
     return {**known, "percent": 100 * known["share"]}
 

@@ -46,7 +46,7 @@ class Trial:
 
 
 COMPLETION = Trial(
-    Selection("speed_completion", ("completion",), VARIES, former="speed_accuracy"),
+    Selection("speed_completion", ("completion",), VARIES),
     "completing a shape",
     "chamfer_l2",
     "Chamfer × 1000 (scene units²)",
@@ -62,7 +62,7 @@ def _queries(record: Record) -> float | None:
 
 
 RENDERING = Trial(
-    Selection("speed_rendering", ("ablation",), VARIES, former="speed_accuracy"),
+    Selection("speed_rendering", ("ablation",), VARIES),
     "rendering an image",
     "error_p95",
     "depth error, 95th percentile × 1000 (scene units)",
