@@ -71,7 +71,7 @@ def assert_one_line(err: str, *words: str) -> None:
         ),
         ("dataset=soffa", ("unknown dataset 'soffa'", "did you mean sofa")),
         ("scale=smok", ("unknown scale 'smok'", "did you mean smoke")),
-        ("+experiment=completion_papper", ("unknown experiment", "did you mean completion_paper")),
+        ("+experiment=unseen_bac", ("unknown experiment", "did you mean unseen_back")),
         ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
         ("dataset=/etc/passwd", ("unknown dataset '/etc/passwd'", "dataset=mesh dataset.path=/etc/passwd")),
         ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
