@@ -246,23 +246,6 @@ def points_in_ball(count: int) -> Float[Tensor, "count 3"]:
     return torch.rand(count, 1, **draws) ** (1 / 3) * direction
 
 
-def central_difference_normals(
-    field: Field, points: Float[Tensor, "*batch 3"], *, delta: float
-) -> Float[Tensor, "*batch 3"]:
-    """Unit gradients of the field by central differences (DIST, Eq. 3), with six values per point.
-
-    Args:
-        points: where, in scene units.
-        delta: half the distance between the two samples on an axis, in scene units, positive.
-    """
-    if delta <= 0:
-        raise ValueError(f"delta must be positive, not {delta}: 1e-3 suits scenes in the unit sphere")
-    offsets = delta * torch.eye(3, dtype=points.dtype, device=points.device)
-    ahead = field(points[..., None, :] + offsets)
-    behind = field(points[..., None, :] - offsets)
-    return torch.nn.functional.normalize((ahead - behind) / (2 * delta), dim=-1)
-
-
 @runtime_checkable
 class Occupancy(Protocol):
     """Points [*batch, 3] to logits [*batch] of the probability p of being inside: any callable."""

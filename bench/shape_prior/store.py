@@ -1,6 +1,5 @@
 """Stores priors: some are shipped, others are trained on first use and cached by a hash of shapes and settings."""
 
-import json
 import os
 import time
 from dataclasses import asdict
@@ -104,11 +103,6 @@ def probe(dataset: Dataset) -> list[float]:
     """Area and volume of the first two training shapes: a test compares them, to detect a change of the sampler."""
     meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]
     return [number for mesh in meshes for number in (mesh.area, mesh.volume)]
-
-
-def shipped_records() -> list[dict[str, Any]]:
-    """The records of the shipped priors."""
-    return [json.loads(path.read_text()) for path in sorted(SHIPPED.glob("*.json"))]
 
 
 def _surface_errors(

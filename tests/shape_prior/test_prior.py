@@ -14,7 +14,7 @@ from bench.config import CONF, build, register
 from bench.setup.inputs import prior_settings
 from bench.shape_prior import store as prior_store
 from bench.shape_prior.autodecoder import NetworkSettings, PriorSettings, distance_samples, fit_error, train
-from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe, shipped_records
+from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe
 from datasets.dataset import Split
 from datasets.extract import extract
 from datasets.families import FAMILIES
@@ -204,6 +204,10 @@ def test_training_that_is_cut_short_leaves_no_prior(tmp_path, monkeypatch):
 def test_settings_that_cannot_be_are_refused(name):
     with pytest.raises(ValueError, match=f"prior.{name} must be at least 1, not 0"):
         replace(SETTINGS, **{name: 0})
+
+
+def shipped_records() -> list[dict]:
+    return [json.loads(path.read_text()) for path in sorted(SHIPPED.glob("*.json"))]
 
 
 @pytest.fixture(params=sorted(FAMILIES))
