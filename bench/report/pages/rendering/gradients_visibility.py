@@ -26,6 +26,8 @@ NOTES = (
     "Error: length of the difference of the two gradients over that of the true one, all pixels and directions "
     "together; that of a gradient of zeros is 1. Noise: what the rays of a pixel differ by, in the same unit: it is "
     "the error of one ray per pixel, and falls with the square root of their number.",
+    "Cosine and scale are of each pixel's own gradient. A blur of a pixel or more moves the gradient to the pixels "
+    "beside, which lowers both; the sum over an image it keeps.",
     "Blur: the length over which a renderer spreads the gradient of visibility: NeuS 1/s, VolSDF beta, UNISURF the "
     "width of the occupancy, the relaxed boundary its band. A renderer without one has one row.",
     "The truth has an error of its own, since few of a pixel's rays change sides: of a disc, at the defaults, 0.07 of "
