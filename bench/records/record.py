@@ -89,6 +89,11 @@ class Record:
         return row_name(self.config, self.renderer)
 
     @property
+    def title(self) -> str:
+        """What was run, on what: for pictures and tables."""
+        return f"{self.task}, {self.name}, {self.scene or self.dataset}"
+
+    @property
     def folder(self) -> Path:
         """Its folder, by the results folder of its configuration."""
         return Path(self.config["results_dir"]) / "runs" / self.id

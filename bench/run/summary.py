@@ -18,7 +18,7 @@ from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
 def show(folder: Path, record: Record, index: Path) -> None:
     """Prints the outcome of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene or record.dataset}"))
+    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
     for name, metric in SHOWN.items():
@@ -86,7 +86,7 @@ def _candidates(record: Record) -> Table:
 
     candidates = Candidates.of(record.metrics)
     half_pixel = number(1000 * candidates.footprint)
-    title = f"{record.task}, {record.name}, {record.scene}; half a pixel is {half_pixel} (x1000)"
+    title = f"{record.title}; half a pixel is {half_pixel} (x1000)"
     table = Table(box=box.SIMPLE_HEAD, title=escape(title))
     for heading in ("", "field", "stored", "free", "bytes", "FLOPs/query", "error (x1000)", "s.e.", "fit"):
         table.add_column(heading, justify="left" if heading in ("", "field") else "right", no_wrap=heading == "field")
@@ -103,7 +103,7 @@ def _candidates(record: Record) -> Table:
 
 def _measured(record: Record) -> Table:
     """All metrics of a task that measures without optimising."""
-    table = Table(box=box.SIMPLE_HEAD, title=escape(f"{record.task}, {record.name}, {record.scene}"))
+    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
     table.add_column("")
     table.add_column("measured", justify="right")
     for name, value in record.metrics.items():

@@ -110,7 +110,7 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
         filmstrip: with all frames.
     """
     record = run.record
-    title = f"{record.task}, {record.name}, {record.scene}: {record.status}"
+    title = f"{record.title}: {record.status}"
     if run.inputs.evaluation.picture is not None:
         draw_pictures(title)
     filmstrip.save(run.folder, title)

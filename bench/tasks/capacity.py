@@ -123,10 +123,11 @@ class Capacity:
         saving = pixel_precision_summary(metrics, chosen.candidate.name)
         precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, *saving]]
         record.notes = [*record.notes, summary(choice, growth), *final_notes(chosen.renderer), *precision_notes]
-        title = f"{record.task}, {record.name}, {record.scene}"
-        filmstrip.save(run.folder, f"{title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name)
+        filmstrip.save(
+            run.folder, f"{record.title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name
+        )
         if inputs.evaluation.picture is not None:
-            draw_candidates(run.folder, record.metrics, title)
+            draw_candidates(run.folder, record.metrics, record.title)
 
 
 def _note_costs(run: RunContext, fitter: Fitter, observations: RayObservations, evidence: list[Evidence]) -> None:

@@ -179,7 +179,7 @@ class OneImage:
         with run.off_clock():
             note_result(run, self._judged(shape, images, subject, inputs))
             if inputs.evaluation.picture is not None:
-                draw_reconstruction(run.folder, inputs, shape, subject, [], _title(run))
+                draw_reconstruction(run.folder, inputs, shape, subject, [], f"{run.record.title}: {run.record.status}")
 
     def _network(self, run: RunContext, recipe: Recipe) -> tuple[SingleView, dict[str, Any]]:
         """The network and the record of its training, which is told in the run's notes."""
@@ -223,7 +223,14 @@ class OneImage:
             note_result(run, Evaluation({FITTED: overlapping}, mesh))
             record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
             if inputs.evaluation.picture is not None:
-                draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, _title(run))
+                draw_picture(
+                    run.folder,
+                    mesh,
+                    picture,
+                    camera,
+                    inputs.evaluation.picture,
+                    f"{run.record.title}: {run.record.status}",
+                )
 
     def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
@@ -246,7 +253,7 @@ class OneImage:
             after.metrics["iou"] = overlap(problem.field(), images, inputs.device)
             note_result(run, replace(after, failure=failure_of(history, after)))
             if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, _title(run))
+                draw_surface(run.folder, inputs, mesh, subject, f"{run.record.title}: {run.record.status}")
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
@@ -270,7 +277,7 @@ class OneImage:
             after.metrics["iou"] = 0.0 if mesh is None else overlap(Inside(Truth(mesh)), images, torch.device("cpu"))
             note_result(run, after)
             if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, _title(run))
+                draw_surface(run.folder, inputs, mesh, subject, f"{run.record.title}: {run.record.status}")
 
 
 @dataclass(frozen=True)
@@ -294,11 +301,6 @@ def _inferred(
     mesh = surface_of(shape, run.inputs)
     run.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
     return shape, mesh
-
-
-def _title(run: RunContext) -> str:
-    record = run.record
-    return f"{record.task}, {record.name}, {record.scene}: {record.status}"
 
 
 def subject_of(images: ImagesOf, given: int, inputs: RunInputs) -> Subject:

@@ -52,7 +52,8 @@ def make(experiment: Experiment) -> Result:
             budgets = dict(sorted(grouped(of_row, _budget).items()))
             for budget, found in budgets.items():
                 estimates.append(_estimate(found))
-                lines.append({"family": name, "method": row.name, **_line(budget, budgets)})
+                line = {"family": name, "method": row.name, "found": str(estimates[-1])}
+                lines.append({**line, **_line(budget, budgets)})
     return Result(
         experiment,
         "Shape from one image, by the size of the training.",
@@ -82,7 +83,6 @@ def _line(budget: Budget, budgets: dict[Budget, list[Record]]) -> dict[str, obje
     return {
         "shapes": str(budget[0]),
         "views": str(budget[1]),
-        "found": str(_estimate(found)),
         "iou": middle(found, "iou"),
         "ratio": "" if ratio is None else str(ratio),
         "failed": f"{sum(record['status'] != 'ok' for record in found)} of {len(found)}",
