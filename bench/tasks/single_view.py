@@ -223,14 +223,8 @@ class OneImage:
             note_result(run, Evaluation({FITTED: overlapping}, mesh))
             record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
             if inputs.evaluation.picture is not None:
-                draw_picture(
-                    run.folder,
-                    mesh,
-                    picture,
-                    camera,
-                    inputs.evaluation.picture,
-                    f"{run.record.title}: {run.record.status}",
-                )
+                title = f"{run.record.title}: {run.record.status}"
+                draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, title)
 
     def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
