@@ -1,7 +1,7 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
@@ -122,6 +122,16 @@ def register() -> None:
     """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
     ConfigStore.instance().store(name="schema", node=Config)
     register_resolvers()
+
+
+def check_label(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Raises ValueError where a renderer takes the place of a method's, whose label the run would keep."""
+    given = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
+    if config.get("label") and {"renderer", "method"} <= given.keys() and "label" not in given:
+        raise ValueError(
+            f"renderer={given['renderer']} beside +method={given['method']} would run under the name "
+            f"{config.label!r}: add label=NAME, in a sweep 'label=\\${{renderer._label_}}'"
+        )
 
 
 def check_names(config: DictConfig) -> None:

@@ -110,8 +110,13 @@ class Record:
 
 
 def row_name(config: dict[str, Any], renderer: str) -> str:
-    """The name of a run's row: that of `renderer_name`, with a silhouette loss that is not the renderer's own."""
+    """The name of a run's row: that of `renderer_name`, with a silhouette loss that is not the renderer's own.
+
+    Where a task was told to leave the masks out, no loss of them took part.
+    """
     name, loss = renderer_name(config, renderer), _labelled(config.get("silhouette"))
+    if (config.get("task") or {}).get("masks") is False:
+        loss = "without masks"
     return f"{name}, {loss}" if loss else name
 
 

@@ -16,7 +16,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, check_names, register
+from bench.config import CONF, check_label, check_names, register
 from bench.hints import nearest
 from bench.run.check import check_apart
 from bench.run.plan import Shown
@@ -121,6 +121,7 @@ def _check(config: DictConfig) -> None:
     """Raises ValueError for what can be told of a configuration without torch."""
     check_names(config)
     chosen = HydraConfig.get()
+    check_label(config, chosen.overrides.task)
     check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
     check_apart(config)
 

@@ -16,7 +16,7 @@ from hydra.experimental.callback import Callback
 from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import Isolation, Rerun, check_names
+from bench.config import Isolation, Rerun, check_label, check_names
 from bench.progress import display, notice
 from bench.records.expected import Remaining
 from bench.records.files import digest
@@ -137,6 +137,7 @@ def make_plan(config: DictConfig) -> Plan:
         composed = loader.load_sweep_config(config, cell)
         plain = _without_hydra(composed)
         check_names(plain)
+        check_label(plain, cell)
         by_hand = [override for override in cell if _key(override) in typed]
         check_targets(plain, by_hand, composed.hydra.runtime.choices.get("renderer", ""))
         try:

@@ -232,3 +232,10 @@ def test_a_sweep_composes_each_cell_once_for_the_plan_and_once_to_run_it(swept, 
     _, ran = swept("seed=0,1,2", launch=True)
     assert [config.seed for config in ran] == [0, 1, 2]
     assert len(composed) == 2 * 3
+
+
+def test_a_row_without_masks_is_not_named_by_a_loss_of_them():
+    config = {"label": "Newton, RGB", "silhouette": {"_label_": "IDR's mask loss"}, "task": {"masks": False}}
+    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
+    config["task"]["masks"] = True
+    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, IDR's mask loss"

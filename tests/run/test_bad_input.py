@@ -131,6 +131,14 @@ def test_a_mask_loss_that_no_task_reads_is_told_before_any_run(bench, tmp_path, 
     assert not (tmp_path / "r" / "runs").exists()
 
 
+@pytest.mark.parametrize("options", [(), ("-m",)])
+def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior, options):
+    code, _, err = bench(*options, "+method=dist_mask", "renderer=dvr", "plan=true")
+    assert code == 2
+    assert_one_line(err, "renderer=dvr beside +method=dist_mask", "'DIST with mask'", "label=NAME")
+    assert bench(*options, "+method=dist_mask", "renderer=dvr", "label=mine", "plan=true")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("argument", "words"),
     [

@@ -22,8 +22,8 @@ PLACE = re.compile(r"^PLACE(_[A-Z_]+)? = (\d+)$", re.MULTILINE)
 HEAD = """# Results
 
 Written by `python -m bench.report` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in
-scene units), Markdown and LaTeX, each figure as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs that
-a page reads; the README of `conf` lists the experiments and how long they take.
+scene units), Markdown and LaTeX, each figure as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of
+the experiment that a page names; the README of `conf` lists the experiments and how long they take.
 
 """
 
@@ -154,8 +154,11 @@ def link(*parts: str) -> str:
 
 
 def _section(path: Path, name: str) -> str:
-    """A page's Markdown under a heading, with folded notes and links relative to the folder above."""
+    """A page's Markdown under a heading, with its experiment, folded notes and links relative to the folder above."""
     text = path.read_text(encoding="utf-8", errors="replace").replace(f"]({name}.png)", f"]({FOLDER}/{name}.png)")
+    module, _ = page_names().get(name, ("", ""))
+    selections = import_module(f"bench.report.pages.{module}").READS if module else ()
+    read = ", ".join(f"`{one}`" for one in dict.fromkeys(each.experiment for each in selections))
     text = re.sub(r"((?:^- .*\n)+)", r"<details><summary>Notes</summary>\n\n\1\n</details>\n", text, flags=re.MULTILINE)
     title, rest = re.fullmatch(r"\*\*(.*?)\*\*\s*(.*)", text, re.DOTALL).groups()
-    return f'## <a id="{name}"></a>{title}\n\n{rest}'
+    return f'## <a id="{name}"></a>{title}\n\n' + (f"Experiment: {read}.\n\n" if read else "") + rest

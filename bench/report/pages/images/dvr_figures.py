@@ -19,12 +19,14 @@ RUNS = (FAMILY, *IDENTITY, *metrics("seen_chamfer_l1", "psnr"))
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with the pictures of the first scenes."""
-    scenes = list(grouped(experiment.records, scene_of))[:MOST_SCENES]
+    every = list(grouped(experiment.records, scene_of))
+    scenes = every[:MOST_SCENES]
+    left = f" The first {len(scenes)} of {len(every)} scenes." if len(every) > len(scenes) else ""
     figure, missing = draw_pictures(experiment, list(experiment.rows()), scenes)
     return Result(
         experiment,
         "Shapes from photographs in pictures.",
-        "Colours above, normals (right, up, towards the camera as red, green, blue) below.",
+        f"Colours above, normals (right, up, towards the camera as red, green, blue) below.{left}",
         remarks=(*NOTES, *missing),
         data=to_data(RUNS, experiment.records),
         figure=figure,

@@ -3,7 +3,7 @@
 import pandas as pd
 
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import SCALE, definitions, grouped
+from bench.report.data.records import SCALE, definitions, grouped, setting
 from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result
 from bench.report.write.shapes import COST, draw_curves, lines_of, scene_of
@@ -62,11 +62,22 @@ def make(experiment: Experiment) -> Result:
         experiment,
         "Shape and colour from photographs.",
         f"Medians over {scenes} scene{'s' if scenes > 1 else ''} of errors on what the photographs see; in the figure, "
-        "the error over time and over field values at each checkpoint.",
+        f"the error over time and over field values at each checkpoint.{_conditions(experiment)}",
         remarks=(*NOTES, *definitions(experiment.records, DEFINED)),
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, [*lines_of(experiment, NAMES), *published]),
-        figure=draw_curves(experiment, "seen_chamfer_l1", "Chamfer-L1 × 1000\n(scene units)", 1000.0),
+        figure=draw_curves(experiment, "seen_chamfer_l1", "Chamfer-L1, seen × 1000\n(scene units)", 1000.0),
+    )
+
+
+def _conditions(experiment: Experiment) -> str:
+    """What photographs there were, and how long was optimised."""
+    task = next((r["config"]["task"] for r in experiment.records if setting(r["config"], "task", "optimiser")), None)
+    if task is None or setting(task, "images", "views") is None:
+        return ""
+    return (
+        f" {task['images']['views']} photographs of {task['longest']} pixels a side, one in {task['held_out']} held "
+        f"out; {task['optimiser']['iterations']} iterations."
     )
 
 

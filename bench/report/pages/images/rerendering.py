@@ -16,7 +16,7 @@ from bench.report.write.table import FAMILY, IDENTITY, metrics, to_data
 
 PLACE = 49
 READS = dvr_table2.READS
-PRESET = "rgb_dist"  # the row that is shown, where it was run; else the first
+PRESET = "rgb_dist"  # the row that is shown, where it has a run that ended ok; else the first that has
 MOST_SCENES = 3
 SIZES = ("size_0_", "size_1_", "size_2_")  # of images.npz, see `bench.reconstruct.pictures`
 TURNED = {"turned_0_": "turned by 120°", "turned_1_": "turned by 240°"}  # about the vertical axis, likewise
@@ -37,8 +37,9 @@ RUNS = (FAMILY, *IDENTITY, *metrics("seen_chamfer_l1", "psnr"))
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per scene."""
-    rows = list(experiment.rows())
-    row = next((row for row in rows if row.preset == PRESET), rows[0])
+    rows = experiment.rows()
+    ended = [row for row, runs in rows.items() if any(run["status"] == "ok" for run in runs)] or list(rows)
+    row = next((row for row in ended if row.preset == PRESET), ended[0])
     of_row = grouped([record for record in experiment.records if row_of(record) == row], scene_of)
     kept = [records[0] for records in of_row.values()][:MOST_SCENES]
     shown = replace(experiment, records=kept, left_out=experiment.left_out + len(experiment.records) - len(kept))

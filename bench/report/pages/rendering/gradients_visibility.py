@@ -29,7 +29,8 @@ NOTES = (
     "Cosine and scale are of each pixel's own gradient. A blur of a pixel or more moves the gradient to the pixels "
     "beside, which lowers both; the sum over an image it keeps.",
     "Blur: the length over which a renderer spreads the gradient of visibility: NeuS 1/s, VolSDF beta, UNISURF the "
-    "width of the occupancy, the relaxed boundary its band. A renderer without one has one row.",
+    "width of the occupancy, the relaxed boundary its band; a pixel at the outline is about 0.01 scene units wide. A "
+    "renderer without one has one row.",
     "The truth has an error of its own, since few of a pixel's rays change sides: of a disc, at the defaults, 0.07 of "
     "its length, and a cosine of 0.997 with the exact one.",
     "UNISURF's interval keeps its proportion to the blur. No schedule is at work.",
@@ -113,7 +114,7 @@ def _number(name: str, heading: str) -> Column:
 COLUMNS = (  # of a record and a blur
     shown("Renderer", lambda line: line[0]["name"]),
     *through(lambda line: line[0], *IDENTITY),
-    text("blur", "Blur", lambda line: line[1] and f"{float(line[1]):g}"),
+    text("blur", "Blur (scene units)", lambda line: line[1] and f"{float(line[1]):g}"),
     *(_number(name, heading) for name, heading in zip(NUMBERS, HEADINGS, strict=True)),
     shown("Status", lambda line: line[0]["status"]),
 )

@@ -29,7 +29,8 @@ NOTES = (
     "The adaptive search makes {share:.0f} % of a full grid's trials; every renderer gets the same trials at a "
     "severity. Renderings have {resolution}×{resolution} pixels.",
     "“At once”: breaks at the mildest severity; “none”: does not break at the severest; both with the number of failed "
-    "trials there and the interval of their share (Clopper and Pearson). – is a renderer without that setting.",
+    "trials there and the interval of their share (Clopper and Pearson). “Rises”: more trials succeed at the severest "
+    "than at the mildest severity, so that none is a breakdown. – is a renderer without that setting.",
     "“One trial”: repeats could not differ there, so that each severity was tried once and there is no interval; the "
     "breakdown lies between two neighbouring severities.",
     "Where a disturbance moves the surface, renderers are judged by the moved surface.",
