@@ -300,7 +300,7 @@ def test_a_sweep_that_is_stopped_just_after_a_record_is_written_says_so(tmp_path
 def test_a_cell_that_cannot_be_composed_stops_the_sweep_before_it_starts(isolated, tmp_path):
     code, _, err = isolated("-m", *FAILING, "scale=smoke,smok")
     assert code == 2
-    assert err.strip() == "error: unknown scale 'smok': did you mean smoke or desk?"
+    assert err.strip() == "error: unknown scale 'smok': did you mean smoke?"
     assert not (tmp_path / "r" / "runs").exists()
 
 
