@@ -89,7 +89,7 @@ def history(experiment: Experiment, record: Record, name: str) -> list[tuple[flo
 def draw_curves(experiment: Experiment, name: str, label: str, scale: float) -> Figure:
     """A column per scene: the metric over seconds above, over field values below; rows without a loop as levels."""
     scenes = grouped(experiment.records, scene_of)
-    figure, axes = chart.sheet(4.4, 2, len(scenes), sharey="col")
+    figure, axes = chart.sheet(3.4 + 0.11 * len(experiment.rows()), 2, len(scenes), sharey="col")  # legend below
     for column, (scene, records) in zip(axes.T, scenes.items(), strict=True):
         column[0].set_title(scene)
         for record in records:

@@ -66,7 +66,7 @@ def make(experiment: Experiment) -> Result:
         remarks=(*NOTES, *definitions(experiment.records, DEFINED)),
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, [*lines_of(experiment, NAMES), *published]),
-        figure=draw_curves(experiment, "seen_chamfer_l1", "Chamfer-L1, seen × 1000\n(scene units)", 1000.0),
+        figure=draw_curves(experiment, "seen_chamfer_l1", "Chamfer-L1, seen\n× 1000 (scene units)", 1000.0),
     )
 
 
