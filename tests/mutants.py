@@ -170,7 +170,6 @@ MUTANTS = (
     M("bench/models/model.py", "Size(free, free + self.held,", "Size(free, free,", "tests/models/test_models.py"),
     M("bench/models/candidates.py", "listed if measure == FREE else", "listed if measure != FREE else",
       "tests/models/test_sizes.py"),
-    M("bench/report/data/subjects/parsimony.py", "size // FLOAT", "size", "tests/report/test_report_parsimony.py"),
     # Stress tests: trials, their judges, the search.
     M("bench/stress/rendering.py", "both & (error > footprint)", "both & (error > 4 * footprint)", "tests/stress"),
     M("bench/stress/rendering.py", '(numbers["hits"] or rays)', "rays", "tests/stress"),
