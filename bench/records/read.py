@@ -170,8 +170,8 @@ def check_links(results_dir: Path) -> None:
 def _sound(cell: dict[str, Any]) -> bool:
     """Whether the fields of a planned cell have their types, and its id leads to no other folder."""
     texts = all(isinstance(cell[name], str) for name in TEXTS)
-    texts = texts and isinstance(cell["overrides"], list) and all(isinstance(one, str) for one in cell["overrides"])
-    return texts and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
+    listed = isinstance(cell["overrides"], list) and all(isinstance(one, str) for one in cell["overrides"])
+    return texts and listed and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
 
 
 def curve_lines(folder: Path) -> list[dict[str, Any]] | None:

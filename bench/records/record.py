@@ -94,6 +94,11 @@ class Record:
         return f"{self.task}, {self.name}, {self.scene or self.dataset}"
 
     @property
+    def outcome(self) -> str:
+        """The title with the status."""
+        return f"{self.title}: {self.status}"
+
+    @property
     def folder(self) -> Path:
         """Its folder, by the results folder of its configuration."""
         return Path(self.config["results_dir"]) / "runs" / self.id

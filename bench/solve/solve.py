@@ -110,10 +110,9 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
         filmstrip: with all frames.
     """
     record = run.record
-    title = f"{record.title}: {record.status}"
     if run.inputs.evaluation.picture is not None:
-        draw_pictures(title)
-    filmstrip.save(run.folder, title)
+        draw_pictures(record.outcome)
+    filmstrip.save(run.folder, record.outcome)
 
 
 def descend(

@@ -179,7 +179,7 @@ class OneImage:
         with run.off_clock():
             note_result(run, self._judged(shape, images, subject, inputs))
             if inputs.evaluation.picture is not None:
-                draw_reconstruction(run.folder, inputs, shape, subject, [], f"{run.record.title}: {run.record.status}")
+                draw_reconstruction(run.folder, inputs, shape, subject, [], run.record.outcome)
 
     def _network(self, run: RunContext, recipe: Recipe) -> tuple[SingleView, dict[str, Any]]:
         """The network and the record of its training, which is told in the run's notes."""
@@ -223,8 +223,7 @@ class OneImage:
             note_result(run, Evaluation({FITTED: overlapping}, mesh))
             record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
             if inputs.evaluation.picture is not None:
-                title = f"{run.record.title}: {run.record.status}"
-                draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, title)
+                draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
 
     def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
@@ -247,7 +246,7 @@ class OneImage:
             after.metrics["iou"] = overlap(problem.field(), images, inputs.device)
             note_result(run, replace(after, failure=failure_of(history, after)))
             if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, f"{run.record.title}: {run.record.status}")
+                draw_surface(run.folder, inputs, mesh, subject, run.record.outcome)
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
@@ -271,7 +270,7 @@ class OneImage:
             after.metrics["iou"] = 0.0 if mesh is None else overlap(Inside(Truth(mesh)), images, torch.device("cpu"))
             note_result(run, after)
             if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, f"{run.record.title}: {run.record.status}")
+                draw_surface(run.folder, inputs, mesh, subject, run.record.outcome)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class _Photographs:
         with run.off_clock():
             note_result(run, judge_mesh(mesh, subject, inputs))
             if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, f"{record.title}: {record.status}")
+                draw_surface(run.folder, inputs, mesh, subject, record.outcome)
 
 
 @dataclass(frozen=True)

@@ -76,8 +76,8 @@ def _conditions(experiment: Experiment) -> str:
     if task is None or setting(task, "images", "views") is None:
         return ""
     return (
-        f" {task['images']['views']} photographs of {task['longest']} pixels a side, one in {task['held_out']} held "
-        f"out; {task['optimiser']['iterations']} iterations."
+        f" {task['images']['views']} photographs, {task['longest']} pixels along the longer side, one in "
+        f"{task['held_out']} held out; {task['optimiser']['iterations']} iterations."
     )
 
 
