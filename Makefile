@@ -2,7 +2,7 @@
 PYTHON ?=
 BIN := .venv/bin
 
-.PHONY: demo test test-slow test-browser benchmark mutants lint setup clean
+.PHONY: demo test test-slow test-types test-browser benchmark mutants lint setup clean
 
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
@@ -12,6 +12,9 @@ test: .venv/ready-dev ## set up once, then the tests (7 minutes on 2 quiet cores
 
 test-slow: .venv/ready-dev ## the minutes-long tests
 	$(BIN)/python -m pytest -m slow --ignore tests/benchmarks
+
+test-types: .venv/ready-dev ## the tests of `make test`, or TESTS, with types and shapes checked at every call
+	CHECK_TYPES=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 test-browser: .venv/ready-dev ## installs Chromium and Playwright where they are missing, then opens the page in it (minutes)
 	@.ci/setup browser

@@ -83,6 +83,9 @@ class Camera:
     width: int
 
     def __post_init__(self) -> None:
+        shapes = tuple(self.intrinsics.shape), tuple(self.world_to_camera.shape)
+        if shapes != ((3, 3), (4, 4)):
+            raise ValueError(f"intrinsics must have shape [3, 3] and world_to_camera [4, 4], not {shapes}")
         focal = self.intrinsics.detach().diagonal()[:2]
         if not bool((focal > 0).all()) or not bool(torch.isfinite(self.intrinsics).all()):
             raise ValueError(f"focal lengths must be positive and finite, not {focal.tolist()}: check intrinsics")

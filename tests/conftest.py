@@ -1,9 +1,10 @@
-"""Shared by all tests: types and shapes are checked at every signature of ours, and torch keeps to one thread."""
+"""Shared by all tests. CHECK_TYPES=1 checks the types and shapes of every call of ours, in twice the time."""
 
 import bench  # noqa: F401, before all else: it sets the OpenMP variables, which torch reads once
 
 # isort: split
 import gc
+import os
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -32,8 +33,8 @@ def checked(function: Callable) -> Callable:
     return CHECKED(function)
 
 
-# The hook must stand before the first import of what it checks.
-install_import_hook(["renderers", "datasets", "bench"], "tests.conftest.checked")
+if os.environ.get("CHECK_TYPES"):  # set by `make test-types`; the hook must stand before the imports that it checks
+    install_import_hook(["renderers", "datasets", "bench"], "tests.conftest.checked")
 
 settings.register_profile("implicit-bench", deadline=None, derandomize=True)
 settings.load_profile("implicit-bench")

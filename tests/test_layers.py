@@ -1,6 +1,8 @@
 """Who may import whom: renderers <- datasets <- bench, in bench room by room; and that tests check types."""
 
 import ast
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,25 +24,15 @@ FORBIDDEN = {  # what the modules of a package may not import
 }
 # The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
 ROOMS = (
-    *(
-        "hints",
-        "rows",
-        "targets",
-        "config",
-        "progress",
-        "records",
-        "machine",
-        "trackers",
-        "shape_prior",
-        "setup",
-        "evaluate",
-    ),
-    *("pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks", "run", "report"),
-)
+    "hints", "rows", "targets", "config", "progress", "records", "machine", "trackers", "shape_prior", "setup",
+    "evaluate", "pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks", "run",
+    "report", "studies",
+)  # fmt: skip
+STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a method that is made of what others maintain
-WITHOUT_TORCH = ("bench.records", "bench.report", "bench.pictures.style", "bench.pictures.size_chart")
+WITHOUT_TORCH = ("bench.records", "bench.report", STUDIES, "bench.pictures.style", "bench.pictures.size_chart")
 COMMON = "datasets.extras"  # without torch, and of use to all but renderers
 REPORT_MAY = (COMMON, "bench.report", "bench.records", "bench.pictures.style", "bench.pictures.size_chart")
 
@@ -86,7 +78,7 @@ def backward(module: str, names: set[str]) -> list[str]:
 def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     """What the source of a module does that it may not do."""
     tree = ast.parse(source)
-    names = imported(tree, module, is_package)
+    names = imported(tree, module, is_package) - {STUDIES}
     top = module.split(".")[0]
     found = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
     found += [f"imports a command: {name}" for name in names if top == "bench" and ".__main__" in name]
@@ -98,8 +90,10 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     if within(module, *WITHOUT_TORCH):
         slow = [name for name in names if within(name, "torch", "renderers", "datasets")]
         found += [f"imports {name}" for name in slow if not within(name, COMMON)]
-    if within(module, "bench.report"):
+    if within(module, "bench.report", STUDIES):
         found += [f"imports {name}" for name in names if name.split(".")[0] in OURS and not within(name, *REPORT_MAY)]
+    if top == "bench":  # a study neither
+        found += [f"imports a study: {name}" for name in names if within(name, STUDIES)]
     if module == "bench":  # runs before every import of bench.report, and before torch may be imported
         found += [f"imports {name}" for name in names if name.split(".")[0] not in sys.stdlib_module_names]
     for node in ast.walk(tree):
@@ -120,9 +114,9 @@ def named(path: Path) -> tuple[str, bool]:
     return ".".join(parts[:-1] if is_package else parts), is_package
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_one_way(path):
-    assert wrongs(path.read_text(), *named(path)) == []
+def test_imports_go_one_way():
+    found = {str(path): wrongs(path.read_text(), *named(path)) for path in modules()}
+    assert {path: wrong for path, wrong in found.items() if wrong} == {}
 
 
 def test_every_package_is_looked_at():
@@ -142,7 +136,7 @@ def test_every_room_has_its_place():
     there = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
     there |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
     commands = {path for path in there if {p.name for p in (ROOT / "bench" / path).rglob("*.py")} == COMMAND_ALONE}
-    assert there - commands == set(ROOMS)
+    assert there - commands | {"studies"} == set(ROOMS)
 
 
 COMMAND_ALONE = {"__init__.py", "__main__.py"}  # of a folder that holds a command and nothing to import
@@ -153,59 +147,66 @@ def test_conf_holds_yaml_only():
     assert {path.name for path in held if path.suffix != ".yaml"} <= {"__init__.py", "README.md"}
 
 
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("renderers.dist", "import datasets"),
-        ("renderers.dist", "from datasets.scene import Scene"),
-        ("renderers.dist", "def f():\n    from bench.config import build"),
-        ("renderers.dist", "import numpy as np"),
-        ("renderers.fields.mlp", "from ...bench import config"),
-        ("renderers.fields.mlp", "from torchvision import ops"),
-        ("datasets.scene", "import bench.records"),
-        ("datasets.scene", "from bench import records"),
-        ("datasets.scene", "if True:\n    import conf"),
-        ("bench.run.run", "from tests.renderers.analytic_cases import CASES"),
-        ("bench.run.run", "from bench.report.write.html import write_index"),
-        ("bench.solve.optimise", "from bench.tasks.task import Task"),
-        ("bench.records.record", "def f():\n    import bench.report"),
-        ("bench.records.record", "import torch"),
-        ("bench.config", "from bench.records.record import Record"),
-        ("bench.run.run", "from bench.merge.__main__ import merge"),
-        ("bench.report.write.html", "import torch.nn"),
-        ("bench.report.write.html", "from torch import Tensor"),
-        ("bench.report.write.html", "from bench.solve.solve import COSTS"),
-        ("bench.report.write.html", "from bench import solve"),
-        ("bench.report.write.html", "from ...solve.solve import COSTS"),
-        ("bench.report.write.html", "from datasets.mesh import Mesh"),
-        ("bench.report", "import renderers"),
-        ("bench", "import torch"),
-        ("conf", "from bench import config"),
-        ("bench.run.run", "from os import *"),
-        ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
-        ("tests.test_layers", "import sys\nsys.path += ['.']"),
-        ("tests.test_layers", "from sys import path"),
-    ],
+WRONG = (
+    ("renderers.dist", "import datasets"),
+    ("renderers.dist", "from datasets.scene import Scene"),
+    ("renderers.dist", "def f():\n    from bench.config import build"),
+    ("renderers.dist", "import numpy as np"),
+    ("renderers.fields.mlp", "from ...bench import config"),
+    ("renderers.fields.mlp", "from torchvision import ops"),
+    ("datasets.scene", "import bench.records"),
+    ("datasets.scene", "from bench import records"),
+    ("datasets.scene", "if True:\n    import conf"),
+    ("bench.run.run", "from tests.renderers.analytic_cases import CASES"),
+    ("bench.run.run", "from bench.report.write.html import write_index"),
+    ("bench.solve.optimise", "from bench.tasks.task import Task"),
+    ("bench.records.record", "def f():\n    import bench.report"),
+    ("bench.records.record", "import torch"),
+    ("bench.config", "from bench.records.record import Record"),
+    ("bench.run.run", "from bench.merge.__main__ import merge"),
+    ("bench.report.write.html", "import torch.nn"),
+    ("bench.report.write.html", "from torch import Tensor"),
+    ("bench.report.write.html", "from bench.solve.solve import COSTS"),
+    ("bench.report.write.html", "from bench import solve"),
+    ("bench.report.write.html", "from ...solve.solve import COSTS"),
+    ("bench.report.write.html", "from datasets.mesh import Mesh"),
+    ("bench.report", "import renderers"),
+    ("bench", "import torch"),
+    ("conf", "from bench import config"),
+    ("bench.run.run", "from os import *"),
+    ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
+    ("tests.test_layers", "import sys\nsys.path += ['.']"),
+    ("tests.test_layers", "from sys import path"),
+    ("bench.run.run", "from bench.studies import completion"),
+    ("bench.__main__", "import bench.studies.completion"),
+    ("bench.report.write.html", "from ...studies.completion import make"),
+    ("bench.studies.completion", "from bench.studies.table1 import make"),
+    ("bench.studies.completion", "from .table1 import make"),
+    ("bench.studies.completion", "import torch"),
+    ("bench.studies.completion", "from bench.tasks.task import Task"),
 )
-def test_the_checker_finds_what_is_wrong(module, source):
-    assert wrongs(source, module, is_package=module in ("bench", "bench.report", "conf"))
+RIGHT = (
+    ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
+    ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
+    ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
+    ("bench.run.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
+    ("bench.__main__", "from bench.report.write.html import write_index"),
+    ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
+    ("bench", "import os"),
+    ("benchmark.report", "import datasets_of_others"),
+    ("bench.report.write.paper", "from bench import studies"),
+    ("bench.studies.completion", "import pandas as pd\nfrom bench.report.data.statistics import geometric"),
+)
 
 
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
-        ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
-        ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
-        ("bench.run.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
-        ("bench.__main__", "from bench.report.write.html import write_index"),
-        ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
-        ("bench", "import os"),
-        ("benchmark.report", "import datasets_of_others"),
-    ],
-)
-def test_the_checker_lets_pass_what_is_right(module, source):
-    assert wrongs(source, module, is_package=module == "bench") == []
+def test_the_checker_finds_what_is_wrong():
+    for module, source in WRONG:
+        assert wrongs(source, module, is_package=module in ("bench", "bench.report", "conf")), (module, source)
+
+
+def test_the_checker_lets_pass_what_is_right():
+    for module, source in RIGHT:
+        assert wrongs(source, module, is_package=module == "bench") == [], (module, source)
 
 
 @jaxtyped(typechecker=checked)
@@ -221,3 +222,10 @@ def test_types_and_shapes_are_checked_of_arguments_and_of_results():
             _first(*arguments)
     with pytest.raises(TypeCheckError, match="return value"):  # of shape (4, 3), where n is (4,)
         _first(torch.zeros(4, 3), 1)
+
+
+def test_make_test_types_checks_every_call_of_ours():
+    code = "import tests.conftest, torch; from renderers.fields.analytic import sphere; sphere().rotate(torch.eye(4))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CHECK_TYPES": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert "TypeCheckError" in done.stderr
