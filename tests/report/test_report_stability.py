@@ -2,14 +2,13 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose, named_by_rows, shared_loss
 from bench.report.data.records import row_of
 from bench.report.data.subjects.atlas import STABILITY, atlas
-from bench.report.pages.stability import stability, stability_curves, stability_failures
+from bench.report.pages.stability import stability, stability_curves
 from bench.report.write.paper import write_paper
 from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
 
@@ -222,26 +221,12 @@ def test_curves_have_a_row_a_level_with_its_interval(tmp_path):
     assert data["level"].iloc[-1] == 1.0
 
 
-def test_first_failures_are_drawn_with_the_truth_beside(tmp_path):
-    kinds = np.zeros((8, 8), dtype=np.uint8)
-    kinds[2:4] = 2
-    for label, level, severity in (("DIST", 0.5, 0.3), ("DVR", 0.4, 0.2)):
-        folder = broke(tmp_path, "wires", label, level)
-        np.savez(folder / "images.npz", kinds=kinds, true_distance=np.ones((8, 8)), severity=severity)
-    broke(tmp_path, "depth_noise", "DIST", 0.5, measure="fit")  # has no picture
-    result = made(tmp_path, stability_failures.make)
-    assert result.data[["axis", "row", "severity", "lost"]].to_numpy().tolist() == [["wires", "DIST", 0.3, 16]]
-
-
-def test_all_four_are_written(tmp_path):
+def test_all_three_are_written(tmp_path):
     folder = broke(tmp_path, "wires", "DIST", 0.5)
     (folder / "curve.jsonl").write_text("not a line\n")
-    (folder / "images.npz").write_bytes(b"nothing")
     written = write_paper(read_records(tmp_path)[0], tmp_path)
-    assert [path.stem for path in written] == [
-        "stability", "stability_cost", "stability_curves", "stability_failures",
-    ]  # fmt: skip
-    for path in written[:3]:
+    assert [path.stem for path in written] == ["stability", "stability_cost", "stability_curves"]
+    for path in written:
         assert path.with_suffix(".png").stat().st_size > 1000
 
 
