@@ -21,8 +21,6 @@ PAPER = Path(__file__).parents[2] / "results" / "paper"
 WITHOUT = {
     "single_view_figures",
     "dvr_figures",
-    "parsimony_flops",
-    "parsimony_needs",
     "completion_gallery",
     "misplaced_gallery",
     "multiview_gallery",

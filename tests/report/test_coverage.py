@@ -18,8 +18,6 @@ from bench.report.data.statistics import (
     clopper_pearson,
     geometric,
     geometric_ratio,
-    hypervolume,
-    hypervolume_interval,
     interquartile_mean,
     kaplan_meier,
     median,
@@ -124,24 +122,6 @@ def test_ratios_of_geometric_means(size):
         return covered(geometric_ratio(list(1.25 * first), list(second)), 1.25)
 
     assert simulated(one, 3000) >= LEAST
-
-
-@MANY
-@pytest.mark.parametrize("size", [(6, 1), (8, 2)], ids=str)
-def test_hypervolumes(size, simulations):
-    costs, errors = np.exp([0.0, 0.7, 1.5]), np.exp([1.5, 1.0, 0.0])  # true medians of three settings
-    reference = (20.0, 20.0)
-
-    def one(generator, seed):
-        points = []
-        slow, hard = (np.exp(s * generator.normal(size=(size[0], 1))) for s in (0.3, BETWEEN))  # the same for all
-        for cost, error in zip(costs, errors, strict=True):
-            noisy = (np.exp(s * generator.normal(size=size)) for s in (0.1, WITHIN))
-            points.append(tuple(list(x * of * n) for x, of, n in zip((cost, error), (slow, hard), noisy, strict=True)))
-        area = hypervolume_interval(points, reference=reference, seed=seed, draws=DRAWS)
-        return covered(area, float(hypervolume(costs, errors, reference=reference)))
-
-    assert simulated(one, simulations) >= LEAST
 
 
 @pytest.mark.parametrize("size", [(6, 1), (6, 8), (8, 2), (8, 4), (16, 8)], ids=str)

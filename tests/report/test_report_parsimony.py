@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 from omegaconf import OmegaConf
 
 from bench.pictures.size_chart import KINDS
@@ -130,10 +129,10 @@ def test_captions_find_their_settings_where_the_configuration_has_them(compose_c
 
 
 def test_plotted_numbers_stand_as_csv_a_line_per_candidate(four):
-    for made in (made_of(four, parsimony.make), made_of(four, parsimony.make_flops)):
-        assert len(made.data) == 3 + 3 + 3 + 1
-        ringed = made.data[made.data["recommended"] == True]  # noqa: E712, a column of objects
-        assert list(ringed["rung"]) == ["sphere", "box", "grid_24"]
+    made = made_of(four, parsimony.make)
+    assert len(made.data) == 3 + 3 + 3 + 1
+    ringed = made.data[made.data["recommended"] == True]  # noqa: E712, a column of objects
+    assert list(ringed["rung"]) == ["sphere", "box", "grid_24"]
     assert list(made.data["error"].dropna())[:3] == pytest.approx([2e-4, 0.1, 4e-3])
 
 
@@ -146,13 +145,12 @@ def test_a_candidate_that_failed_is_counted_named_and_crossed(tmp_path):
     assert [list(line.get_xdata()) for line in crosses] == [[9]]
 
 
-@pytest.mark.parametrize(("function", "size"), [(parsimony.make, 9), (parsimony.make_flops, 18)])
-def test_the_recommended_candidate_is_ringed_not_the_best(four, function, size):
-    figure = made_of(four, function).figure
+def test_the_recommended_candidate_is_ringed_not_the_best(four):
+    figure = made_of(four, parsimony.make).figure
     titles = [axis.get_title() for axis in figure.axes]
     assert titles == ["ball\nneeds sphere", "box\nneeds box", "car\nneeds grid 24", "torus\n"]
     ring = next(line for line in figure.axes[1].lines if line.get_label() == "recommended")
-    assert np.column_stack(ring.get_data()).tolist() == [[size, pytest.approx(0.01)]]
+    assert np.column_stack(ring.get_data()).tolist() == [[9, pytest.approx(0.01)]]
     assert [text.get_text() for text in figure.axes[3].texts] == ["crashed"]
     assert len(figure.legends) == 1
 
@@ -172,25 +170,6 @@ def test_a_place_that_is_left_over_holds_the_legend(four):
     assert figure.axes[-1].get_legend() is not None
 
 
-def test_need_over_what_the_best_single_part_leaves(four):
-    made = made_of(four, parsimony.make_needs)
-    data = made.data.set_index("scene")
-    assert list(data["single_part_error_footprints"][:3]) == pytest.approx([0.01, 0.5, 8])
-    assert list(data["recommended_free"][:3]) == [4, 9, 3000]
-    assert list(data["recommended_stored"][:3]) == [4, 9, 13_824]
-    assert data.loc["torus", "single_part_error_footprints"] is None
-    assert "3 of 4 scenes are drawn." in made.caption
-    axis = made.figure.axes[0]
-    assert {text.get_text() for text in axis.texts} == {"ball", "box", "car", "half a pixel"}
-    levels = [line.get_ydata()[0] for line in axis.lines if line.get_label() in ("a tenth of it", "papers' network")]
-    assert levels == pytest.approx([PAPERS, PAPERS / 10])
-    colours = {to_hex(c.lines[0].get_color()): list(c.lines[0].get_ydata()) for c in axis.containers}
-    assert colours == {KINDS[""][1]: [4, 9], KINDS["grid"][1]: [13_824]}
-
-
-PAGES = (parsimony.make, parsimony.make_flops, parsimony.make_needs)
-
-
 def by_free_numbers(results, scene) -> None:
     """A run whose choice was by free numbers."""
     climbed(results, scene, {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
@@ -203,40 +182,19 @@ def test_a_choice_by_free_numbers_is_told(tmp_path):
     assert made.figure.axes[0].get_xlabel() == "free numbers"
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_captions_and_notes_say_by_which_size_the_choice_is(four, page):
-    made = made_of(four, page)
+def test_captions_and_notes_say_by_which_size_the_choice_is(four):
+    made = made_of(four, parsimony.make)
     assert "The size of a field is its stored numbers." in made.notes
-    assert page is parsimony.make_flops or "tored numbers" in made.caption
-    if page is not parsimony.make_needs:
-        assert any("the smallest candidate by stored numbers whose error" in note for note in made.notes)
+    assert "stored numbers" in made.caption
+    assert any("the smallest candidate by stored numbers whose error" in note for note in made.notes)
 
 
 def test_choices_by_different_sizes_are_told(tmp_path):
     by_free_numbers(tmp_path, "car")
     climbed(tmp_path, "box", {"sphere": 7, "box": 0.5}, needs="box")
     told = "not the same for all scenes: stored numbers for box; free numbers for car."
-    for page in (*PAGES, parsimony_auto.make):
+    for page in (parsimony.make, parsimony_auto.make):
         assert any(note.endswith(told) for note in page(chosen(tmp_path)).notes)
-
-
-def test_names_of_near_points_do_not_cover_each_other(tmp_path):
-    for scene in ("one", "two", "three", "four"):
-        climbed(tmp_path, scene, {"sphere": 8, "box": 0.5}, needs="box")
-    figure = parsimony.make_needs(chosen(tmp_path)).figure
-    figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in figure.axes[0].texts if text.get_text() != "half a pixel"]
-    assert len(boxes) == 4
-    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
-
-
-def test_a_name_beside_a_point_at_the_left_stays_clear_of_the_axis(tmp_path):
-    for scene in ("sphere", "box", "capsule", "rounded_box"):
-        climbed(tmp_path, scene, {"sphere": 8, "box": 0.1}, needs="box")
-    figure = parsimony.make_needs(chosen(tmp_path)).figure
-    figure.draw_without_rendering()
-    axes = figure.axes[0]
-    assert min(text.get_window_extent().x0 for text in axes.texts) >= axes.get_window_extent().x0
 
 
 @pytest.mark.parametrize(
@@ -315,10 +273,10 @@ def test_scenes_that_differ_in_their_shape_have_it_in_their_names(tmp_path):
     assert [run.name for run in scene_runs(chosen(tmp_path))] == ["car, shape 0", "car, shape 1"]
 
 
-def test_the_report_writes_all_four_even_where_all_runs_failed(tmp_path):
+def test_the_report_writes_both_even_where_all_runs_failed(tmp_path):
     climbed(tmp_path, "car", {"sphere": 8}, needs="sphere", status="timeout")
     written = write_paper(read_records(tmp_path)[0], tmp_path)
-    names = ["parsimony", "parsimony_flops", "parsimony_needs", "parsimony_auto"]
+    names = ["parsimony", "parsimony_auto"]
     assert [path.stem for path in written] == names
     assert all(path.with_suffix(".png").is_file() for path in written)
     assert "timeout" in (tmp_path / "paper" / "parsimony_auto.md").read_text()

@@ -12,7 +12,8 @@ from bench.records.read import read_records
 from bench.report.data.curves import history_of
 from bench.report.data.experiments import choose
 from bench.report.data.subjects.speed import COMPLETION, TARGET, TRIALS, settings
-from bench.report.pages.speed import loss_chamfer, speed, speed_curves
+from bench.report.pages.speed import speed, speed_curves
+from bench.report.write import chart
 from bench.report.write.answer import write_answers
 from bench.report.write.html import write_index
 from bench.report.write.paper import write_paper
@@ -103,6 +104,17 @@ def test_failed_and_dominated_points_are_drawn(three):
     assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
 
 
+@pytest.mark.parametrize(("names", "x"), [(("one", "two", "three", "four"), 0.5), (("capsule", "rounded box"), 0.01)])
+def test_names_of_near_points_cover_neither_each_other_nor_the_axis(names, x):
+    _, ((axes,),) = chart.sheet(3.4)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    chart.name_points(axes, [(name, x, 0.5) for name in names])
+    axes.figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    assert min(box.x0 for box in boxes) >= axes.get_window_extent().x0
+
+
 def test_one_draw_has_no_probability(tmp_path):
     for label, errors in (("fast", [9, 6]), ("good", [9, 5, 1])):
         completed(tmp_path, label, errors)
@@ -167,13 +179,9 @@ def test_a_look_costs_what_was_spent_before_it(three):
 def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
     assert TARGET == 1e-3
     table = made(three, speed_curves.make).table.set_index("Setting")
-    assert table.loc["good"].tolist() == ["3", "3", "3.00 s"]
-    assert table.loc["bad"].tolist() == ["3", "0", "–"]
-    assert table.loc["broken"].tolist() == [
-        "3",
-        "1",
-        "1.00 s",
-    ]  # failed runs did not, whatever they scored
+    assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
+    assert table.loc["bad"].tolist() == ["3", "0", "–", "0.775"]
+    assert table.loc["broken"].tolist() == ["3", "1", "1.00 s", "–"]  # failed runs did not, whatever they scored
 
 
 def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_path):
@@ -243,32 +251,15 @@ def test_renderings_of_another_size_are_not_compared(tmp_path):
     assert data["evaluations"].tolist() == [1000, 1000]
 
 
-def test_the_hypervolume_is_that_of_the_renderers_settings(tmp_path):
-    for index in range(2):
-        completed(tmp_path, "one", [9, 9, 1], index=index)
-        completed(tmp_path, "two", [9, 9, 10], index=index, renderer="idr")
-    data = made(tmp_path, speed.make_volume).data.set_index("renderer")
-    assert data.loc["dist", ["reference_seconds", "reference_error"]].tolist() == [4.0, 20.0]
-    assert data.loc["dist", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 1))
-    assert data.loc["idr", "hypervolume"] == pytest.approx(np.log10(4 / 2) * np.log10(20 / 10))
-
-
 def test_loss_and_error_are_correlated_by_rank(three):
-    data = made(three, loss_chamfer.make).data.set_index("row")
-    assert data.loc["good", ["within", "together", "looks", "runs"]].tolist() == [1.0, 1.0, 9, 3]
-    assert data["together"].isna()["fast"]  # one look is no correlation
+    ranks = made(three, speed_curves.make).table.set_index("Setting")["ρ of loss and error"]
+    assert ranks.to_dict() == {"good": "1.00", "bad": "0.775", "fast": "–", "broken": "–"}  # one look has none
 
 
 def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
     completed(tmp_path, "dist", [9, 5, 1])
     folder = completed(tmp_path, "idr", [9, 5, 1], status="timeout", renderer="idr")
     (folder / "curve.jsonl").unlink()
-    for make in (speed.make_front, speed.make_volume, speed_curves.make, loss_chamfer.make):
+    for make in (speed.make_front, speed_curves.make):
         result = made(tmp_path, make)
         assert "idr" in result.table.to_string()
-
-
-def test_an_error_of_zero_does_not_break_the_volume(tmp_path):
-    rendered(tmp_path, "dist", 1.0, 0.0)
-    rendered(tmp_path, "idr", 0.5, 0.02)
-    assert np.isfinite(made(tmp_path, speed.make_volume).data["hypervolume"].astype(float)).all()

@@ -18,8 +18,6 @@ from bench.report.data.statistics import (
     geometric,
     geometric_ratio,
     holm,
-    hypervolume,
-    hypervolume_interval,
     interquartile_mean,
     kaplan_meier,
     median,
@@ -121,7 +119,6 @@ def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     for found in (
         bootstrap(groups, mean, seed=0),
         paired_bootstrap(groups, groups, mean, seed=0),
-        hypervolume_interval([(groups_plus_one(groups), groups_plus_one(groups))], reference=(9, 9), seed=0),
         share(np.ones(n), 2 * np.ones(n)),
         wins(groups, groups),
     ):
@@ -131,10 +128,6 @@ def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     assert found.value == n / 2 + 0.5 and found.points == tuple(i + 1.0 for i in range(n))
     six = bootstrap(singles(*range(6)), mean, seed=0)
     assert FEWEST_SHAPES == 6 and six.known and str(six) == f"2.50 {six.ends()}"
-
-
-def groups_plus_one(groups):
-    return [group + 1 for group in groups]
 
 
 def test_shapes_with_unequal_numbers_of_seeds():
@@ -396,46 +389,6 @@ def test_front_of_uncertain_cases():
     assert chances == pytest.approx([0.5, 0.5], abs=0.08)
     # A failure on one shape of two: the median is infinite if it is drawn at all.
     assert front([point((1, 1), (1, INF))], seed=0, draws=8000) == pytest.approx([0.25], abs=0.02)
-
-
-@pytest.mark.parametrize(
-    "costs, errors, expected",
-    [
-        ([10], [0.01], 1 * 2),
-        ([1, 10], [0.1, 0.01], 1 * 1 + 1 * 2),
-        ([10, 1], [0.01, 0.1], 3),
-        ([1, 10, 10, 20], [0.1, 0.01, 0.05, 0.5], 3),  # dominated points add nothing
-        ([1000, 1, INF, 1], [0.001, 10, 0.1, INF], 0),  # beyond the reference
-    ],
-)
-def test_hypervolume(costs, errors, expected):
-    assert hypervolume(costs, errors, reference=(100, 1)) == pytest.approx(expected)
-
-
-@given(st.lists(st.tuples(st.floats(0.01, 1e3), st.floats(0.01, 1e3)), min_size=2, max_size=6))
-def test_hypervolume_of_more_points_is_no_less_and_at_most_the_sum(points):
-    costs, errors = np.array(points).T
-    area = hypervolume(costs, errors, reference=(100, 10))
-    fewer, last = (hypervolume(costs[i], errors[i], reference=(100, 10)) for i in (slice(-1), slice(-1, None)))
-    assert max(fewer, last) - 1e-9 <= area <= fewer + last + 1e-9
-
-
-@pytest.mark.parametrize("costs, errors, reference", [([0], [1], (9, 9)), ([1], [0], (9, 9)), ([1], [1], (9, INF))])
-def test_hypervolume_needs_logarithms(costs, errors, reference):
-    with pytest.raises(ValueError, match="above 0"):
-        hypervolume(costs, errors, reference=reference)
-
-
-def test_hypervolume_interval_is_that_of_the_median():
-    # One setting of cost 10: the area is 1 (to the cost of 100) times the digits between its median error and 1.
-    errors = 10 ** np.random.default_rng(0).uniform(-4, -1, (9, 2))
-    interval = hypervolume_interval([(list(np.full((9, 2), 10.0)), list(errors))], reference=(100, 1), seed=3)
-    expected = bootstrap(list(errors), median, seed=3)
-    assert (interval.value, interval.high, interval.low) == pytest.approx(
-        (-math.log10(expected.value), -math.log10(expected.low), -math.log10(expected.high))
-    )
-    failed = [point((1,) * 6, (INF,) * 6)]
-    assert hypervolume_interval(failed, reference=(100, 1), seed=3) == Interval(0, 0, 0)
 
 
 def test_the_interval_of_a_geometric_mean_is_students_over_the_shapes():

@@ -338,36 +338,6 @@ def front(points: Sequence[Point], *, seed: int, draws: int = 2000) -> list[floa
     return (~dominated(costs, errors) & np.isfinite(costs) & np.isfinite(errors)).mean(axis=0).tolist()
 
 
-def hypervolume(costs: Values, errors: Values, *, reference: tuple[float, float]) -> float | np.ndarray:
-    """The area [...] that points [..., n] dominate up to the reference's cost and error, in powers of ten of both.
-
-    A point beyond the reference in either adds nothing.
-
-    Raises:
-        ValueError: a cost, an error or the reference is not above 0, so that its logarithm is not finite.
-    """
-    costs, errors = _checked(costs), _checked(errors)
-    if not (min(reference) > 0 and math.isfinite(max(reference)) and (costs > 0).all() and (errors > 0).all()):
-        raise ValueError(
-            f"costs, errors and the finite reference {reference} must be above 0: add what can be resolved"
-        )
-    x, y = (np.log10(np.minimum(v, limit)) for v, limit in zip((costs, errors), reference, strict=True))
-    order = np.argsort(x, axis=-1)
-    x = np.take_along_axis(x, order, axis=-1)
-    lowest = np.minimum.accumulate(np.take_along_axis(y, order, axis=-1), axis=-1)
-    corner = np.log10(reference)
-    return (np.diff(x, axis=-1, append=np.full_like(x[..., :1], corner[0])) * (corner[1] - lowest)).sum(axis=-1)
-
-
-def hypervolume_interval(
-    points: Sequence[Point], *, reference: tuple[float, float], seed: int, level: float = 0.95, draws: int = 2000
-) -> Interval:
-    """The hypervolume of the settings' medians with its interval; all settings get the same shapes and seeds."""
-    resampled = _resample([groups for point in points for groups in point], median, seed, draws)
-    value, drawn, shapes = (hypervolume(v[0::2].T, v[1::2].T, reference=reference) for v in resampled)
-    return _interval(value, drawn, shapes, level)
-
-
 def several(groups: Groups) -> bool:
     """Whether there is more than one run: from one alone no probability and no rank is given."""
     return len(flat(groups)) > 1

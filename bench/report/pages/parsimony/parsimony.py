@@ -1,11 +1,7 @@
-"""Model selection: each candidate's error over its size and over the FLOPs of a query, and a scene's need.
-
-A scene's need is the size of its recommended field; its complexity is measured as the error of the best single part.
-"""
+"""Model selection: each candidate's error over its size, and the smallest sufficient one of each scene."""
 
 import math
 from collections.abc import Sequence
-from operator import itemgetter
 from typing import Any
 
 import pandas as pd
@@ -16,7 +12,6 @@ from bench.pictures import style
 from bench.pictures.size_chart import AXES, FLOPS, KINDS, CandidateResult, panel
 from bench.records import format
 from bench.report.data.experiments import Experiment
-from bench.report.data.records import grouped
 from bench.report.data.subjects.parsimony import (
     PARSIMONY,
     SIZES,
@@ -26,7 +21,6 @@ from bench.report.data.subjects.parsimony import (
     measure_note,
     measure_of,
     named_settings,
-    over,
     scene_runs,
     spread,
 )
@@ -36,8 +30,6 @@ from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, percent, shown, text, thousandfold, through, to_data, to_table
 
 PLACE = 160
-PLACE_FLOPS = 170
-PLACE_NEEDS = 180
 READS = (PARSIMONY,)
 INTERVAL = "± and bars are one standard error, by the jackknife over views"
 NOTES = (
@@ -63,16 +55,6 @@ TABLE = (
     "Chamfer distance to the true surface is computed afterwards and takes no part in the choice; as points are "
     "sampled on both surfaces, it is not 0 for the true shape.",
 )
-QUERY = (
-    "A query computes one value of the field; its floating-point operations are counted for networks, and estimated "
-    "for formulas and grids."
-)
-MOST_ERROR = 10.0  # half pixels: largest error of a ray
-NEEDS_NOTES = (
-    "A single part is a sphere or a kind of box with at most 11 numbers: the error of the best one measures the "
-    f"complexity of the scene from the data alone. The error of a ray is at most {MOST_ERROR:g} half pixels.",
-    "The dashed line is the size of the papers' network, the dotted one a tenth of it.",
-)
 MOST = 4  # most panels in a row
 
 
@@ -89,43 +71,6 @@ def make(experiment: Experiment) -> Result:
         data=to_data(CANDIDATES, _candidate_lines(runs)),
         table=scene_table(COLUMNS, runs),
         figure=draw(runs, measure_of(runs)),
-    )
-
-
-def make_flops(experiment: Experiment) -> Result:
-    """Makes the page with a panel per scene over FLOPs per query."""
-    runs = scene_runs(experiment)
-    return Result(
-        experiment,
-        "Error over the cost of a query of the field.",
-        "Held-out error of each candidate over its FLOPs per query, a panel per scene.",
-        interval=INTERVAL,
-        remarks=(QUERY, measure_note(runs), *_notes(experiment, AXES[measure_of(runs)], *NOTES)),
-        data=to_data(QUERIES, _candidate_lines(runs)),
-        figure=draw(runs, FLOPS),
-    )
-
-
-def make_needs(experiment: Experiment) -> Result:
-    """Makes the page with a point per scene: the size of its recommended field over its complexity."""
-    runs = scene_runs(experiment)
-    measure = measure_of(runs)
-    lines = [(run, _need(run, measure)) for run in runs]
-    needs = [need for _, need in lines if need]
-    unknown = [run.name for run, need in lines if run.ok and not need]
-    return Result(
-        experiment,
-        "Size of the field that each scene needs over its complexity.",
-        f"{AXES[measure].capitalize()} of the recommended field, by which it is the smallest sufficient one, over the "
-        f"held-out error of the best single part, in half pixels; {len(needs)} of {len(runs)} scenes are drawn.",
-        interval=INTERVAL,
-        remarks=(
-            f"Not drawn, as no single part was fitted: {', '.join(unknown)}." if unknown else "",
-            measure_note(runs),
-            *NEEDS_NOTES,
-        ),
-        data=to_data(NEEDS, lines),
-        figure=draw_needs(needs, papers_size(runs, measure), AXES[measure]),
     )
 
 
@@ -220,50 +165,6 @@ def _error(result: CandidateResult) -> str:
     return spread(result.error, result.numbers.get("standard_error"))
 
 
-def papers_size(runs: list[SceneRun], measure: str) -> float | None:
-    """The size of the papers' network, computed from the runs' savings; None where unknown."""
-    known = ((run.number(f"saved_{measure}"), run.number(f"recommended_{measure}")) for run in runs)
-    return next((saved * size for saved, size in known if saved and size), None)
-
-
-@style.styled
-def draw_needs(needs: list[dict[str, Any]], papers: float | None, size: str) -> Figure:
-    """Draws the size, of the measure in words, over the complexity, with a colour per kind of candidate."""
-    figure, ((axes,),) = chart.sheet(3.4)
-    of_kind = grouped(needs, itemgetter("kind"))
-    for kind, (label, colour, marker) in KINDS.items():
-        if kind in of_kind:
-            x, y, bars = ([need[key] for need in of_kind[kind]] for key in ("complexity", "size", "spread"))
-            axes.errorbar(x, y, xerr=bars, fmt=marker, color=colour, ms=6, elinewidth=0.7, label=label)
-    if papers is not None:
-        for height, line, label in ((papers, "--", "papers' network"), (papers / 10, ":", "a tenth of it")):
-            axes.axhline(height, color="#777777", lw=0.9, ls=line, label=label)
-    axes.axvline(1.0, color="#bbbbbb", lw=0.8, zorder=0)
-    small = {"textcoords": "offset points", "fontsize": 6, "color": "#777777", "va": "center"}
-    axes.annotate("half a pixel", (1.0, 0.45), (3, 0), xycoords=("data", "axes fraction"), **small)
-    axes.set(xlim=(-0.5, MOST_ERROR + 0.5), xlabel="held-out error of the best single part (half pixels)", yscale="log")
-    axes.set_ylabel(f"{size} of the recommended field")
-    axes.margins(y=0.1)
-    style.legend_below(figure, axes, columns=6)
-    chart.name_points(axes, [(need["name"], need["complexity"], need["size"]) for need in needs])
-    return figure
-
-
-def _need(run: SceneRun, measure: str) -> dict[str, Any]:
-    """The complexity with its standard error, in half pixels, and the size and kind of the recommended candidate.
-
-    Empty where the run did not end ok, or no single part was fitted.
-    """
-    parts = [result for result in run.candidates.results if result.kind == "" and result.error is not None]
-    if not run.ok or not parts:
-        return {}
-    best = min(parts, key=lambda result: result.error)
-    footprint, chosen = run.candidates.footprint, run.candidates.chosen
-    spread = (best.numbers.get("standard_error") or 0.0) / footprint
-    need = {"name": run.name, "kind": chosen.kind, "size": chosen.numbers[measure]}
-    return {**need, "complexity": best.error / footprint, "spread": spread}
-
-
 SAVED = ("stored", "free", "bytes", "flops_per_query", "seconds")
 SPENT = ("seconds", "evaluations", "flops")
 OF_SCENE = ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")
@@ -295,20 +196,6 @@ COLUMNS = (
     Column("saved_seconds", "Saved fit seconds", show=factor),
     Column("chamfer_l2", "Chamfer × 1000", show=thousandfold),
     shown("Failed candidates", lambda run: f"{len(_failed_fits(run))} of {len(run.candidates.results)}"),
-)
-QUERIES = (
-    *through(lambda line: line[0], *SCENE, Column("footprint")),
-    *through(_of_candidate, *CANDIDATE, *map(Column, (FLOPS, "error", "standard_error", "failed"))),
-)
-NEEDS = (  # of a run and its need
-    *through(lambda line: line[0], *SCENE),
-    Column("single_part_error_footprints", value=lambda line: line[1].get("complexity")),
-    Column("single_part_standard_error_footprints", value=lambda line: line[1].get("spread")),
-    *through(lambda line: line[0], Column("footprint"), Column("recommended_field")),
-    Column("kind", value=lambda line: KINDS[line[1]["kind"]][0] if line[1] else None),
-    *through(lambda line: line[0], Column("recommended_by"), *(Column(f"recommended_{size}") for size in SIZES)),
-    Column("share_of_papers_network_stored", value=lambda line: over(1.0, line[0].number("saved_stored"))),
-    Column("share_of_papers_network_free", value=lambda line: over(1.0, line[0].number("saved_free"))),
 )
 
 

@@ -1,6 +1,5 @@
-"""The Pareto front of error and time, and the hypervolume that each renderer's settings dominate in their plane."""
+"""The Pareto front of error and time."""
 
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment, together
-from bench.report.data.records import grouped
 from bench.report.data.subjects.speed import (
     SEED,
     TRIALS,
@@ -31,7 +29,6 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, defined, shown, text, to_data, to_table
 
 PLACE_FRONT = 80
-PLACE_VOLUME = 100
 READS = tuple(trial.selection for trial in TRIALS)
 NOTE = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
 NOTES = (
@@ -63,27 +60,6 @@ def make_front(completion: Experiment | None, rendering: Experiment | None) -> R
         data=to_data([*columns, text("resolution", value=lambda point: resolution(point.row.records[0]))], points),
         table=to_table(columns, points),
         figure=draw(panels),
-    )
-
-
-def make_volume(completion: Experiment | None, rendering: Experiment | None) -> Result:
-    """Makes the page, with a line per renderer: the area that its settings dominate, with its interval."""
-    settings = trials(completion, rendering)
-    areas = [area for rows in settings for area in _volumes(rows)]
-    lines = [line for line, _ in areas]
-    return Result(
-        together(completion, rendering),
-        "Area that each renderer dominates in the plane of error and time.",
-        "Area dominated by the medians of a renderer's settings, in powers of ten of seconds times powers of ten of "
-        "error, up to twice the largest finite median of either; larger is better.",
-        interval="95 % bootstrap intervals over {shapes and seeds}",
-        estimates=[area for _, area in areas],
-        remarks=(
-            "More settings can only add to the area: it does not rank renderers with different numbers of settings.",
-            sizes(*settings),
-        ),
-        data=to_data(VOLUME, lines),
-        table=to_table(VOLUME, lines),
     )
 
 
@@ -133,23 +109,6 @@ def _panel(axis: Axes, panel: list[Placed]) -> None:
     axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
 
 
-def _volumes(rows: list[Setting]) -> list[tuple[dict[str, Any], statistics.Interval]]:
-    """The lines of a trial, one per renderer, and their areas; none where all medians are infinite."""
-    finite = np.array([row.point for row in rows if np.isfinite(row.point).all()])
-    if not len(finite):
-        return []
-    reference = tuple(float(x) for x in 2 * finite.max(axis=0))
-    lines = []
-    for renderer, of_renderer in grouped(rows, lambda row: row.renderer).items():
-        points = [(row.costs, row.errors) for row in of_renderer]
-        area = statistics.hypervolume_interval(points, reference=reference, seed=SEED)
-        identity = {"trial": rows[0].trial.title, "renderer": renderer, "settings": len(points)}
-        numbers = {"hypervolume": area.value, "low": area.low, "high": area.high, "ends": area.ends()}
-        limits = {"reference_seconds": reference[0], "reference_error": reference[1]}
-        lines.append(({**identity, **numbers, **limits}, area))
-    return lines
-
-
 def _of(point: Placed) -> tuple[statistics.Groups, statistics.Groups]:
     """The seconds and the errors of a point, per shape."""
     return point.row.costs, point.row.errors
@@ -187,12 +146,6 @@ COLUMNS = (  # of a point
     shown("Failed", _failed),
     Column("on_front", "P(on the front)", lambda point: point.chance, defined),
     Column("dominated", value=lambda point: point.dominated),
-)
-VOLUME = (
-    *(text("trial", "Trial"), text("renderer", "Renderer"), text("settings", "Settings")),
-    *(Column("hypervolume", "Hypervolume"), Column("low"), Column("high")),
-    shown("95 % interval", itemgetter("ends")),
-    *(Column("reference_seconds"), Column("reference_error")),
 )
 
 
@@ -235,13 +188,3 @@ def _hover(row: pd.Series) -> list[str]:
     chance = "" if pd.isna(row["on_front"]) else f"on the front with probability {row['on_front']:.2f}"
     costs = f"{format.seconds(row['seconds'])}, error × 1000 {format.number(row['error'])}"
     return list(filter(None, [str(row["setting"]), costs, failed, chance]))
-
-
-def answer_volume(data: pd.DataFrame, notes: list[str]) -> Answer:
-    """The renderer with the largest area in each trial."""
-    best = data.loc[data.groupby("trial", sort=False)["hypervolume"].idxmax()]
-    said = "; ".join(
-        f"{row['trial']}: {row['renderer']} *{format.number(row['hypervolume'])}* (settings: {row['settings']:.0f})"
-        for _, row in best.iterrows()
-    )
-    return Answer("Which renderer dominates most of the plane of error and time?", f"The largest area: {said}.")

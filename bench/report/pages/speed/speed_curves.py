@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.data.curves import HISTORY, history_of
+from bench.report.data.curves import HISTORY, history_of, spearman
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, Row, loop_seconds
 from bench.report.data.statistics import FEWEST_SHAPES, kaplan_meier
@@ -29,6 +29,8 @@ NOTES = (
     f"Right: the share of runs not yet at {SCALE * TARGET:g} × 10⁻³ (Kaplan and Meier); a run that ended above it is "
     "censored, one that failed remains to the end. The table has all settings, and the median time of the runs that "
     "reached it.",
+    "ρ is Spearman's rank correlation of loss and Chamfer distance over the checkpoints of a run, its median over "
+    "runs.",
 )
 Reached = tuple[float, bool]  # seconds, and whether the target was reached then
 Histories = dict[Row, list[pd.DataFrame]]  # of the runs of each setting
@@ -38,7 +40,7 @@ POINTS = (  # of a record and a point of its history
 )
 COLUMNS = (
     *(text("setting", "Setting"), text("runs", "Runs"), text("reached", "Reached")),
-    Column("median", "Median time to it", show=format.seconds),
+    *(Column("median", "Median time to it", show=format.seconds), Column("rank", "ρ of loss and error")),
 )
 
 
@@ -48,6 +50,7 @@ def make(experiment: Experiment) -> Result:
     shown = {row.row: [history_of(experiment, record) for record in row.records] for row in rows}
     pairs = {row.row: list(zip(row.records, shown[row.row], strict=True)) for row in rows}
     times = {row: [time_to(history, record) for record, history in of_row] for row, of_row in pairs.items()}
+    ranks = {row: [spearman(history.dropna()) for history in of_row] for row, of_row in shown.items()}
     points = [
         (record, point)
         for of_row in pairs.values()
@@ -61,7 +64,7 @@ def make(experiment: Experiment) -> Result:
         interval=_bands(rows),
         remarks=(sizes(rows), *NOTES),
         data=to_data(POINTS, points),
-        table=to_table(COLUMNS, [_line(row, of_row) for row, of_row in times.items()]),
+        table=to_table(COLUMNS, [_line(row, times[row], ranks[row]) for row in times]),
         figure=draw(main_settings(rows), shown, times),
     )
 
@@ -76,10 +79,12 @@ def _few(rows: list[Setting]) -> bool:
     return len({run[0] for row in rows for run in row.keys}) < FEWEST_SHAPES
 
 
-def _line(row: Row, times: list[Reached]) -> dict[str, Any]:
+def _line(row: Row, times: list[Reached], ranks: list[float | None]) -> dict[str, Any]:
     reached = [time for time, hit in times if hit]
     median = float(np.median(reached)) if reached else None
-    return {"setting": row.name, "runs": len(times), "reached": len(reached), "median": median}
+    known = [rank for rank in ranks if rank is not None]
+    numbers = {"median": median, "rank": float(np.median(known)) if known else None}
+    return {"setting": row.name, "runs": len(times), "reached": len(reached), **numbers}
 
 
 @style.styled
