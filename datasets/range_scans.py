@@ -14,13 +14,15 @@ from torch import Tensor
 
 from datasets.dataset import Split
 from datasets.mesh import Mesh, fit_in_sphere, normalise
-from datasets.meshes import load_mesh
-from datasets.truncated import check_whole
+from datasets.meshes import READ_ERRORS, check_whole, load_mesh
+from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
+from datasets.truth import Truth, sample_surface
 from renderers.checks import BadInput, check_share
 
 LONGEST = 4.0  # median edges: points farther apart are not joined, as across a gap or behind an outline
 SCANNER = np.array([0.0, 0.0, 1.0])  # from the object to the scanner, in a scan's own axes (Stanford's repository)
 LINE = "bmesh FILE tx ty tz qx qy qz qw"
+OCTREE = 9  # depth of the octree of a Poisson reconstruction: cells of a 512th of its box
 
 
 @runtime_checkable
@@ -55,13 +57,13 @@ class Scan:
         Raises:
             BadInput: where the file is cut short, or has no points.
         """
-        import open3d
+        import trimesh
 
         try:
             check_whole(self.file)
-        except ValueError as error:
-            raise BadInput(f"scan '{self.file}': {error}") from None
-        points = np.asarray(open3d.io.read_point_cloud(str(self.file)).points)
+            points = np.asarray(getattr(trimesh.load(self.file, process=False), "vertices", ()))
+        except READ_ERRORS as error:
+            raise BadInput(f"scan '{self.file}': must be a whole .ply file ({error}); copy it again") from None
         if len(points) < 3 or not np.isfinite(points).all():
             raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
         faces = Delaunay(points[:, :2]).simplices
@@ -128,7 +130,7 @@ class RangeScans:
 
     @cached_property
     def _read(self) -> Mesh:
-        mesh = load_mesh(self.reference)
+        mesh = load_mesh(self.reference, close=smoothed)
         return replace(mesh, repairs=(f"the true shape is '{self.reference.name}'", *mesh.repairs))
 
     def mesh(self, split: Split, index: int) -> Mesh:
@@ -180,3 +182,22 @@ def _scan(conf: Path, number: int, words: list[str]) -> Scan:
     if not file.is_file():
         raise ValueError(f"'{conf}' names '{name}', which is not beside it: copy it there, or take line {number} out")
     return Scan(file, numbers[:3], numbers[3:])
+
+
+def smoothed(mesh: Mesh) -> Mesh | None:
+    """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
+
+    None where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the other, as where faces are
+    not wound consistently or a hole is wide.
+    """
+    wound = apply(mesh, ("meshing_re_orient_faces_coherently", {}))
+    meshes = mesh_set(wound if wound.volume > 0 else replace(wound, faces=wound.faces[:, ::-1]))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)
+    found = current(meshes, mesh)
+    if not (found.watertight and found.volume > 0):
+        return None
+    for near, far in ((mesh, found), (found, mesh)):
+        points, _ = sample_surface(near, 5000, seed=0)
+        if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
+            return None
+    return with_note(found, "replaced by its Poisson reconstruction, since its parts do not close into a solid")

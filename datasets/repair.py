@@ -1,6 +1,7 @@
 """Repairs triangle meshes: makes them closed solids, and notes every change."""
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,22 +10,25 @@ from datasets.mesh import Mesh
 from datasets.truth import Truth, sample_surface
 
 WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
-THIN = 1e-6  # of the diagonal: a closed part thinner than this on average encloses nothing
+THIN = 2e-6  # of the diagonal: a closed part of less mean thickness encloses nothing
 WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: gaps up to this width are closed by a wrap; coarse to fine
 WRAP_OFFSET = 0.1  # % of the diagonal: how far outside the surface a wrap lies
 HOLLOW_SHARE = 0.15  # of the coarser wrap's volume: a finer wrap that loses more has entered the inside,
 HOLLOW_SIZE = 0.005  # unless it loses less than this share of the cubed diagonal, as around a sheet
 OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired solid than this was cut away
 CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
-SHEET = 0.3  # % of the diagonal: a wrap with less mean thickness is that of a sheet, two offsets thick
+SHEET = 0.003  # of the diagonal: a wrap of less mean thickness is that of a sheet, two offsets thick
 OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
-OCTREE = 9  # depth of the octree of a Poisson reconstruction: cells of a 512th of its box
 
 
-def repair(mesh: Mesh) -> Mesh:
+def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Mesh:
     """Makes a mesh a closed solid, wound outward and without overlaps, with as little change as possible.
 
     Where that changes its area or volume by more than `CHANGED`, the first entry of `repairs` is a warning.
+
+    Args:
+        mesh: any mesh.
+        close: another way to close a mesh whose holes cannot be closed, tried before it is wrapped.
 
     Raises:
         ValueError: where it encloses no volume.
@@ -34,8 +38,8 @@ def repair(mesh: Mesh) -> Mesh:
     if closed is None:
         return _warned(mesh, _wrap_flat(mesh))
     if not closed.watertight:
-        reason = "its parts do not close into a solid"
-        return _warned(mesh, _smoothed(mesh, reason) or _wrap(closed, reason))
+        solid = close(mesh) if close else None
+        return _warned(mesh, solid or _wrap(closed, "its parts do not close into a solid"))
     solid = _merge(_turn_outward(closed))
     if solid is None:
         return _warned(mesh, _wrap(closed, "its overlapping parts could not be merged into a solid"))
@@ -52,7 +56,7 @@ def _tidy(mesh: Mesh) -> Mesh:
     import pymeshlab
 
     mesh = mesh.compact()
-    mesh = _apply(mesh, ("meshing_merge_close_vertices", {"threshold": pymeshlab.PercentageValue(100 * WELD)}))
+    mesh = apply(mesh, ("meshing_merge_close_vertices", {"threshold": pymeshlab.PercentageValue(100 * WELD)}))
     faces = mesh.faces
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
@@ -65,7 +69,7 @@ def _tidy(mesh: Mesh) -> Mesh:
     kept = np.sort(np.concatenate([keep, double_sided]))
     if len(kept) == len(faces):
         return replace(mesh, faces=faces)
-    return _with_note(replace(mesh, faces=faces[kept]), f"{_count(len(faces) - len(kept), 'doubled face')} dropped")
+    return with_note(replace(mesh, faces=faces[kept]), f"{_count(len(faces) - len(kept), 'doubled face')} dropped")
 
 
 def _close(mesh: Mesh) -> Mesh:
@@ -76,17 +80,17 @@ def _close(mesh: Mesh) -> Mesh:
         return mesh
     shells = replace(mesh, faces=mesh.faces[opened])
     wind = ("meshing_re_orient_faces_coherently", {})
-    closed = _apply(shells, wind)
+    closed = apply(shells, wind)
     if closed.watertight:
-        closed = _with_note(closed, "faces wound consistently")
+        closed = with_note(closed, "faces wound consistently")
     else:
         cut = ("meshing_repair_non_manifold_edges", {"method": "Remove Faces"})
         split = ("meshing_repair_non_manifold_vertices", {"vertdispratio": 0.0})
         fill = ("meshing_close_holes", {"maxholesize": len(mesh.vertices), "selfintersection": False})
-        shells = _apply(shells, cut, split, wind)
-        closed = _apply(shells, fill, wind)
+        shells = apply(shells, cut, split, wind)
+        closed = apply(shells, fill, wind)
         if (count := shells.holes - closed.holes) > 0:
-            closed = _with_note(closed, f"{_count(count, 'hole')} closed")
+            closed = with_note(closed, f"{_count(count, 'hole')} closed")
     faces = np.concatenate([mesh.faces[~opened], closed.faces + len(mesh.vertices)])
     return replace(closed, vertices=np.concatenate([mesh.vertices, closed.vertices]), faces=faces).compact()
 
@@ -95,13 +99,11 @@ def _drop_flat_parts(mesh: Mesh) -> Mesh | None:
     """Drops the parts that enclose nothing; None if no part is left."""
     parts = mesh.parts
     areas = np.bincount(parts, weights=np.linalg.norm(mesh.crosses, axis=1) / 2)
-    flat = np.abs(mesh.part_volumes) <= THIN * mesh.diagonal * areas
-    if flat.all():
-        return None
-    if not flat.any():
-        return mesh
+    flat = 2 * np.abs(mesh.part_volumes) <= THIN * mesh.diagonal * areas
+    if flat.all() or not flat.any():
+        return None if flat.all() else mesh
     kept = replace(mesh, faces=mesh.faces[~flat[parts]])
-    return _with_note(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
+    return with_note(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
 
 
 def _turn_outward(mesh: Mesh) -> Mesh:
@@ -118,7 +120,7 @@ def _turn_outward(mesh: Mesh) -> Mesh:
     if not turn.any():
         return mesh
     faces = np.where(turn[parts][:, None], mesh.faces[:, ::-1], mesh.faces)
-    return _with_note(replace(mesh, faces=faces), f"{_count(int(turn.sum()), 'part')} turned outward")
+    return with_note(replace(mesh, faces=faces), f"{_count(int(turn.sum()), 'part')} turned outward")
 
 
 def _merge(mesh: Mesh) -> Mesh | None:
@@ -126,7 +128,7 @@ def _merge(mesh: Mesh) -> Mesh | None:
     import pymeshlab
 
     count = mesh.parts.max() + 1
-    meshes = _mesh_set(mesh)
+    meshes = mesh_set(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
     crossing = meshes.current_mesh().selected_face_number()
     if count == 1 and not crossing:
@@ -137,13 +139,13 @@ def _merge(mesh: Mesh) -> Mesh | None:
         return None
     if meshes.current_mesh().face_number() == 0:
         return None
-    merged = _current(meshes, mesh)
+    merged = current(meshes, mesh)
     if not (merged.watertight and merged.volume > 0):
         return None
     left = merged.parts.max() + 1
     if left < count:
-        return _with_note(merged, f"{count} overlapping parts merged into {left}")
-    return _with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
+        return with_note(merged, f"{count} overlapping parts merged into {left}")
+    return with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
 
 
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
@@ -153,42 +155,23 @@ def _covers(solid: Mesh, mesh: Mesh) -> bool:
     return bool(outside.mean() <= OUTSIDE_SHARE)
 
 
-def _smoothed(mesh: Mesh, reason: str) -> Mesh | None:
-    """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
-
-    None where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the other, as where faces are
-    not wound consistently or a hole is wide.
-    """
-    wound = _apply(mesh, ("meshing_re_orient_faces_coherently", {}))
-    meshes = _mesh_set(wound if wound.volume > 0 else replace(wound, faces=wound.faces[:, ::-1]))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)
-    found = _current(meshes, mesh)
-    if not (found.watertight and found.volume > 0):
-        return None
-    for near, far in ((mesh, found), (found, mesh)):
-        points, _ = sample_surface(near, 5000, seed=0)
-        if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
-            return None
-    return _with_note(found, f"replaced by its Poisson reconstruction, since {reason}")
-
-
 def _wrap(mesh: Mesh, reason: str) -> Mesh:
     """Shrinks a closed surface around the mesh, as fine as possible without entering its inside."""
     import pymeshlab
 
     wrapped = None
     for alpha in WRAP_ALPHAS:
-        meshes = _mesh_set(mesh)
+        meshes = mesh_set(mesh)
         percentages = {"alpha": pymeshlab.PercentageValue(alpha), "offset": pymeshlab.PercentageValue(WRAP_OFFSET)}
         meshes.generate_alpha_wrap(**percentages)
-        finer = _current(meshes, mesh)
+        finer = current(meshes, mesh)
         if wrapped is not None:
             lost = wrapped.volume - finer.volume
             if lost > HOLLOW_SHARE * wrapped.volume and lost > HOLLOW_SIZE * mesh.diagonal**3:
                 break
         wrapped, used = finer, alpha
     how = f"a closed surface shrunk around it, {WRAP_OFFSET:g} % of the diagonal outside, over gaps up to {used:g} %"
-    return _with_note(wrapped, f"wrapped: {how}, since {reason}")
+    return with_note(wrapped, f"wrapped: {how}, since {reason}")
 
 
 def _wrap_flat(mesh: Mesh) -> Mesh:
@@ -198,7 +181,7 @@ def _wrap_flat(mesh: Mesh) -> Mesh:
         ValueError: where they have none.
     """
     wrapped = _wrap(mesh, "all its parts are flat")
-    if 2 * wrapped.volume / wrapped.area > SHEET / 100 * mesh.diagonal:
+    if 2 * wrapped.volume > SHEET * mesh.diagonal * wrapped.area:
         return wrapped
     found = "a single triangle" if len(mesh.faces) == 1 else f"{_count(len(mesh.faces), 'face')} in flat sheets"
     done = f" (after {'; '.join(mesh.repairs)})" if mesh.repairs else ""
@@ -218,7 +201,7 @@ def _warned(before: Mesh, after: Mesh, closed: Mesh | None = None) -> Mesh:
     """
     if after.repairs == before.repairs:
         return after
-    wound = _apply(before, ("meshing_re_orient_faces_coherently", {}))
+    wound = apply(before, ("meshing_re_orient_faces_coherently", {}))
     changes = []
     for name, was, *now in (
         ("area", before.area, after.area, *([closed.area] if closed else [])),
@@ -252,7 +235,8 @@ def _winding(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
     return np.arctan2(top, bottom).sum(axis=1) / (2 * np.pi)
 
 
-def _mesh_set(mesh: Mesh):
+def mesh_set(mesh: Mesh):
+    """The mesh for filters of pymeshlab."""
     import pymeshlab
 
     meshes = pymeshlab.MeshSet()
@@ -260,23 +244,25 @@ def _mesh_set(mesh: Mesh):
     return meshes
 
 
-def _current(meshes, before: Mesh) -> Mesh:
+def current(meshes, before: Mesh) -> Mesh:
+    """What filters made of a mesh, with its notes."""
     current = meshes.current_mesh()
     return replace(before, vertices=current.vertex_matrix(), faces=current.face_matrix())
 
 
-def _apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
+def apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
     """Runs filters of pymeshlab; one that fails leaves the mesh unchanged, which the caller checks."""
     import pymeshlab
 
-    meshes = _mesh_set(mesh)
+    meshes = mesh_set(mesh)
     for name, options in filters:
         with contextlib.suppress(pymeshlab.PyMeshLabException):
             meshes.apply_filter(name, **options)
-    return _current(meshes, mesh)
+    return current(meshes, mesh)
 
 
-def _with_note(mesh: Mesh, repair: str) -> Mesh:
+def with_note(mesh: Mesh, repair: str) -> Mesh:
+    """The mesh with another note of what was repaired."""
     return replace(mesh, repairs=(*mesh.repairs, repair))
 
 

@@ -188,7 +188,7 @@ NO_FACES = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty 
         (["nothing.ply"], "found nothing at"),
         (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
         (["broken.ply"], "broken.ply': cannot be read"),
-        (["cut.ply"], "must be a whole .ply file, but it is truncated"),
+        (["cut.ply"], "cut.ply': cannot be read"),
         (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
         (["points.ply"], "points.ply': must have faces, found none; export it"),
         (["line.ply"], "line.ply': must have an area, found 0; export it again"),

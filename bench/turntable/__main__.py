@@ -15,8 +15,7 @@ from bench.records.files import leads_out
 from bench.records.record import read_record
 from bench.turntable.turntable import PARTS, Turn, turntable
 from datasets.mesh import Mesh, normalise
-from datasets.meshes import FLAT, READ_ERRORS, SUFFIXES, find_meshes
-from datasets.truncated import check_whole
+from datasets.meshes import FLAT, READ_ERRORS, SUFFIXES, check_whole, find_meshes
 
 ENDINGS = (".webp", ".gif")
 QUALITY = 90  # of WebP, of 100: at the usual 80 edges leave traces on the white of later frames

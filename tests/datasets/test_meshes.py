@@ -129,16 +129,6 @@ def test_a_broken_file_is_one_clear_error(name, tmp_path):
     assert caught.value.__cause__ is None and caught.value.__suppress_context__  # no traceback of a library
 
 
-@pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.97])
-def test_a_truncated_binary_file_is_refused(suffix, share, tmp_path):
-    whole = trimesh.creation.icosphere(1).export(file_type=suffix)
-    path = tmp_path / f"cut.{suffix}"
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=r"export (or copy )?it"):
-        load_mesh(path)
-
-
 # repairing
 
 
@@ -191,36 +181,15 @@ def test_parts_apart_stay_as_they_are():
     assert (len(mesh.faces), mesh.repairs) == (24, ())
 
 
-@pytest.mark.parametrize(("height", "reason"), [(lambda x: 0.1 * np.sin(9 * x), "cut away")])
-def test_a_sheet_is_wrapped_closely_with_a_note(height, reason):
-    thin = sheet(height)
+def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
+    thin = sheet(lambda x: 0.1 * np.sin(9 * x))
     mesh = repair(thin)
     assert mesh.watertight
     assert 0 < mesh.volume < 0.01
-    assert mesh.repairs[-1].startswith("wrapped: ") and reason in mesh.repairs[-1]
+    assert mesh.repairs[-1].startswith("wrapped: ") and "cut away" in mesh.repairs[-1]
+    assert mesh.repairs[:-1] == tuple(warnings_of(mesh)) != ()  # wrapped on both sides: its area doubles
     points, _ = sample_surface(thin, 500, seed=0)
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 0.005
-
-
-def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
-    """A ball with two faces joined by a tube that crosses over, so that the surface has one side only."""
-    one, other = ball.faces[first], ball.faces[second]
-    sides = [(one[i], one[i - 2], other[i - 2], other[i]) for i in range(3)]
-    tube = [corner for a, b, c, d in sides for corner in ([a, b, c], [a, c, d])]
-    return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-def test_a_scan_with_a_tangle_keeps_its_surface(inverted):
-    ball = trimesh.creation.icosphere(5)
-    near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
-    tangled = handled(ball, 0, near)
-    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]) if inverted else tangled)
-    assert mesh.watertight
-    assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
-    points, _ = sample_surface(mesh, 2000, seed=0)
-    assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.01
-    assert mesh.volume == pytest.approx(ball.volume, rel=1e-3)
 
 
 def walls() -> Mesh:
@@ -232,11 +201,11 @@ def walls() -> Mesh:
 def test_a_mesh_without_volume_is_an_error():
     with pytest.raises(ValueError, match=r"must enclose a volume, found a single triangle; .* give the sheet a thick"):
         repair(Mesh(np.eye(3), np.array([[0, 1, 2]])))
-    with pytest.raises(ValueError, match=r"found 288 faces in flat sheets; .*export a closed surface"):
-        repair(sheet(lambda x: 0 * x))
     flat = sheet(lambda x: 0 * x)
     twice = Mesh(flat.vertices, np.concatenate([flat.faces, flat.faces[:, ::-1]]))
-    with pytest.raises(ValueError, match=r"found 288 faces in flat sheets \(after 288 doubled faces dropped\)"):
+    with pytest.raises(
+        ValueError, match=r"found 288 faces in flat sheets \(after 288 doubled faces dropped\); .*export a"
+    ):
         repair(twice)
 
 
@@ -264,8 +233,6 @@ def test_a_repair_that_changes_area_or_volume_much_says_by_how_much():
     assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the disc that closes it
     assert numbers[2] == pytest.approx(100 * (numbers[1] / numbers[0] - 1), abs=1)
     assert numbers[4] == pytest.approx(2 / 3 * np.pi, rel=0.03)
-    sheet_like = repair(sheet(lambda x: 0.1 * np.sin(9 * x)))  # wrapped on both sides: its area doubles
-    assert len(warnings_of(sheet_like)) == 1 and sheet_like.repairs[0] == warnings_of(sheet_like)[0]
 
 
 def test_ordinary_repairs_come_without_a_warning():

@@ -11,8 +11,11 @@ import trimesh
 
 from datasets.dataset import Split
 from datasets.local import LocalMeshes
-from datasets.range_scans import RangeScans
+from datasets.mesh import Mesh
+from datasets.range_scans import RangeScans, smoothed
+from datasets.repair import repair
 from datasets.scene import make_scene
+from datasets.truth import sample_surface
 from datasets.views import ViewSampler
 from tests.made_scans import RADIUS, TURNS, write_scans
 from tests.run.driving import command, record_of
@@ -164,3 +167,24 @@ def test_a_run_takes_the_depths_that_it_is_told(folder, tmp_path, depths):
     (note,) = [note for note in record["notes"] if note.startswith("measured: ")]
     assert record["evaluations"]["observed"] == int(note.split()[1])
     assert record["config"]["task"]["depths"] == depths
+
+
+def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
+    """A ball with two faces joined by a tube that crosses over, so that the surface has one side only."""
+    one, other = ball.faces[first], ball.faces[second]
+    sides = [(one[i], one[i - 2], other[i - 2], other[i]) for i in range(3)]
+    tube = [corner for a, b, c, d in sides for corner in ([a, b, c], [a, c, d])]
+    return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_scan_with_a_tangle_keeps_its_surface(inverted):
+    ball = trimesh.creation.icosphere(5)
+    near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
+    tangled = handled(ball, 0, near)
+    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]) if inverted else tangled, smoothed)
+    assert mesh.watertight
+    assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
+    points, _ = sample_surface(mesh, 2000, seed=0)
+    assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.01
+    assert mesh.volume == pytest.approx(ball.volume, rel=1e-3)
