@@ -14,7 +14,6 @@ from bench.solve.problem import Unsupported
 from bench.stress.fit import FITS, FitTrial, judge_fit
 from bench.stress.gradient import judge_gradient
 from bench.stress.rendering import judge_rendering
-from bench.stress.theory import THEORIES, Prediction
 from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.stress import SCENES
 from renderers.checks import check_choice
@@ -63,7 +62,6 @@ class Stress:
         group: of axes in the atlas.
         sweep: the range of severities.
         setting: the renderer's setting that takes the severity, if it is one.
-        theory: a name of `bench.stress.theory.THEORIES`, if there is one.
         repeats: 1 where repeats of a trial cannot differ, so that no interval is given; else null, for task.search's.
     """
 
@@ -72,7 +70,6 @@ class Stress:
     group: str
     sweep: Sweep
     setting: str | None = None
-    theory: str | None = None
     repeats: int | None = None
 
     def __post_init__(self) -> None:
@@ -81,8 +78,6 @@ class Stress:
         check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else tuple(SCENES))
         if self.repeats not in (None, 1):
             raise ValueError(f"task.stress.repeats must be 1 or null, not {self.repeats}: set task.search.repeats")
-        if self.theory is not None:
-            check_choice("task.stress.theory", self.theory, tuple(THEORIES))
 
     def stressed(self, renderer: Renderer, severity: float) -> Renderer:
         """The renderer with its setting at the severity; unchanged where the severity is not a setting.
@@ -126,9 +121,3 @@ class Stress:
             return judge_fit(FitTrial(self.scene, conditions.fit, severity, draw), stressed, conditions)
         exam = SCENES[self.scene](severity, draw, conditions.resolution)
         return (judge_rendering if self.measure == "rendering" else judge_gradient)(exam, stressed, conditions)
-
-    def predicted(self, renderer: Renderer, conditions: Conditions) -> list[Prediction]:
-        """The severities at which theory predicts failure; empty without a theory."""
-        if self.theory is None:
-            return []
-        return THEORIES[self.theory](renderer, conditions.resolution, conditions.criteria)

@@ -30,7 +30,6 @@ DEFINITIONS = {
     "mild_successes, mild_trials, severe_successes, severe_trials": "at the two ends of the sweep",
     "failed_...": "trials that failed in this way; each counts once, as its most frequent kind of failure",
     "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
-    "predicted": "severity at which theory predicts failure, by the first of its formulas",
 }
 MEASURED = {
     "rendering": rendering.DEFINITIONS,
@@ -84,10 +83,6 @@ class Stability:
                 write_line(trials.line())
                 run.progress("searching", len(trials.all), search.most, None)
         record.metrics = self._metrics(search, trials)
-        for place, prediction in enumerate(self.stress.predicted(renderer, conditions)):
-            name = f"predicted_{place}" if place else "predicted"
-            record.metrics[name] = prediction.severity
-            record.definitions[name] = prediction.formula
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = trials.verdict()
         record.notes = [*record.notes, *trials.warnings()]

@@ -99,10 +99,7 @@ def test_a_run_trains_its_network_where_it_is_asked_to(tmp_path):
 
 def test_the_code_of_the_prior_is_found_by_the_mask(tmp_path):
     small = [one for one in TINY[1:] if not one.startswith(("task.training", "dataset"))]
-    small += [
-        "dataset=capsule",
-        "index=2",
-    ]  # thin, unlike the mean shape: the loss falls to a ninth, or less, at any seed
+    small += ["dataset=capsule", "index=2"]  # unlike the mean shape: the loss falls to a ninth of its start, or less
     small += ["prior.steps=100", "prior.shapes=3", "task.search.optimiser.iterations=8", f"results_dir={tmp_path}"]
     done = command("+method=single_view_code", *small)
     assert done.code == 0, done.err

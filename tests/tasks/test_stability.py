@@ -1,4 +1,4 @@
-"""Breakdowns that theory knows are found, planted faults move them, and a user's renderer is in the atlas."""
+"""Breakdowns known in closed form are found, planted faults move them, and a user's renderer is in the atlas."""
 
 import json
 from dataclasses import replace
@@ -62,7 +62,6 @@ def test_the_breakdown_is_that_of_the_closed_form(tmp_path, case):
     renderer, severity = CLOSED_FORM[case]
     metrics = run(tmp_path, case[0], renderer)
     assert within(case[0], metrics, severity)
-    assert metrics["predicted"] == pytest.approx(severity)
     assert metrics["trials"] <= metrics["grid_trials"] / 2
 
 
@@ -78,14 +77,12 @@ def test_one_trial_per_level_gives_no_interval(tmp_path):
 
 def test_the_grazing_plane_breaks_where_eq_8_runs_out_of_steps(tmp_path):
     metrics = run(tmp_path, "grazing_plane", load("renderer", "idr"))
-    assert metrics["predicted_1"] == pytest.approx(10.35, abs=0.05)  # DIST, Eq. 8: k = 50, alpha = 1, d = 1
-    assert within("grazing_plane", metrics, metrics["predicted"])
+    assert within("grazing_plane", metrics, 9.96)  # degrees: DIST, Eq. 8 at the far edge, for k = 50, epsilon = 5e-5
 
 
 def test_aggressive_marching_has_gradients_too_long_from_the_front_on(tmp_path):
     metrics = run(tmp_path, "grazing_gradient", load("renderer", "dist"))
     assert metrics["level"] < 0 and metrics["mild_successes"] == 0
-    assert metrics["predicted"] == 90
 
 
 def test_an_exception_of_a_trial_is_a_failure_and_the_search_continues(tmp_path):

@@ -67,36 +67,10 @@ class Cell:
         """Whether levels are linear in the logarithm of the severity."""
         return bool(self.stress("sweep", "log"))
 
-    def place(self, severity: float) -> float:
-        """The level of a severity."""
-        mild, severe = self.ends
-        if self.log:
-            return math.log(severity / mild) / math.log(severe / mild)
-        return (severity - mild) / (severe - mild)
-
     @property
     def one_trial(self) -> bool:
         """Whether each level was tried once, since repeats of a trial cannot differ: there is no interval."""
         return self.stress("repeats") == 1
-
-    def covers(self, severity: float) -> bool:
-        """Whether a severity lies in the breakdown's interval, or beyond the same end of the sweep as the breakdown.
-
-        With one trial per level it must lie between the last success and the first failure.
-        """
-        low, high = self._within()
-        if low is None or high is None:
-            return False
-        level = self.place(severity)
-        return low <= level <= high or (self.at_once and level < 0) or (self.never and level > 1)
-
-    def _within(self) -> tuple[float | None, float | None]:
-        """The ends of the breakdown's interval; with one trial per level, the levels about it."""
-        levels = setting(self.record, "config", "task", "search", "levels")
-        if self.one_trial and self.level is not None and isinstance(levels, int):
-            half = 0.5 / (levels - 1)
-            return self.level - half, self.level + half
-        return self.number("level_low"), self.number("level_high")
 
     @property
     def falls(self) -> bool:

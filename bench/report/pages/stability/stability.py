@@ -16,7 +16,7 @@ from bench.records import format
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Row, median_of_known, setting
 from bench.report.data.statistics import rank
-from bench.report.data.subjects.atlas import FAILED, STABILITY, Atlas, Cell, atlas, title
+from bench.report.data.subjects.atlas import FAILED, STABILITY, Atlas, atlas, title
 from bench.report.write import chart
 from bench.report.write.answer import Answer, chart_panel, presets_of, series
 from bench.report.write.result import Result
@@ -147,8 +147,8 @@ def draw(grid: Atlas) -> Figure:
 
 
 def _all_about(grid: Atlas) -> list[str]:
-    """Notes on each row, on theory, and on moved surfaces."""
-    return [*(_worst(grid, row) for row in grid.rows), _agreement(grid), *_theory(grid), _moved(grid)]
+    """Notes on each row and on moved surfaces."""
+    return [*(_worst(grid, row) for row in grid.rows), _moved(grid)]
 
 
 def _worst(grid: Atlas, row: Row) -> str:
@@ -164,43 +164,6 @@ def _worst(grid: Atlas, row: Row) -> str:
     failed = ", ".join(f"{count} {style.PIXEL_NAMES.get(kind, kind)}" for kind, count in kinds.most_common())
     said = f"worst on {'; '.join(axes)}" if axes else f"breaks on none of {len(tried)} axes"
     return f"{row.name}: {said}. Failed trials: {failed or 'none'}."
-
-
-def _predicted(grid: Atlas, axis: str) -> list[tuple[str, Cell, float]]:
-    """The rows of an axis with a theoretical prediction: name, breakdown, predicted severity."""
-    return [(row.name, cell, p) for row, cell in grid.on(axis) if cell.known and (p := cell.number("predicted"))]
-
-
-def _agreement(grid: Atlas) -> str:
-    """A note on how many predictions lie in the measured intervals, and on the axes where others do not; or none."""
-    pairs = [(title(axis), cell.covers(p)) for axis in grid.axes for _, cell, p in _predicted(grid, axis)]
-    of, outside = Counter(axis for axis, _ in pairs), Counter(axis for axis, inside in pairs if not inside)
-    where = ", ".join(f"{count} of {of[axis]} of {axis}" for axis, count in outside.most_common()) or "none"
-    told = f"{outside.total()} of {len(pairs)} predictions lie outside of the measured interval: {where}."
-    return told if pairs else ""
-
-
-def _theory(grid: Atlas) -> list[str]:
-    """A note per axis with a theoretical prediction: the predicted and the measured breakdown of each row."""
-    lines = []
-    for axis in grid.axes:
-        known = _predicted(grid, axis)
-        rows = [f"{name} {format.number(p)}{_beside(cell, p)}, measured {cell.full()}" for name, cell, p in known]
-        beyond = " (theory does not hold for any row)" if not any(cell.covers(p) for _, cell, p in known) else ""
-        if rows:
-            lines.append(f"Predicted, {title(axis)}{beyond}: {'; '.join(rows)}.")
-    return lines
-
-
-def _beside(cell: Cell, predicted: float) -> str:
-    """How a predicted severity differs from the measured one, where it lies outside its interval."""
-    measured = cell.number("breakdown")
-    if cell.covers(predicted):
-        return ""
-    if not measured:
-        return " (outside)"
-    share = 100 * (predicted / measured - 1)
-    return f" (outside, {abs(share):.0f} % {'above' if share > 0 else 'below'})"
 
 
 def _moved(grid: Atlas) -> str:
@@ -259,9 +222,7 @@ def answer(data: pd.DataFrame, notes: list[str]) -> Answer:
     said = (
         f"{best} does not break on *{never[best]} of {known[best]}* axes, {least} on {never[least]} of {known[least]}"
     )
-    told = next((note for note in notes if "predictions lie outside" in note), "")
-    theory = f"; {told.split(' predictions')[0]} predictions of theory lie outside of what was measured" if told else ""
-    return Answer("Where does each renderer break?", f"{said}{theory}.", atlas=_cells(data))
+    return Answer("Where does each renderer break?", f"{said}.", atlas=_cells(data))
 
 
 def _cells(data: pd.DataFrame) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The stress test as curves: the share of successful trials over the severity, and theoretical predictions."""
+"""The stress test as curves: the share of successful trials over the severity."""
 
 import math
 
@@ -28,8 +28,6 @@ NOTES = (
     "Curves are logistic, with the most probable breakdown and width. Dots are shares of the trials at a severity; the "
     "CSV has their number and intervals (Clopper and Pearson). Renderers are shifted a little upwards, so that none "
     "hides another. An axis with one trial a level, where repeats could not differ, has no intervals.",
-    "A dashed line is the predicted breakdown of the renderer of its colour, a dotted one that of a second formula, as "
-    "published: DIST, Eqs. 8 and 10.",
 )
 Shares = dict[tuple[str, Row], pd.DataFrame]
 
@@ -102,9 +100,6 @@ def _curve(panel: Axes, row: Row, cell: Cell, table: pd.DataFrame, above: float)
     ends = [cell.number(f"level_{end}") for end in ("low", "high")]
     if None not in ends:
         panel.plot(np.interp(ends, levels, along), [50 + 4 * above] * 2, color=colour, lw=2, solid_capstyle="butt")
-    for name, line in (("predicted", "--"), ("predicted_1", ":")):
-        if (predicted := cell.number(name)) is not None:
-            panel.axvline(predicted, color=colour, ls=line, lw=0.6)
 
 
 def _shares(experiment: Experiment, cell: Cell) -> pd.DataFrame:
