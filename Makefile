@@ -25,8 +25,10 @@ benchmark: .venv/ready-dev ## renderers in turn, then speed and memory against t
 	$(BIN)/python -m bench.report
 	$(BIN)/python -m pytest -o addopts="-q -s -p no:dash" tests/benchmarks
 
-mutants: .venv/ready-dev ## plants mistakes one at a time and prints those that no test finds (some minutes)
-	ONLY="$(ONLY)" $(BIN)/python -m tests.mutants
+mutants: .venv/ready-dev ## installs mutmut, then changes the code in one place at a time (a night); ONLY='renderers.bracket*'
+	@.ci/setup mutants
+	$(BIN)/mutmut run $(if $(ONLY),'$(ONLY)')
+	$(BIN)/mutmut results
 
 lint: .venv/ready-dev ## ruff (lint and format) and pyright
 	$(BIN)/ruff check .
