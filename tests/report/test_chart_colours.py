@@ -11,7 +11,6 @@ from bench.report.pages.stability import stability, stability_curves
 from tests.report import test_report_crossing as of_crossing
 from tests.report import test_report_speed as of_speed
 from tests.report import test_report_stability as of_stability
-from tests.report.test_report_paper import coarse_pictures  # noqa: F401, a fixture
 
 LABELS = {"+ aggressive": "dist_aggressive", "+ dynamic": "dist_dynamic"}
 

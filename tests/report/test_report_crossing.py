@@ -10,7 +10,7 @@ from bench.report.data.experiments import choose
 from bench.report.data.subjects.completions import EVERY
 from bench.report.data.subjects.crossing import CROSSING, Crossed
 from bench.report.pages.completion import crossing, crossing_gaps
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 RENDERERS = {"dist": ("renderers.DIST", "DIST"), "idr": ("renderers.IDR", "IDR")}
 LOSSES = {"Hinge": "DIST's mask loss", "CrossEntropy": "IDR's mask loss"}

@@ -9,7 +9,7 @@ from bench.report.pages.completion import completion_gallery
 from bench.report.pages.images import rerendering
 from bench.report.pages.views import misplaced_gallery, multiview_gallery
 from bench.report.write.gallery import GAP, TILE, Block, Cell, draw, tile
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 COLOURS = {normal: tuple(np.array(normal) / 2 + 0.5) for normal in (UP, RIGHT, TOWARDS)}

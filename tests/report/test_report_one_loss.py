@@ -6,7 +6,7 @@ from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.data.subjects.completions import EVERY
 from bench.report.pages.completion import one_loss
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 # Error over DIST's, field values, seconds of the loop of a run.
 METHODS = {"dist": (1.0, 1000, 4.0), "newton": (0.5, 500, 8.0), "neus": (0.25, 9000, 30.0), "volsdf": (2.0, 9000, 40.0)}

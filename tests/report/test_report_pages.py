@@ -15,7 +15,7 @@ from bench.report.pages.completion import table2
 from bench.report.pages.rendering import table1
 from bench.report.write import paper
 from bench.report.write.paper import find_paper, page_names, write_paper
-from tests.report.test_report_paper import DYNAMIC, NAIVE, coarse_pictures, costs, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
 
 PAGE = """
 from bench.report.data.experiments import Selection

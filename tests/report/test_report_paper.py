@@ -1,6 +1,7 @@
 """The tables and figures of the experiments, made from run folders whose numbers are known."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +28,6 @@ DYNAMIC, PARALLEL, NAIVE = "+ dynamic", "+ parallel", "Naive sphere tracing"
 PRESETS = {DYNAMIC: "dist_dynamic", PARALLEL: "naive_practical_parallel", NAIVE: "naive_serial"}
 PRESETS |= {"+ aggressive": "dist_aggressive", "DIST with mask": "dist_mask", "Naive with mask": "naive_mask"}
 PAGES = {"table1": table1, "fig4": fig4, "fig5": fig5, "fig7": fig7, "gradients": gradients}
-
-
-@pytest.fixture(autouse=True)
-def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A picture takes longer to write than all else together."""
-    monkeypatch.setitem(style.RC, "savefig.dpi", 50)
 
 
 def write_run(results: Path, experiment: str | None, label: str | None, **changed) -> Path:
@@ -292,18 +287,22 @@ def bands(factor: float = 1.0, camera: bool = True) -> dict:
     return metrics
 
 
+def write_judged(results: Path) -> Path:
+    """Writes three runs of the gradients' table, one of which failed."""
+    definitions = {"code_cosine, camera_cosine": "Of both.", "else": "?", "frontal.pixels": "Drawn."}
+    write_run(results, "gradients", None, metrics=bands(), renderer="dist", definitions=definitions)
+    write_run(results, "gradients", None, metrics=bands(2.0, camera=False), renderer="dvr")
+    write_run(results, "gradients", None, renderer="naive", status="oom", reason="8 GB")
+    return results
+
+
 @pytest.fixture
 def judged(tmp_path: Path) -> Path:
-    definitions = {"code_cosine, camera_cosine": "Of both.", "else": "?", "frontal.pixels": "Drawn."}
-    write_run(tmp_path, "gradients", None, metrics=bands(), renderer="dist", definitions=definitions)
-    write_run(tmp_path, "gradients", None, metrics=bands(2.0, camera=False), renderer="dvr")
-    write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
-    return tmp_path
+    return write_judged(tmp_path)
 
 
-def test_gradients_have_a_row_for_each_renderer_and_band(judged):
-    main([f"results_dir={judged}"])
-    rows = pd.read_csv(judged / "paper" / "gradients.csv").set_index(["row", "band"])
+def test_gradients_have_a_row_for_each_renderer_and_band(reported):
+    rows = pd.read_csv(reported / "paper" / "gradients.csv").set_index(["row", "band"])
     assert list(rows.index) == [(name, band) for name in ("dist", "dvr", "naive") for band in gradients.BANDS]
     assert rows.loc[("dvr", "oblique"), "code_scale"] == 4.0
     assert rows.loc[("dist", "grazing"), "camera_median_error"] == pytest.approx(3e-4)
@@ -311,7 +310,7 @@ def test_gradients_have_a_row_for_each_renderer_and_band(judged):
     assert rows.loc[("dist", "silhouette"), "image_cosine"] == 0.75
     assert rows.loc[("dist", "silhouette"), "pixels"] == 77
     assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
-    text = (judged / "paper" / "gradients.md").read_text()
+    text = (reported / "paper" / "gradients.md").read_text()
     assert (
         "- Code cosine, Camera cosine: Of both.\n- Pixels: Drawn.\n" in text
         and "naive: oom (8 GB)" in text
@@ -320,7 +319,7 @@ def test_gradients_have_a_row_for_each_renderer_and_band(judged):
     assert "Code pooled cosine | Code pooled scale | Code cosine" in text
     assert "A pooled number compares the gradients of all pixels of a band at once" in text
     assert rows.loc[("dist", "grazing"), "code_pooled_cosine"] == 0.97
-    assert r"\begin{tabular}" in (judged / "paper" / "gradients.tex").read_text()
+    assert r"\begin{tabular}" in (reported / "paper" / "gradients.tex").read_text()
 
 
 def seen(blur: str, error: float) -> dict[str, float]:
@@ -552,19 +551,16 @@ def test_experiment_of_nothing_but_failures_is_still_made(tmp_path, name):
     assert "The run did not end ok" in (tmp_path / "paper" / f"{name}.md").read_text()
 
 
-def test_command_writes_all_files_and_the_page_shows_them(judged, capsys):
-    write_run(judged, "table1", DYNAMIC, metrics=costs())
-    main([f"results_dir={judged}"])
-    assert capsys.readouterr().out.splitlines()[-1] == str(judged / "index.html")
+def test_command_writes_all_files_and_the_page_shows_them(reported):
     drawn_too = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
     suffixes = {"table1": {".csv", ".md", ".tex", ".json"}, "gradients": drawn_too, "gradients_visibility": drawn_too}
-    written = {path.name for path in (judged / "paper").iterdir()}
+    written = {path.name for path in (reported / "paper").iterdir()}
     assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
-    page = Page(judged)
+    page = Page(reported)
     assert links(page) == {f"paper/{name}" for name in written if not name.endswith(".json")}
     assert "1.99M" in page.paper("table1")["rows"][0]
     assert [paper["name"] for paper in page.papers] == ["table1", "gradients", "gradients_visibility"]
-    assert (judged / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
+    assert (reported / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_page_alone_makes_nothing_and_shows_what_is_there(judged):
@@ -583,11 +579,12 @@ def links(page: Page) -> set[str]:
     return {link for whole in found for link in [*whole["files"].values(), whole["picture"]] if link}
 
 
-def test_same_records_give_the_same_files(judged):
-    main([f"results_dir={judged}"])
-    first = {path.name: path.read_bytes() for path in (judged / "paper").iterdir()}
-    main([f"results_dir={judged}"])
-    assert first == {path.name: path.read_bytes() for path in (judged / "paper").iterdir()}
+def test_same_records_give_the_same_files(reported, tmp_path, capsys):
+    copy = shutil.copytree(reported, tmp_path / "results")
+    main([f"results_dir={copy}"])
+    assert capsys.readouterr().out.splitlines()[-1] == str(copy / "index.html")
+    first, second = ({path.name: path.read_bytes() for path in (each / "paper").iterdir()} for each in (reported, copy))
+    assert first == second
 
 
 def test_row_keeps_its_look_and_known_rows_differ():

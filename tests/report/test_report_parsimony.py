@@ -14,7 +14,7 @@ from bench.report.data.subjects.parsimony import NETWORK, PARSIMONY, SETTINGS, s
 from bench.report.pages.parsimony import parsimony, parsimony_auto
 from bench.report.write.paper import write_paper
 from bench.report.write.result import latex
-from tests.report.test_report_paper import coarse_pictures, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import write_run
 
 PAPERS = 1_839_614
 SIZES = {"sphere": 4, "box": 9, "union_3": 30, "grid_24": 3000, NETWORK: PAPERS}  # free numbers

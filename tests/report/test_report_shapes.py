@@ -10,7 +10,7 @@ from bench.report.data.experiments import choose
 from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
 from bench.report.write.paper import write_paper
 from bench.report.write.shapes import MOST_COLUMNS, history, scene_of
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 NEWTON, IDR, NEUS, HULL, STEREO = "Newton, RGB", "IDR, RGB", "NeuS, RGB", "Visual hull", "Stereo, Poisson"
 METHODS = {NEWTON: "rgb_newton", IDR: "rgb_idr", NEUS: "rgb_neus", HULL: "hull", STEREO: "stereo"}

@@ -18,7 +18,7 @@ from bench.report.write.answer import write_answers
 from bench.report.write.html import write_index
 from bench.report.write.paper import write_paper
 from tests.report.page_data import Page
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 
 def completed(results, label, errors, **changed):

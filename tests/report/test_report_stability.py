@@ -10,7 +10,7 @@ from bench.report.data.records import row_of
 from bench.report.data.subjects.atlas import STABILITY, atlas
 from bench.report.pages.stability import stability, stability_curves
 from bench.report.write.paper import write_paper
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 

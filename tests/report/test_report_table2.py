@@ -16,7 +16,7 @@ from bench.report.data.subjects import oracle
 from bench.report.data.subjects.completions import POINTS
 from bench.report.pages.completion import priors, table2
 from bench.report.write.paper import write_paper
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 REFERENCE, OTHER = "DIST with mask", "Naive with mask"
 

@@ -14,7 +14,7 @@ from bench.report.data.subjects.tuning import TUNING, tunings
 from bench.report.pages.completion import tuned as tuned_page
 from bench.report.pages.completion import tuning
 from bench.tune.__main__ import main, write
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
 OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean over the first six is 1

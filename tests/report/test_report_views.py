@@ -12,7 +12,7 @@ from bench.report.data.records import ONE_WAY
 from bench.report.data.subjects import oracle
 from bench.report.pages.views import fig6, fig10, fig12, table3
 from bench.report.write.paper import write_paper
-from tests.report.test_report_paper import coarse_pictures, told, write_run  # noqa: F401, a fixture
+from tests.report.test_report_paper import told, write_run
 
 ENDS = ONE_WAY
 
