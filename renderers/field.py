@@ -1,4 +1,4 @@
-"""Fields: callables from points to values, negative inside; their properties; normals; the Meter."""
+"""Fields: callables from points to values, negative inside; their properties; normals; the Meter; moved fields."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from renderers.camera import rigid
 
 PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
 STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
@@ -198,6 +200,43 @@ class Meter(Wrapper):
 
     def _count_backward(self, gradient: Tensor) -> None:
         self.counts.gradient += int(gradient.count_nonzero())
+
+
+@dataclass(frozen=True)
+class Moved(Wrapper):
+    """A shape that was scaled, then moved: world = M (scale * local); values stay distances.
+
+    Args:
+        inner: the shape in its own axes.
+        similarity: the six numbers of the rigid motion M, see `renderers.camera.rigid`, and the natural logarithm of
+            the scale.
+    """
+
+    inner: Field
+    similarity: Float[Tensor, "7"]
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        scale, motion = self._parts
+        return scale * self.inner((points - motion[:3, 3]) @ motion[:3, :3] / scale)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The bounds that the field offers, moved as it is."""
+        offered = bounds_of(self.inner)
+        if offered is None:
+            return None
+        scale, motion = (part.detach() for part in self._parts)
+
+        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+            turned = motion[:3, :3] / scale
+            low, high = offered((middle - motion[:3, 3]) @ turned, half @ turned)
+            return scale * low, scale * high
+
+        return bounds
+
+    @property
+    def _parts(self) -> tuple[Tensor, Tensor]:
+        return self.similarity[6].exp(), rigid(self.similarity[:6])
 
 
 def carries_gradient(field: Field, like: Float[Tensor, "*batch 3"]) -> bool:

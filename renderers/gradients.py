@@ -155,3 +155,24 @@ def implicit(
     else:
         slope = torch.where(slope.abs() < least_slope, least_slope, slope)
     return distance.detach() - at.change / slope
+
+
+def implicit_front(field: Field, rays: Rays, front: Front, *, least_slope: float, radius: float) -> Rendering:
+    """The rendering of a front with one sample a ray, whose hits have the implicit gradient; see `approximate_front`.
+
+    Args:
+        least_slope: see `implicit`.
+    """
+    flat = rays.flat()
+    hit = (front.status == Status.HIT).nonzero().squeeze(-1)
+    queried = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
+    found = implicit(field, flat[hit], front.distance[hit], least_slope=least_slope)
+    least = fixed_samples(field, flat[queried], front.sample_distance[queried, 0], front.sample_value[queried, 0])
+    return assemble(
+        rays,
+        radius,
+        distance=front.distance.index_put((hit,), found),
+        status=front.status,
+        residual=front.value,
+        closest=(queried, least),
+    )

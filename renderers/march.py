@@ -49,11 +49,11 @@ class Stepping:
     """
 
     epsilon: float
-    alpha: float
-    extra_step_cap: float | None
-    step_clamp: float | None
-    active_only: bool
-    careful_split: bool
+    alpha: float = 1.0
+    extra_step_cap: float | None = None
+    step_clamp: float | None = None
+    active_only: bool = True
+    careful_split: bool = False
     step_back: bool = False
     least_step: float = 0.0
     slope: float = 1.0

@@ -6,23 +6,23 @@ from typing import ClassVar
 import numpy as np
 import open3d
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
 from renderers.bracket import BLOCK
 from renderers.camera import Rays, sphere_span
-from renderers.checks import check_at_least, check_positive
+from renderers.checks import check_at_least
 from renderers.field import Field, Kind, carries_gradient
 from renderers.rendering import Capabilities, Rendering, Status, assemble
-from renderers.silhouette import CrossEntropy
+from renderers.silhouette import SurfaceRenderer
 
 OUTSIDE = 1.0  # value that stands for one that is not finite, of a grid point
 LEAST_COSINE = 1e-3  # between a ray and the normal of the triangle that it hits; flatter ones are divided by this
 
 
 @dataclass(frozen=True)
-class MeshProxy:
+class MeshProxy(SurfaceRenderer):
     """Marching cubes in each rendering; a ray's hit is where it crosses a triangle.
 
     Source: MeshSDF (Remelli et al. 2020, arXiv 2006.03997), Theorem 1: a vertex moves by -n / |grad f| times the change
@@ -37,26 +37,18 @@ class MeshProxy:
         grid: samples on each side of the cube about the sphere.
         ray_samples: along a ray without a hit, of the grid's values, to find its closest place.
         least_slope: least length of the field's gradient at a vertex, in field units per scene unit.
-        mask_sharpness, mask_weight: of the mask loss; see `silhouette.CrossEntropy`.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
     grid: int
     ray_samples: int
-    least_slope: float
-    mask_sharpness: float
-    mask_weight: float
-    sphere_radius: float
 
     capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("grid", self.grid, 4, "96 has cells of .02 scene units")
         check_at_least("ray_samples", self.ray_samples, 2, "64 are a sample a cell and a half")
-        check_positive("least_slope", self.least_slope, "1e-2 is far flatter than a distance")
-        check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
-        check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
-        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     @property
     def accuracy(self) -> float:
@@ -89,12 +81,6 @@ class MeshProxy:
             residual=torch.zeros_like(entry).index_put((queried,), least.detach()),
             closest=(queried, least),
         )
-
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `silhouette.CrossEntropy`."""
-        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
 
     def _values(self, field: Field, like: Tensor) -> Float[Tensor, "side side side"]:
         """The field on the grid, by x, y, z."""

@@ -95,7 +95,7 @@ class Naive:
         with torch.no_grad():
             assert self.n_gradient_samples is not None  # checked above
             front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
-            stepping = Stepping(self.epsilon, 1.0, None, None, active_only=False, careful_split=False)
+            stepping = Stepping(self.epsilon, active_only=False)
             march(field, rays, front, stepping, self.steps)
         return approximate_front(field, rays, front, alpha=1.0, radius=self.sphere_radius)
 

@@ -1,26 +1,25 @@
 """Ray casting by range analysis: what is not certified to be empty is cut in half (Sharp and Jacobson, 2022)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Float, Int8
 from torch import Tensor
 
 from renderers.bracket import Bracket, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Field, Kind, bounds_of
+from renderers.field import Bounds, Field, bounds_of
 from renderers.gradients import fixed_samples, implicit
-from renderers.rendering import Capabilities, Rendering, Status, assemble
-from renderers.silhouette import CrossEntropy
+from renderers.rendering import Rendering, Status, assemble
+from renderers.silhouette import SurfaceRenderer
 
 GROWTH = 2.0  # of the next segment after an empty one
 ROOT_STEPS = 6  # of the secant method in the last segment
 
 
 @dataclass(frozen=True)
-class RangeAnalysis:
+class RangeAnalysis(SurfaceRenderer):
     """Goes along a ray by segments on which the field is certified to be positive, as long as they can be.
 
     Source: "Spelunking the Deep" (Sharp and Jacobson 2022, arXiv 2202.02444), Secs. 3, 4.1: ray casting by affine
@@ -38,29 +37,16 @@ class RangeAnalysis:
     Args:
         least_segment: in scene units; a shorter one is not cut any more.
         most_segments: per ray; a ray that is left is out of steps.
-        least_slope: see `gradients.implicit`.
-        mask_sharpness, mask_weight: of the mask loss; see `silhouette.CrossEntropy`.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
     least_segment: float
     most_segments: int
-    least_slope: float
-    mask_sharpness: float
-    mask_weight: float
-    sphere_radius: float
-
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_positive("least_segment", self.least_segment, "1e-3 finds all that a pixel shows")
         check_at_least("most_segments", self.most_segments, 1, "2500 cross the unit sphere by segments of 1e-3")
-        check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
-        check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
-        check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
-        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Finds the first crossings without a graph, then attaches the implicit gradient to the hits."""
@@ -81,12 +67,6 @@ class RangeAnalysis:
             residual=torch.where(least.isfinite(), least, 0.0),
             closest=(queried, fixed_samples(field, flat[queried], least_at[queried], least[queried])),
         )
-
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `silhouette.CrossEntropy`."""
-        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
 
     def _cast(self, field: Field, rays: Rays) -> "_Cast":
         bounds = bounds_of(field) or _promised(field)

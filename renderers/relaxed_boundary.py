@@ -1,26 +1,25 @@
 """Sphere tracing with a band about the silhouette that carries its gradient (Wang et al., SIGGRAPH Asia 2024)."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Kind
-from renderers.gradients import fixed_samples, implicit
+from renderers.field import Field
+from renderers.gradients import fixed_samples, implicit_front
 from renderers.march import Front, Stepping, march
-from renderers.rendering import Capabilities, Rendering, Status, Volume, assemble
-from renderers.silhouette import CrossEntropy
+from renderers.rendering import Rendering, Status, Volume
+from renderers.silhouette import SurfaceRenderer
 
 # Of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value.
 CANDIDATE = 1.5
 
 
 @dataclass(frozen=True)
-class RelaxedBoundary:
+class RelaxedBoundary(SurfaceRenderer):
     """Sphere tracing that gives rays close by a surface the gradient of coming into its view.
 
     On a ray that passes a surface, by a least field value within the band above `epsilon`, that surface has the weight
@@ -39,31 +38,18 @@ class RelaxedBoundary:
         steps: most marching steps per ray.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
         band: width of the band, in field units.
-        least_slope: see `gradients.implicit`.
-        mask_sharpness, mask_weight: of the mask loss; see `silhouette.CrossEntropy`.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
     steps: int
     epsilon: float
     band: float
-    least_slope: float
-    mask_sharpness: float
-    mask_weight: float
-    sphere_radius: float
-
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("steps", self.steps, 1, "400 converges, also next to an outline")
         check_positive("epsilon", self.epsilon, "5e-5 is a four-hundredth of a pixel at 64 x 64")
         check_positive("band", self.band, "0.01 is a third of a pixel at 64 x 64")
-        check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
-        check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
-        check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
-        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     @property
     def blur(self) -> float:
@@ -79,20 +65,8 @@ class RelaxedBoundary:
         flat = rays.flat()
         with torch.no_grad():
             front, passed, least = self._march(field, flat)
-        hit = (front.status == Status.HIT).nonzero().squeeze(-1)
-        queried = front.sample_value[:, 0].isfinite().nonzero().squeeze(-1)
-        distance = front.distance.index_put(
-            (hit,), implicit(field, flat[hit], front.distance[hit], least_slope=self.least_slope)
-        )
-        value = fixed_samples(field, flat[queried], front.sample_distance[queried, 0], front.sample_value[queried, 0])
-        rendering = assemble(
-            rays,
-            self.sphere_radius,
-            distance=distance,
-            status=front.status,
-            residual=front.value,
-            closest=(queried, value),
-        )
+        rendering = implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
+        distance, hit = rendering.distance.view(-1), (front.status == Status.HIT).nonzero().squeeze(-1)
         near = (least.isfinite() & (front.status != Status.STARTED_INSIDE)).nonzero().squeeze(-1)
         here = fixed_samples(field, flat[near], passed[near], least[near])
         coming = (here.detach() - here) / self.band
@@ -100,16 +74,10 @@ class RelaxedBoundary:
         volume = Volume(torch.cat([near, hit]), torch.cat([passed[near], distance[hit]]), torch.cat([coming, behind]))
         return replace(rendering, volume=volume)
 
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `silhouette.CrossEntropy`."""
-        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
-
     def _march(self, field: Field, rays: Rays) -> tuple[Front, Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The front; where each ray first passed a surface within the band, and the value there: infinite without."""
         front = Front.on_sphere(rays, radius=self.sphere_radius, samples=1)
-        stepping = Stepping(self.epsilon, 1.0, None, None, active_only=True, careful_split=False)
+        stepping = Stepping(self.epsilon)
         passed, least = front.distance.clone(), torch.full_like(front.distance, torch.inf)
         places = values = torch.full_like(least, torch.nan).expand(3, -1)  # of each ray's last three samples
         for _ in range(self.steps):

@@ -5,8 +5,9 @@ Their gradient is that of the renderer's `closest`, which the hinge asks for onl
 of `naive` follows the surface, so that its spurious hits are hardly pushed away.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,8 +17,8 @@ from torch.nn.functional import softplus
 from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, occupancy_logits
-from renderers.rendering import Observed, Renderer, Rendering, closest_values
+from renderers.field import Field, Kind, occupancy_logits
+from renderers.rendering import Capabilities, Observed, Renderer, Rendering, closest_values
 
 RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
 PLACES = (RANDOM, DEPTH)
@@ -147,6 +148,42 @@ class CrossEntropy:
         entropy = softplus(torch.where(mask, -logits, logits))
         total = (entropy * ~(mask & rendering.hit)).sum()
         return self.weight * total / (self.sharpness * max(mask.numel(), 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceRenderer(ABC):
+    """What renderers share whose hits have the exact gradient, and whose mask loss is IDR's.
+
+    Args:
+        least_slope: see `gradients.implicit`.
+        mask_sharpness, mask_weight: of the mask loss; see `CrossEntropy`.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    least_slope: float
+    mask_sharpness: float
+    mask_weight: float
+    sphere_radius: float
+
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
+    )
+
+    def __post_init__(self) -> None:
+        check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
+        check_positive("mask_sharpness", self.mask_sharpness, "the paper of IDR begins at 50")
+        check_at_least("mask_weight", self.mask_weight, 0, "the paper of IDR uses 100")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    @abstractmethod
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """See `Renderer`."""
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `CrossEntropy`."""
+        return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
 
 
 @dataclass(frozen=True)

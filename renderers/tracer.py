@@ -9,8 +9,7 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.evened import evened, measured_steepness
-from renderers.field import Coarse, Field, Kind, carries_gradient, coarse_of
+from renderers.field import Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_ball
 from renderers.gradients import crossing
 from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
@@ -20,6 +19,9 @@ from renderers.rendering import Deferred, Rendering, Status, assemble
 LONGEST = 0.006
 PATIENT = 2  # times `steps`, where all rays are marched on coarse values, and for those in doubt on the field after it
 NO_NEARER = 0.25  # times the error of coarse values: to how small ones rays are marched
+PAIRS, SPAN = 64, 0.1  # of points between which the steepness is measured; how far apart they are, in radii
+MOST = 0.95  # quantile of the slopes between them: a few places do not decide the steps everywhere
+STEEP = 1.2  # up to which values are taken for distances
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Tracer:
         return self._crossings_after(field, rays, reached, asked)
 
     def steepness(self, field: Field, rays: Rays) -> float:
-        """By what a field's values are to be divided before rays are marched on them; see `evened`.
+        """By what a field's values are to be divided before rays are marched on them; see `Evened`.
 
         Those of a bound are lengths that a step may take, however steep they are.
         """
@@ -302,3 +304,45 @@ def _keep_crossing(ends: Float[Tensor, "m 4"], index: Int[Tensor, " k"], distanc
     """Writes the first change of sign among the samples of k rays, where they have one, as the ends of a Bracket."""
     found, bracket = first_crossing(distance, value)
     ends[index[found]] = torch.stack([bracket.near, bracket.far, bracket.near_value, bracket.far_value], dim=1)
+
+
+@dataclass(frozen=True)
+class Evened(Wrapper):
+    """A field whose values are divided by how steep it is; the zero set is the same."""
+
+    inner: Field
+    steepness: float
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.inner(points) / self.steepness
+
+    @property
+    def coarse(self) -> Coarse | None:
+        """The coarse values of the field, divided as well."""
+        offered, by = coarse_of(self.inner), self.steepness
+        return offered and Coarse(lambda points: offered.values(points) / by, offered.error / by)
+
+
+def evened(field: Field, steepness: float) -> Field:
+    """The field divided by its steepness; itself where that is 1."""
+    if steepness == 1:
+        return field
+    return Evened(field, steepness)  # pyright: ignore[reportReturnType] (it is frozen)
+
+
+@torch.no_grad()
+def measured_steepness(values: Values, like: Float[Tensor, "*batch 3"], *, radius: float) -> float:
+    """How steep values are between pairs of points in the sphere; 1 where that is at most `STEEP`.
+
+    Values that are not finite do not count. Those behind the surface do: in front of it most fields are as steep.
+
+    Args:
+        like: points of the dtype and device at which values are asked.
+        radius: of the sphere about the origin in which the points lie.
+    """
+    points = radius * points_in_ball(PAIRS).to(like)
+    towards = torch.nn.functional.normalize(points.roll(1, dims=0) - points, dim=-1)
+    here, there = values(torch.cat([points, points + SPAN * radius * towards])).chunk(2)
+    slopes = (here - there)[here.isfinite() & there.isfinite()].abs() / (SPAN * radius)
+    steepness = float(slopes.quantile(MOST)) if len(slopes) else 1.0
+    return steepness if steepness > STEEP else 1.0

@@ -20,11 +20,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderers.camera import Rays
-from renderers.evened import evened
 from renderers.field import Field
 from renderers.packed_march import CLEAR, FURTHER, Reached
 from renderers.rendering import Rendering
-from renderers.tracer import Solved, Tracer
+from renderers.tracer import Solved, Tracer, evened
 
 SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have moved further
 STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch

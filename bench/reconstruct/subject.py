@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 from bench.setup.inputs import RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
-from datasets.observe import observed_pixels
 from datasets.photographs import Photography
 from datasets.scene import see
 from datasets.shot import Shot
 from datasets.truth import Truth
+from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
 
 FEWEST = 3  # given photographs

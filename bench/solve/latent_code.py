@@ -17,8 +17,7 @@ from bench.shape_prior.autodecoder import Prior
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import NotReached
 from renderers.checks import check_at_least, check_choice
-from renderers.field import Counts, Field, Meter
-from renderers.fields.moved import Moved
+from renderers.field import Counts, Field, Meter, Moved
 
 Terms = dict[str, Tensor]
 

@@ -17,8 +17,8 @@ from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.problem import OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
-from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene
+from datasets.views import observed_pixels, parse_amount
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss

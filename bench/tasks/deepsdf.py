@@ -11,8 +11,8 @@ from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.problem import OptimiserSettings
 from bench.solve.solve import solve_task
-from datasets.observe import observed_pixels, parse_amount
 from datasets.scene import Scene
+from datasets.views import observed_pixels, parse_amount
 from renderers.checks import check_positive
 from renderers.field import Field
 from renderers.rendering import Renderer

@@ -1,8 +1,10 @@
 """Volume rendering along rays: weights from the share of light that passes, and the rendering that they give."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,9 +12,10 @@ from torch import Tensor
 
 from renderers.bracket import BLOCK
 from renderers.camera import Rays, sphere_span
-from renderers.field import Field, carries_gradient
+from renderers.checks import check_at_least, check_positive
+from renderers.field import Field, Kind, carries_gradient
 from renderers.gradients import fixed_samples
-from renderers.rendering import Deferred, Rendering, Status, Volume, assemble
+from renderers.rendering import Capabilities, Deferred, Rendering, Status, Volume, assemble
 
 FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
 SEEN = 0.5  # opacity above which a ray has hit
@@ -134,10 +137,40 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     return replace(rendering, deferred=deferred, volume=volume)
 
 
-def mask_loss(rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
-    """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.2)."""
-    opacity = rendering.opacity.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
-    return -torch.where(mask, opacity, 1 - opacity).log().sum() / max(mask.numel(), 1)
+@dataclass(frozen=True, kw_only=True)
+class VolumeRenderer(ABC):
+    """What renderers share that see through a volume.
+
+    Args:
+        sharpening: iterations in which the first blur becomes the last one, by equal factors.
+        mask_weight: of the mask loss.
+        sphere_radius: of the sphere about the origin that holds the shape.
+    """
+
+    sharpening: int
+    mask_weight: float
+    sphere_radius: float
+
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
+    )
+
+    def __post_init__(self) -> None:
+        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
+        check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
+        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
+
+    @abstractmethod
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """See `Renderer`."""
+
+    def silhouette_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.2); the other papers have no masks."""
+        opacity = rendering.opacity.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
+        entropy = -torch.where(mask, opacity, 1 - opacity).log().sum() / max(mask.numel(), 1)
+        return self.mask_weight * entropy
 
 
 @dataclass(frozen=True)

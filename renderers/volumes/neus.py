@@ -1,21 +1,20 @@
 """NeuS: volume rendering whose weights are greatest at the surface (Wang et al., NeurIPS 2021)."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Kind
-from renderers.rendering import Capabilities, Rendering
+from renderers.field import Field
+from renderers.rendering import Rendering
 from renderers.volumes.integrate import (
     Samples,
+    VolumeRenderer,
     by_importance,
     evenly,
-    mask_loss,
     render_volume,
     scheduled,
     weights,
@@ -23,7 +22,7 @@ from renderers.volumes.integrate import (
 
 
 @dataclass(frozen=True)
-class NeuS:
+class NeuS(VolumeRenderer):
     """Opacity from how a sigmoid of the distance falls from one sample to the next.
 
     Source: NeuS (Wang et al. 2021, arXiv 2106.10689), Eq. 13 (opacity of an interval), Sec. 3.2 and supplement
@@ -41,9 +40,7 @@ class NeuS:
         round_sharpness: of the sigmoid in the first round, for a length of one scene unit; it doubles with each.
         sharpness: s, of the sigmoid; the blur of the surface is some times its inverse.
         first_sharpness: at the first iteration of an optimisation.
-        sharpening: iterations in which the one becomes the other, by equal factors.
-        mask_weight: of the mask loss.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
 
     samples: int
@@ -52,24 +49,15 @@ class NeuS:
     round_sharpness: float
     sharpness: float
     first_sharpness: float
-    sharpening: int
-    mask_weight: float
-    sphere_radius: float
-
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("samples", self.samples, 2, "the paper uses 64")
         check_at_least("rounds", self.rounds, 0, "the official code uses 4")
         check_at_least("round_samples", self.round_samples, 1, "the official code uses 16")
         check_positive("round_sharpness", self.round_sharpness, "the official code begins at 64")
         check_positive("sharpness", self.sharpness, "1000 blurs the surface over .004 of the unit sphere")
         check_positive("first_sharpness", self.first_sharpness, "the official code begins at 20")
-        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
-        check_at_least("mask_weight", self.mask_weight, 0, "the paper uses 0.1")
-        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     @property
     def blur(self) -> float:
@@ -87,12 +75,6 @@ class NeuS:
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Samples where the sigmoid falls, then sums with a graph."""
         return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
-
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """The cross entropy of the opacity (Sec. 3.2)."""
-        return self.mask_weight * mask_loss(rendering, mask)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Equally spaced samples, then rounds of more, where the last found most weight."""

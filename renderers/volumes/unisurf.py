@@ -1,23 +1,21 @@
 """UNISURF: occupancy as the opacity of samples that draw together about the surface (Oechsle et al., ICCV 2021)."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from renderers.bracket import first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Kind, occupancy_logits
-from renderers.rendering import Capabilities, Rendering
-from renderers.volumes.integrate import Samples, evenly, mask_loss, render_volume, scheduled
+from renderers.field import Field, occupancy_logits
+from renderers.rendering import Rendering
+from renderers.volumes.integrate import Samples, VolumeRenderer, evenly, render_volume, scheduled
 
 
 @dataclass(frozen=True)
-class UNISURF:
+class UNISURF(VolumeRenderer):
     """DVR's search for the surface, then occupancies as opacities within an interval about it.
 
     Source: UNISURF (Oechsle et al. 2021, arXiv 2104.10078), Eq. 5 (weights), Sec. 3.3 and Eq. 9 (the interval).
@@ -38,9 +36,7 @@ class UNISURF:
         first_interval: at the first iteration of an optimisation.
         occupancy_width: scene units over which a distance turns from occupied to free.
         first_occupancy_width: at the first iteration.
-        sharpening: iterations in which the first ones become the others, by equal factors.
-        mask_weight: of the mask loss.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
 
     search_samples: int
@@ -51,23 +47,15 @@ class UNISURF:
     first_interval: float
     occupancy_width: float
     first_occupancy_width: float
-    sharpening: int
-    mask_weight: float
-    sphere_radius: float
-
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("search_samples", self.search_samples, 2, "the paper uses 256")
         check_at_least("search_steps", self.search_steps, 0, "the paper uses 8")
         check_at_least("samples", self.samples, 2, "the paper uses 64")
         check_at_least("free_samples", self.free_samples, 1, "the paper uses 32")
-        for name in ("interval", "first_interval", "occupancy_width", "first_occupancy_width", "sphere_radius"):
+        for name in ("interval", "first_interval", "occupancy_width", "first_occupancy_width"):
             check_positive(name, getattr(self, name), "conf/renderer/unisurf.yaml has values that work")
-        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
-        check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
 
     @property
     def blur(self) -> float:
@@ -95,12 +83,6 @@ class UNISURF:
             return logsigmoid(-occupancy_logits(field, value, width=self.occupancy_width))
 
         return render_volume(field, rays, self._search, passing, radius=self.sphere_radius)
-
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """The cross entropy of the opacity, as in NeuS; the paper has no masks."""
-        return self.mask_weight * mask_loss(rendering, mask)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Equally spaced samples in front of the surface and in the interval; on the whole ray where there is none."""

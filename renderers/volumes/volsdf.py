@@ -6,21 +6,29 @@ from math import log
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
 from renderers.rendering import Capabilities, Rendering
-from renderers.volumes.integrate import Samples, by_importance, evenly, mask_loss, render_volume, scheduled, weights
+from renderers.volumes.integrate import (
+    Samples,
+    VolumeRenderer,
+    by_importance,
+    evenly,
+    render_volume,
+    scheduled,
+    weights,
+)
 
 HALVINGS = 10  # of the interval in which the least width is searched, as in the paper
 MOST_LOG = 14.0  # of the error's exponential: larger ones are all the same
 
 
 @dataclass(frozen=True)
-class VolSDF:
+class VolSDF(VolumeRenderer):
     """Density from the Laplace distribution's cumulative function of the distance.
 
     Source: VolSDF (Yariv et al. 2021, arXiv 2106.12052), Eqs. 2, 3 (density), Theorem 1 and Eq. 14 (bound on the error
@@ -39,9 +47,7 @@ class VolSDF:
         extra_samples: beside these, of the samples that bound the error, every so many, as in the official code.
         width: beta, in scene units; the density deep inside is its inverse.
         first_width: at the first iteration of an optimisation.
-        sharpening: iterations in which the one becomes the other, by equal factors.
-        mask_weight: of the mask loss.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
 
     samples: int
@@ -51,13 +57,11 @@ class VolSDF:
     extra_samples: int
     width: float
     first_width: float
-    sharpening: int
-    mask_weight: float
-    sphere_radius: float
 
     capabilities: ClassVar[Capabilities] = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("samples", self.samples, 2, "the paper uses 128")
         check_at_least("rounds", self.rounds, 0, "the paper uses 5")
         check_positive("error", self.error, "the paper uses 0.1")
@@ -65,9 +69,6 @@ class VolSDF:
         check_at_least("extra_samples", self.extra_samples, 2, "the official code uses 32")
         check_positive("width", self.width, "0.001 blurs the surface over .004 of the unit sphere")
         check_positive("first_width", self.first_width, "the paper begins at 0.1")
-        check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")
-        check_at_least("mask_weight", self.mask_weight, 0, "0.1 is that of NeuS")
-        check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
 
     @property
     def blur(self) -> float:
@@ -85,12 +86,6 @@ class VolSDF:
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Samples until the opacity's error is bounded, then sums with a graph."""
         return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
-
-    def silhouette_loss(
-        self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
-        """The cross entropy of the opacity, as in NeuS; the paper has no masks."""
-        return self.mask_weight * mask_loss(rendering, mask)
 
     def bounded(
         self, field: Field, rays: Rays, entry: Tensor, leave: Tensor

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from datasets.observe import observed_pixels
 from datasets.scene import View
-from datasets.views import ViewSampler
+from datasets.views import ViewSampler, observed_pixels
 
 FOREGROUND = 200
 

@@ -84,8 +84,8 @@ def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status):
 def test_an_optimisation_begins_warm_on_coarse_values_too(off):
     """A ball grows, and another one enters from the side."""
     rays, warm = camera().rays(), fresh(NEWTON)
-    for iteration in range(16):
-        shape = sphere(0.4 + 0.002 * iteration) | sphere(0.2, (1.3 - 0.03 * iteration, 0.0, 0.0))
+    for iteration in range(8):
+        shape = sphere(0.4 + 0.004 * iteration) | sphere(0.2, (1.3 - 0.06 * iteration, 0.0, 0.0))
         meter = Meter(Offering(shape, off))
         found = rendered(at_iteration(warm, iteration), meter, rays)
         cold = load("renderer", "newton", warm=False).render(shape, rays)
@@ -97,7 +97,7 @@ def test_an_optimisation_begins_warm_on_coarse_values_too(off):
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
     rays = camera().rays()
-    reached, _ = NEWTON.trace(Offering(shape, ERRORS["too large"]), rays)
+    reached, _ = NEWTON.tracer.trace(Offering(shape, ERRORS["too large"]), rays)
     left = reached.stopped(Stop.LEFT) & reached.least.isfinite()
     there = shape(rays.flat().at(reached.least_distance))
     assert left.sum() > 1000
@@ -120,9 +120,9 @@ def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind):
 
 
 def test_rays_are_not_marched_to_where_coarse_values_say_nothing():
-    assert NEWTON.stride().epsilon == NEWTON.march_epsilon
-    assert NEWTON.stride(ERROR).epsilon == pytest.approx(ERROR / 4)
-    assert NEWTON.stride(1e-6).epsilon == NEWTON.march_epsilon
+    assert NEWTON.tracer.stride().epsilon == NEWTON.march_epsilon
+    assert NEWTON.tracer.stride(ERROR).epsilon == pytest.approx(ERROR / 4)
+    assert NEWTON.tracer.stride(1e-6).epsilon == NEWTON.march_epsilon
 
 
 def test_coarse_values_can_be_switched_off():

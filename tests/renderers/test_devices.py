@@ -4,19 +4,21 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from bench.config import CONF, load
 from renderers.adaptive_samples import follow
 from renderers.camera import Camera
-from renderers.field import Field, steepest
+from renderers.field import Field, Moved, steepest
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
-from renderers.fields.moved import Moved
 from renderers.rendering import Observed, at_iteration
 from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
 
 CPU = torch.device("cpu")
-NAMES = [path.stem for path in sorted((CONF / "renderer").glob("*.yaml")) if path.stem != "custom"]
+FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "renderer").glob("*.yaml"))}
+NAMES = [name for name, file in FILES.items() if "defaults" not in file and name != "custom"]
+NAMES += ["naive_practical", "dist_slope_bound", "dist_dynamic", "dvr_early_stop"]  # variants with code of their own
 SILHOUETTES = (Own(), Hinge(5e-5, True, "violating"), CrossEntropy(50.0, 100.0), Occupancy(0.02, 3.0, 1.0, DEPTH))
 
 

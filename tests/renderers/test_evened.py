@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.evened import PAIRS, STEEP, Evened, evened, measured_steepness
 from renderers.field import Coarse, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere, torus
+from renderers.tracer import PAIRS, STEEP, Evened, evened, measured_steepness
 
 LIKE = torch.zeros(0, 3)
 RING, BALL = torus(0.5, 0.2), sphere(0.5)

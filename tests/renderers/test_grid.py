@@ -6,10 +6,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from renderers.field import Kind, autograd_gradients
+from renderers.field import Kind, Moved, autograd_gradients
 from renderers.fields.analytic import box, sphere
 from renderers.fields.grid import Grid
-from renderers.fields.moved import Moved
 
 REACH = 1.05
 

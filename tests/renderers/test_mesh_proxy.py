@@ -46,7 +46,7 @@ def test_its_gradients_are_those_of_the_field_up_to_the_grid(steep):
 def test_a_finer_grid_is_closer():
     rays, errors = aimed(100), []
     truth = load("renderer", "idr").render(sphere(0.5), rays).distance
-    for grid in (12, 24, 48, 96):
+    for grid in (12, 24, 48):
         errors.append((replace(RENDERER, grid=grid).render(sphere(0.5), rays).distance - truth).abs().max().item())
     for coarse, fine in pairwise(errors):
         assert fine < 0.4 * coarse  # the error of a chord falls with the square of its length
@@ -54,9 +54,9 @@ def test_a_finer_grid_is_closer():
 
 def test_what_is_thinner_than_the_grid_is_lost():
     ray = Rays(vector((0.01, 0.02, -2))[None], normalize(vector((0.02, 0.03, 1))[None], dim=-1))
-    thin = box((0.5, 0.5, 0.005))
-    assert replace(RENDERER, grid=401).render(thin, ray).hit.item()
-    assert not RENDERER.render(thin, ray).hit.item()
+    thin = box((0.5, 0.5, 0.02))  # cells of 0.02 see it, cells of 0.09 do not
+    assert replace(RENDERER, grid=101).render(thin, ray).hit.item()
+    assert not replace(RENDERER, grid=22).render(thin, ray).hit.item()
 
 
 @pytest.mark.parametrize("slope", [1e-2, 5e-4])

@@ -9,11 +9,11 @@ from torch import Tensor
 from bench.config import load
 from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays, sphere_span
-from renderers.evened import PAIRS
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
 from renderers.packed_march import CLEAR, FURTHER, Reached, Stop, Stride, march
 from renderers.rendering import Rendering, Status, closest_values
+from renderers.tracer import PAIRS
 from tests.renderers.analytic_cases import CASES, beam
 from tests.tiny import camera_of
 
@@ -317,7 +317,7 @@ def test_a_miss_beside_a_surface_at_the_rim_of_the_sphere_has_a_closest_sample()
 @by_shape
 def test_up_to_its_anchor_the_field_is_large(shape):
     rays = camera().rays()
-    reached, _ = NEWTON.trace(shape, rays)
+    reached, _ = NEWTON.tracer.trace(shape, rays)
     assert ((reached.anchor >= reached.entry) & (reached.anchor <= reached.leave)).all()
     assert (reached.anchor > reached.entry).sum() > 300
     shares = torch.linspace(0, 1, 100)
@@ -331,7 +331,7 @@ def test_a_root_lies_between_where_its_ray_begins_and_ends():
     for offset, place, settled in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
         wall = plane((0.0, 0.0, -1.0), offset)
         start = guess - (1.0 if offset > 0 else -0.9995)
-        solved = NEWTON.solve(wall, rays, reached, torch.tensor([0]), start)
+        solved = NEWTON.tracer.solve(wall, rays, reached, torch.tensor([0]), start)
         assert solved.settled.item() == settled
         assert place is None or solved.distance.item() == pytest.approx(place)
 
@@ -339,7 +339,7 @@ def test_a_root_lies_between_where_its_ray_begins_and_ends():
 def test_the_value_where_the_first_step_began_is_kept_where_all_roots_take_a_second():
     rays, guess = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0)), torch.tensor([1.99, 1.992]).double()
     reached = Reached.on_sphere(rays, 1.0)
-    solved = NEWTON.solve(plane((0.0, 0.0, -1.0), 0.0), rays, reached, torch.arange(2), guess)
+    solved = NEWTON.tracer.solve(plane((0.0, 0.0, -1.0), 0.0), rays, reached, torch.arange(2), guess)
     assert solved.settled.all()
     assert solved.begun.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
 
@@ -348,7 +348,13 @@ def marched(*values: float) -> Reached:
     """Where a ray is that begins in the sphere's centre and finds these values."""
     rays, left = beam((0.0, 0.0, 0.0)), iter(values)
     reached = Reached.on_sphere(rays, 1.0)
-    march(lambda points: points.new_full(points.shape[:-1], next(left)), rays, reached, NEWTON.stride(), len(values))
+    march(
+        lambda points: points.new_full(points.shape[:-1], next(left)),
+        rays,
+        reached,
+        NEWTON.tracer.stride(),
+        len(values),
+    )
     return reached
 
 
@@ -374,10 +380,10 @@ def test_a_ray_that_begins_a_little_inside_began_inside():
 
 def test_a_step_of_no_length_has_no_slope():
     at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
-    at.advance(torch.tensor([0.4]).double(), NEWTON.stride())
+    at.advance(torch.tensor([0.4]).double(), NEWTON.tracer.stride())
     first = at.distance.item()
     at.distance = at.free
-    at.advance(torch.tensor([0.4]).double(), NEWTON.stride())
+    at.advance(torch.tensor([0.4]).double(), NEWTON.tracer.stride())
     assert at.distance.item() == first
 
 
@@ -501,7 +507,7 @@ def test_settings_that_cannot_be_are_refused(setting, value, remedy):
 @pytest.mark.parametrize("image", [True, False])
 def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
     field, rays = SHAPES["ring"] | sphere(0.2, (0.0, 0.0, -0.7)), camera().rays()
-    reached = NEWTON.trace(field, rays if image else rays.flat())[0]
+    reached = NEWTON.tracer.trace(field, rays if image else rays.flat())[0]
     left = reached.stopped(Stop.LEFT).nonzero().squeeze(-1)
     cleared = reached.cleared[left]
     assert ((cleared < reached.leave[left]) & (reached.least[left] < CLEAR)).sum() > 50

@@ -9,11 +9,10 @@ from torch.nn.functional import normalize
 from bench.config import load
 from bench.machine.limits import Limits
 from renderers.camera import Rays
-from renderers.field import Counts, Kind, Meter, bounds_of, steepest
+from renderers.field import Counts, Kind, Meter, Moved, bounds_of, steepest
 from renderers.fields.affine import segment_bounds
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
-from renderers.fields.moved import Moved
 from renderers.reference import trace
 from renderers.rendering import Status
 from tests.renderers.analytic_cases import vector
