@@ -23,6 +23,7 @@ from bench.report.write import paper
 from bench.run import library
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
+from tests.readme import wrongs
 from tests.run.driving import command as typed
 
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
@@ -190,6 +191,16 @@ def test_the_page_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
         sys.modules.pop("bench.report.pages.coverage", None)
     assert page["header"][0] == "Run" and len(page["rows"]) == 2
     assert not list((own_task / "sweeps").glob("*/table.csv"))  # a page shows it
+
+
+def test_a_readme_that_is_long_or_full_of_numbers_is_told():
+    fine = (
+        "# Of 9\n\nA line. " * 60 + "\n| a | 1 |\n\n    seed=0,1,2\n\n```python\nx = 1\n```\n[word](page7.md#3) `n=1`\n"
+    )
+    assert wrongs(fine[:900]) == []
+    assert [said.split(",")[0] for said in wrongs(fine)] == ["129 lines", "61 numbers"]
+    assert wrongs("word " * 25 + "end. `a b` " + "word " * 24)[0].startswith("a sentence of 26 words")
+    assert len(wrongs("word " * 25 + "end. `a b` " + "word " * 24)) == 1
 
 
 def test_comments_and_other_words_are_no_part_of_a_command():

@@ -1,0 +1,30 @@
+"""`python -m tests.readme`, a part of `make lint`: whether README.md is short, has few numbers and short sentences."""
+
+import re
+import sys
+from pathlib import Path
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
+BLOCK = re.compile(r"^```[\s\S]*?^```$|^ {4}.*$|<[^>]*>", re.MULTILINE)  # what is typed, and HTML
+ADDRESS = re.compile(r"!?\[([^]]*)\]\([^)]*\)")  # the text of a link stays
+CODE = re.compile(r"`[^`]*`")
+NUMBER = re.compile(r"(?<![\w.])[-−]?\d[\d,.]*")
+ENDS = re.compile(r"(?<=[.!?])\s+|\n\s*\n|\n(?=#|\s*[-*] |\s*\d+\. )|\||^#.*$", re.MULTILINE)  # of sentences
+
+
+def wrongs(text: str) -> list[str]:
+    """What is too long in a README, a line for each; code and addresses have no numbers and are a word."""
+    prose = CODE.sub("code", ADDRESS.sub(r"\1", BLOCK.sub("", text)))
+    lines, numbers = len(text.splitlines()), len(NUMBER.findall(prose))
+    found = [f"{lines} lines, at most {LINES}: move some to results/README.md"] if lines > LINES else []
+    found += [f"{numbers} numbers, at most {NUMBERS}: leave them to results/README.md"] if numbers > NUMBERS else []
+    for sentence in (" ".join(part.split()) for part in ENDS.split(prose)):
+        words = sum(any(map(str.isalnum, word)) for word in sentence.split(" "))
+        found += [f"a sentence of {words} words, at most {WORDS}: {sentence}"] if words > WORDS else []
+    return found
+
+
+if __name__ == "__main__":
+    said = wrongs(README.read_text(encoding="utf-8"))
+    sys.exit("\n".join(f"README.md has {each}" for each in said) or None)
