@@ -23,7 +23,7 @@ def write(results, size: int, threads: int, factor: float = 0.5, **changed) -> N
         metrics |= {f"{name}.{key}": number for key, number in numbers(times, coarse).items()}
     definitions = {"forward_ratio, step_ratio": "over the first renderer's"}
     write_run(
-        results, "benchmark", None, task="benchmark", metrics=changed.pop("metrics", metrics), definitions=definitions,
+        results, "benchmark", None, task="ablation", metrics=changed.pop("metrics", metrics), definitions=definitions,
         settings={"task": {"size": size, "threads": threads}}, **changed,
     )  # fmt: skip
 

@@ -63,7 +63,7 @@ def test_a_process_of_its_own_finds_the_same(plain):
     assert [bool(reason) for reason in found] == [False, True, True, True, True]
 
 
-@pytest.mark.parametrize("task", ["ablation", "benchmark", "gradients", "pose"])
+@pytest.mark.parametrize("task", ["ablation", "gradients", "pose"])
 def test_a_task_on_a_fitted_network_is_refused_without_one(plain, task):
     shape = ("task.shape=prior",) if task == "pose" else ()
     cells = [plain(f"task={task}", *shape), plain("+experiment=fitted", f"task={task}", *shape)]

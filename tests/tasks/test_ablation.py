@@ -22,8 +22,7 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.problem import Unsupported
 from bench.tasks import ablation
-from bench.tasks.ablation import DEFINITIONS, SMALLER, Ablation
-from bench.tasks.workbench import WARM_UP, Clocked, Workbench
+from bench.tasks.ablation import BASE, DEFINITIONS, SMALLER, WARM_UP, Ablation, Clocked
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
@@ -147,8 +146,7 @@ def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(
 def test_costs_are_medians_with_least_and_largest():
     clocked = Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], Counts(10, 4, coarse=7), 77, 600, 80)
     forward = Clocked([2.0], [0.0], [0.0], Counts(5, 0), None, None)
-    measured = ablation.Measured(Workbench.__new__(Workbench), forward, clocked)
-    assert measured.costs({"gemm_peak_flops": 100.0, "bfloat16_peak_flops": 400.0}) == {
+    assert ablation.costs(forward, clocked, {"gemm_peak_flops": 100.0, "bfloat16_peak_flops": 400.0}) == {
         "queries": 5, "coarse_queries": 0, "step_queries": 10, "step_coarse_queries": 7, "step_gradients": 4,
         "repeats": 3, "peak_memory_bytes": 77,
         "forward_seconds": 2.0, "forward_seconds_low": 2.0, "forward_seconds_high": 2.0,
@@ -346,9 +344,63 @@ def test_renderers_that_cannot_are_unsupported(tmp_path):
         ({"smallest": 0}, r"task\.smallest must be at least 1, not 0"),
         ({"wrong": 0.0}, r"task\.wrong must be positive, not 0"),
         ({"wrong": float("nan")}, r"task\.wrong must be positive, not nan"),
+        ({"rounds": 0}, r"task\.rounds must be at least 1, not 0"),
+        ({"size": 2}, r"task\.size must be at least 8, not 2"),
+        ({"threads": 0}, r"task\.threads must be at least 1, not 0"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         replace(SETTINGS, **changed)
     assert not isnan(SETTINGS.wrong)
+
+
+TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)
+
+
+@pytest.fixture(scope="module")
+def in_turn(tmp_path_factory) -> RunContext:
+    return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"), TURNS, 32)
+
+
+def test_every_renderer_in_turn_has_its_costs_and_errors_under_its_name(in_turn):
+    metrics = in_turn.record.metrics
+    assert in_turn.record.status is RunStatus.OK
+    names = {key.split(".")[0] for key in metrics if "." in key}
+    assert names == {BASE, "newton", "dvr"}
+    assert metrics["rounds"] == metrics["dvr.repeats"] == 2
+    known = in_turn.record.definitions
+    assert [key for key in metrics if sum(defined(key.split(".")[-1], part) for part in known) < 1] == []
+    for name in names:
+        assert metrics[f"{name}.rays"] == 16**2
+        assert metrics[f"{name}.hits"] > 20
+        assert metrics[f"{name}.queries"] > 0
+        assert metrics[f"{name}.forward_seconds"] > 0
+    assert metrics["dvr.queries"] > 5 * metrics["newton.queries"]
+    assert metrics["newton.depth_error_median"] < metrics[f"{BASE}.depth_error_median"]
+    assert metrics[f"{BASE}.forward_ratio"] == metrics[f"{BASE}.step_cpu_ratio_high"] == 1
+
+
+def test_ratios_are_of_the_same_round():
+    mine, base = Clocked([2.0, 9.0, 2.0], cpu=[4.0, 4.0, 4.0]), Clocked([1.0, 3.0, 1.0], cpu=[8.0, 2.0, 8.0])
+    assert ablation.ratios(mine, base, "step") == {
+        "step_cpu": 4.0, "step_ratio": 2.0, "step_ratio_low": 2.0, "step_ratio_high": 3.0,
+        "step_cpu_ratio": 0.5, "step_cpu_ratio_low": 0.5, "step_cpu_ratio_high": 2.0,
+    }  # fmt: skip
+
+
+def test_a_limit_names_the_renderer_that_reached_it(tmp_path):
+    run = measured(tmp_path, load("renderer", "dist"), replace(TURNS, limits=Limits(values=8000, memory=8)), 32)
+    assert run.record.status is RunStatus.TIMEOUT
+    assert run.record.reason.startswith("more than 8,000 field values in a rendering of dvr at 16 x 16; ")
+
+
+def test_threads_are_those_asked_for_and_given_back(tmp_path, monkeypatch):
+    seen, before = [], torch.get_num_threads()
+    clock = ablation.Workbench._clock
+    monkeypatch.setattr(
+        ablation.Workbench, "_clock", lambda *given: seen.append(torch.get_num_threads()) or clock(*given)
+    )
+    measured(tmp_path, load("renderer", "dist"), replace(SETTINGS, threads=2))
+    assert set(seen) == {2}
+    assert torch.get_num_threads() == before

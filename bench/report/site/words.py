@@ -21,7 +21,6 @@ TASKS = {
     "prior_fit": "Fit a prior's code to the true distances: the best that a method can hope for",
     "single_view": "Say shape and colour from one image, by a trained network",
     "ablation": "Measure what one rendering costs and how far it is from a float64 reference",
-    "benchmark": "Time renderers in turn in one process",
     "gradients": "Compare a renderer's gradients with float64 differences",
     "stability": "Search for the severity at which a renderer breaks",
     "capacity": "Measure how much model a shape needs",

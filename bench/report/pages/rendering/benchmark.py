@@ -13,10 +13,8 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, shown, text, to_data, to_table, together, whole
 
 PLACE = 15
-BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.benchmark
-READS = (
-    Selection("benchmark", ("benchmark",), ("task",), ("size", "threads"), setup=("scenes", "network", "machine")),
-)
+BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.ablation
+READS = (Selection("benchmark", ("ablation",), ("task",), ("size", "threads"), setup=("scenes", "network", "machine")),)
 HEADINGS = {
     "forward": "Forward ratio",
     "forward_cpu": "Forward ratio, CPU",
