@@ -91,8 +91,7 @@ def median(values: Values) -> float | np.ndarray:
 
 def geometric_mean(values: Values) -> float | np.ndarray:
     """The geometric mean [...] of values [..., n] of 0 or more; +inf where one of them is."""
-    with np.errstate(divide="ignore"):
-        return np.exp(np.mean(np.log(_checked(values)), axis=-1))
+    return stats.gmean(_checked(values), axis=-1)
 
 
 def shape_medians(groups: Groups) -> np.ndarray:
