@@ -5,10 +5,10 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
+from bench.report.gallery import Block, Cell, arrays, draw, whole
 from bench.report.pages.completion import completion_gallery
 from bench.report.pages.images import rerendering
 from bench.report.pages.views import misplaced_gallery, multiview_gallery
-from bench.report.write.gallery import GAP, TILE, Block, Cell, draw, tile
 from tests.report.test_report_paper import told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -71,16 +71,17 @@ def made(results, page):
 
 
 def cells(axis, across=1):
-    """The colour in the middle of the first picture of each cell; the names of rows and columns."""
-    image = axis.get_images()[0].get_array()
+    """The colour in the middle of the first picture of each cell; white without one; the names of rows and columns."""
     rows = [label.get_text().replace("\n", " ") for label in axis.get_yticklabels()]
     columns = [label.get_text().replace("\n", " ") for label in axis.get_xticklabels()]
-    width = across * TILE + GAP
-    return {
-        (row, column): tuple(image[line * (TILE + GAP) + TILE // 2, place * width + (TILE // 2)].tolist())
-        for line, row in enumerate(rows)
-        for place, column in enumerate(columns)
-    }
+    found = {(row, column): (1.0, 1.0, 1.0) for row in rows for column in columns}
+    for image in reversed(axis.get_images()):
+        box = axis.transData.inverted().transform_bbox(image.get_clip_box())
+        (x, y), (left, right, bottom, top) = (box.p0 + box.p1) / 2, image.get_extent()
+        picture = image.get_array()
+        place = (int((y - top) / (bottom - top) * len(picture)), int((x - left) / (right - left) * picture.shape[1]))
+        found[rows[int(y)], columns[int(x // across)]] = tuple(picture[place].tolist())
+    return found
 
 
 def notes(figure):
@@ -122,13 +123,13 @@ def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path
     assert sorted(notes(result.figure)) == sorted(["not_reached", "crashed", "empty", "no picture", "no run"])
     assert cells(result.figure.axes[0], across=2)["DIST", "20 pts"] == COLOURS[RIGHT]
     assert "3 of 5 runs did not end ok" in result.caption
-    assert "No pictures of 2 runs, sofa: no images.npz." in told(result)
+    assert "No pictures of 2 runs: no images.npz." in told(result)
 
 
 def test_a_folder_of_another_task_has_no_such_pictures(tmp_path):
     completed(tmp_path, "DIST", "20", true_hit=None)
     result = made(tmp_path, completion_gallery)
-    assert notes(result.figure) == ["no picture", "no picture"]  # given, found
+    assert notes(result.figure) == ["no picture"]
     assert "images.npz lacks an array: true_hit" in told(result)
 
 
@@ -201,18 +202,33 @@ def test_without_any_picture_the_page_says_so(tmp_path):
     assert notes(result.figure) == ["no picture"] and "no images.npz" in told(result)
 
 
-def test_a_tile_is_the_part_in_the_window_with_its_pixels_as_they_are():
-    picture = np.arange(16.0).reshape(4, 4, 1).repeat(3, axis=2)
-    found = tile(picture, (0.25, 0.5, 0.5))
-    assert found.shape == (TILE, TILE, 3)
-    assert np.unique(found).tolist() == [6, 7, 10, 11]
-    assert (found[: TILE // 2, : TILE // 2] == 6).all()
+def test_a_picture_fills_its_cell_with_the_part_in_the_window_and_is_cut_there():
+    picture = np.arange(16.0).reshape(4, 4, 1).repeat(3, axis=2) / 16
+    axis = draw([Block("", ["a", "b"], {"c": [Cell(), Cell([(picture, (0.25, 0.5, 0.5))])]})]).axes[0]
+    (image,) = axis.get_images()
+    assert image.get_extent() == [0.0, 2.0, 1.5, -0.5]  # the pixels at rows 1 and 2, columns 2 and 3, fill x 1 to 2
+    box = axis.transData.inverted().transform_bbox(image.get_clip_box())
+    assert [box.x0, box.x1, *sorted((box.y0, box.y1))] == pytest.approx([1, 2, 0, 1], abs=0.02)
+
+
+def test_a_large_picture_is_averaged_so_that_single_pixels_stay_visible():
+    figure = draw([Block("", ["a", "b"], {"c": [Cell([whole(np.ones((size, size, 3)))]) for size in (16, 1024)]})])
+    assert [image.get_interpolation() for image in figure.axes[0].get_images()] == ["nearest", "auto"]
+
+
+@pytest.mark.parametrize("broken", [{"hit": (4, 5)}, {"normals": (4, 4)}, {"colours": (5, 4, 3)}, {"hit": (0, 0)}])
+def test_arrays_of_different_sizes_are_none(tmp_path, broken):
+    sizes = {"hit": (4, 4), "normals": (4, 4, 3), "colours": (4, 4, 3)}
+    np.savez(tmp_path / "images.npz", **{name: np.ones(size) for name, size in (sizes | broken).items()})
+    assert arrays(tmp_path, sizes) == ({}, "images.npz holds arrays of different sizes")
+    np.savez(tmp_path / "images.npz", **{name: np.ones(size) for name, size in sizes.items()})
+    assert set(arrays(tmp_path, sizes)[0]) == set(sizes)
 
 
 def test_names_of_narrow_columns_are_wrapped_and_stay_within_the_figure():
     names = ["DIST, paper's, 72 views, 180 iterations", *(f"row {number}" for number in range(10))]
-    rows = {"a name of a row that is long": [Cell((np.ones((TILE, TILE, 3)),))] * len(names)}
-    figure = draw([Block("car", names, rows)], across=1)
+    rows = {"a name of a row that is long": [Cell([whole(np.ones((8, 8, 3)))])] * len(names)}
+    figure = draw([Block("car", names, rows)])
     figure.draw_without_rendering()
     axis = figure.axes[0]
     boxes = [label.get_window_extent() for label in (*axis.get_xticklabels(), *axis.get_yticklabels())]

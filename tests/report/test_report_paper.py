@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.colors import to_rgb
 
 from bench.pictures import style
 from bench.records.read import read_records
+from bench.report import gallery
 from bench.report.__main__ import main
 from bench.report.data import curves
 from bench.report.data.experiments import Experiment, choose
 from bench.report.pages.completion import fig5
 from bench.report.pages.rendering import fig4, fig7, gradients, gradients_visibility, table1
-from bench.report.write import pictures
 from bench.report.write import result as tables
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper
@@ -394,27 +395,30 @@ def test_fig4_counts_what_the_pictures_show(tmp_path):
     assert rows.loc[DYNAMIC, "lost"] == (reference & ~moved).sum() > 0
     assert rows.loc[DYNAMIC, "false"] == (moved & ~reference).sum() > 0
     assert rows.loc[DYNAMIC, "hits"] == reference.sum()
-    assert "No pictures of + aggressive: no images.npz." in made.notes
-    titles = [axis.get_title() for axis in made.figure.axes if axis.get_title()]
-    assert titles[0] == "reference" and "8 px" in titles[3] and "timeout" in titles[3]
+    assert "No pictures of 1 run: no images.npz." in made.notes
+    titles = [label.get_text().replace("\n", " ") for label in made.figure.axes[0].get_xticklabels()]
+    assert titles == ["reference", PARALLEL, DYNAMIC, f"{NAIVE}, 8 px", "+ aggressive"]
+    assert [text.get_text() for text in made.figure.axes[0].texts if text.get_text()] == ["timeout", "no picture"]
     assert any("degrees" in axis.get_ylabel() for axis in made.figure.axes)
 
 
 def test_angles_are_degrees_where_both_hit(tmp_path):
     write_images(tmp_path, tilt=10.0)
-    images = pictures.load(tmp_path)[0]
-    angles = images.angles()
-    assert np.isnan(angles).sum() == (~images.hit).sum()
-    within = np.abs(images.normals[..., 1]) < 0.1  # the turn is about y
+    images = gallery.arrays(tmp_path, gallery.REFERENCE)[0]
+    angles = gallery.angles(images)
+    assert np.isnan(angles).sum() == (~images["hit"]).sum()
+    within = np.abs(images["normals"][..., 1]) < 0.1  # the turn is about y
     assert np.nanmedian(angles[within]) == pytest.approx(10.0, abs=0.2)
 
 
 def test_lost_and_false_pixels_have_their_colours(tmp_path):
     write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1)
     made = fig4.make(chosen(tmp_path, "fig4"))
-    masks = [im.get_array()[..., 3] for axis in made.figure.axes for im in axis.images if im.get_array().shape[-1] == 4]
-    images = pictures.load(tmp_path / "runs" / "run000")[0]
-    assert (masks[0] == images.missed).all() and (masks[1] == images.spurious).all()
+    images = gallery.arrays(tmp_path / "runs" / "run000", gallery.REFERENCE)[0]
+    shown = made.figure.axes[0].get_images()[-1].get_array()
+    for colour, mask, other in ((style.MISSED, "reference_hit", "hit"), (style.SPURIOUS, "hit", "reference_hit")):
+        wrong = images[mask] & ~images[other]
+        assert wrong.any() and ((shown == to_rgb(colour)).all(-1) == wrong).all()
 
 
 @pytest.mark.parametrize(
@@ -423,7 +427,7 @@ def test_lost_and_false_pixels_have_their_colours(tmp_path):
         (b"", "cannot be read"),
         (b"PK\x03\x04 not a zip", "cannot be read"),
         ({"hit": np.ones((2, 2))}, "lacks an array"),
-        ({name: np.ones((2, 2 + place)) for place, name in enumerate(pictures.NAMES)}, "different sizes"),
+        ({name: np.ones((2, 2 + place)) for place, name in enumerate(gallery.REFERENCE)}, "different sizes"),
     ],
 )
 def test_broken_pictures_are_a_remark(tmp_path, content, why):

@@ -9,12 +9,14 @@ from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
 from bench.report.write.paper import write_paper
-from bench.report.write.shapes import MOST_COLUMNS, history, scene_of
+from bench.report.write.shapes import history, scene_of
+from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import told, write_run
 
 NEWTON, IDR, NEUS, HULL, STEREO = "Newton, RGB", "IDR, RGB", "NeuS, RGB", "Visual hull", "Stereo, Poisson"
-METHODS = {NEWTON: "rgb_newton", IDR: "rgb_idr", NEUS: "rgb_neus", HULL: "hull", STEREO: "stereo"}
-TASKS = {HULL: "hull", STEREO: "stereo"}
+POISSON = "Depth, Poisson"
+METHODS = {NEWTON: "rgb_newton", IDR: "rgb_idr", NEUS: "rgb_neus", HULL: "hull", STEREO: "stereo", POISSON: "poisson"}
+TASKS = {HULL: "hull", STEREO: "stereo", POISSON: "poisson"}
 LEVELS = (HULL, STEREO)  # rows without a loop
 FOLDER = "photographs/chair"
 
@@ -219,11 +221,11 @@ def test_a_failed_run_is_worst_in_every_score_of_photographs(tmp_path):
 
 
 def images(folder, colour, size=8, **left_out):
-    """Pictures of a square in one colour, whose photograph is white."""
+    """Pictures of a square in one colour, whose photograph is grey."""
     hit = np.zeros((size, size), dtype=bool)
     hit[2:6, 2:6] = True
     arrays = {
-        "photograph": np.ones((size, size, 3), np.float16),
+        "photograph": np.full((size, size, 3), 0.75, np.float16),
         "colours": (np.array(colour) * hit[..., None]).astype(np.float16),
         "normals": (np.array([0.0, 0.0, 1.0]) * hit[..., None]).astype(np.float16),
         "hit": hit,
@@ -231,37 +233,25 @@ def images(folder, colour, size=8, **left_out):
     np.savez(folder / "images.npz", **{name: array for name, array in arrays.items() if name not in left_out})
 
 
-def titles(figure):
-    return [axis.get_title().replace("\n", " ") for axis in figure.axes if axis.get_title()]
+def shown(figure):
+    """What each block shows by the name of its scene."""
+    return {axis.get_title(loc="left"): cells(axis) for axis in figure.axes}
 
 
 def test_pictures_stand_above_their_normals_and_missing_ones_are_noted(tmp_path):
     images(made(tmp_path, NEWTON, scored(0.02)), (1.0, 0.0, 0.0))
-    made(tmp_path, IDR, scored(0.03))
-    images(made(tmp_path, HULL, scored(0.05)), (0.0, 1.0, 0.0))
-    images(made(tmp_path, STEREO, scored(0.05)), (0.0, 1.0, 0.0), normals=None)
+    made(tmp_path, NEUS, scored(0.03))
+    images(made(tmp_path, HULL, scored(0.05), status="empty"), (0.0, 1.0, 0.0))
+    images(made(tmp_path, POISSON, scored(0.05)), (0.0, 1.0, 0.0), normals=None)
     result = dvr_figures.make(chosen(tmp_path, dvr_figures))
-    assert titles(result.figure) == ["sofa 0, held out", NEWTON, IDR, HULL, STEREO]
-    above, below = np.array(result.figure.axes).reshape(2, 5)
-    shown = [[len(axis.get_images()) for axis in row] for row in (above, below)]
-    assert shown == [[1, 1, 0, 1, 0], [0, 1, 0, 1, 0]]
-    assert (above[0].get_images()[0].get_array() == 1).all()
-    newton, hull = (above[place].get_images()[0].get_array() for place in (1, 3))
-    assert newton[3, 3].tolist() == [1, 0, 0] and hull[3, 3].tolist() == [0, 1, 0]
-    assert newton[0, 0].tolist() == [1, 1, 1]  # beside the shape
-    normals = below[1].get_images()[0].get_array()
-    assert normals[3, 3].tolist() == [0.5, 0.5, 1.0] and normals[0, 0].tolist() == [1, 1, 1]
-    assert [text.get_text() for axis in above[[2, 4]] for text in axis.texts] == ["no picture"] * 2
-    missing = [note for note in result.notes if note.startswith("No pictures")]
-    assert len(missing) == 2 and missing[0] == f"No pictures of {IDR}, sofa 0: no images.npz."
-    assert missing[1].startswith(f"No pictures of {STEREO}, sofa 0: images.npz lacks an array: normals")
-
-
-def test_the_photograph_is_shown_where_the_first_row_has_no_picture(tmp_path):
-    made(tmp_path, NEWTON, scored(0.02))
-    images(made(tmp_path, HULL, scored(0.05)), (0.0, 1.0, 0.0))
-    result = dvr_figures.make(chosen(tmp_path, dvr_figures))
-    assert sorted(titles(result.figure)) == sorted([NEWTON, "sofa 0, held out", HULL])
+    found = shown(result.figure)["sofa 0"]
+    assert [column for row, column in found if row == "colours"] == ["held out", NEWTON, NEUS, HULL, POISSON]
+    assert found["colours", NEWTON] == (1, 0, 0) and found["colours", HULL] == (0, 1, 0)
+    assert found["colours", "held out"] == (0.75, 0.75, 0.75)
+    assert found["normals", NEWTON] == found["normals", HULL] == (0.5, 0.5, 1.0)
+    assert sorted(notes(result.figure)) == ["empty"] * 2 + ["no picture"] * 4
+    assert "No pictures of 1 run: no images.npz." in told(result)
+    assert "No pictures of 1 run: images.npz lacks an array: normals" in told(result)
 
 
 def test_two_scenes_are_shown_and_a_row_without_a_run_is_noted(tmp_path):
@@ -269,20 +259,16 @@ def test_two_scenes_are_shown_and_a_row_without_a_run_is_noted(tmp_path):
         images(made(tmp_path, NEWTON, scored(0.02), dataset=scene), (1.0, 0.0, 0.0))
     images(made(tmp_path, HULL, scored(0.05), dataset="car"), (0.0, 1.0, 0.0))
     result = dvr_figures.make(chosen(tmp_path, dvr_figures))
-    assert titles(result.figure) == ["sofa 0, held out", NEWTON, HULL, "car 0, held out", NEWTON, HULL]
-    assert [note for note in result.notes if "No pictures" in note] == [f"No pictures of {HULL}, sofa 0: no run."]
+    assert list(shown(result.figure)) == ["sofa 0", "car 0"] and "The first 2 of 3 scenes." in result.caption
+    assert notes(result.figure) == ["no run"] * 2
 
 
-def test_many_rows_take_further_lines(tmp_path):
-    for number in range(9):
-        folder = made(tmp_path, NEWTON, scored(0.02), seconds=number + 1)
-        images(folder, (1.0, 0.0, 0.0))
-        record = json.loads((folder / "record.json").read_text())
-        record["config"]["label"] = f"row {number}"
-        (folder / "record.json").write_text(json.dumps(record))
+def test_of_rows_that_look_alike_one_is_shown(tmp_path):
+    for row in (NEWTON, IDR, HULL):
+        images(made(tmp_path, row, scored(0.02)), (1.0, 0.0, 0.0))
     result = dvr_figures.make(chosen(tmp_path, dvr_figures))
-    assert titles(result.figure) == ["sofa 0, held out", *(f"row {number}" for number in range(9))]
-    assert len(result.figure.axes) == 4 * MOST_COLUMNS
+    assert {column for _, column in shown(result.figure)["sofa 0"]} == {"held out", NEWTON, HULL}
+    assert set(result.data["row"]) == {NEWTON, IDR, HULL}
 
 
 def test_shapes_of_one_family_are_scenes_of_their_own(tmp_path):
@@ -318,6 +304,6 @@ def test_the_side_that_no_photograph_shows_is_judged_and_drawn_from_behind(tmp_p
     result = unseen_back.make(chosen(tmp_path, unseen_back))
     assert line_of(result, NEUS)[["unseen", "Early weight"]].tolist() == ["6.00", "25 %"]
     assert line_of(result, NEWTON)["Early weight"] == "–"
-    assert titles(result.figure) == ["sofa 0, true normals", NEWTON, NEUS]
-    true, newton = (result.figure.axes[place].get_images()[0].get_array() for place in (0, 1))
-    assert (true == 0.75).all() and newton[3, 3].tolist() == [0.25] * 3  # of the view from behind
+    found = shown(result.figure)["sofa 0"]
+    assert [column for row, column in found if row == "normals"] == ["truth", NEWTON, NEUS]
+    assert found["normals", "truth"] == (0.75,) * 3 and found["colours", NEWTON] == (0.25,) * 3  # from behind

@@ -1,10 +1,8 @@
-"""Pieces that the pages on shapes from photographs share: lines of the table, curves, pictures."""
+"""Pieces that the pages on shapes from photographs share: lines of the table, and curves."""
 
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -13,7 +11,6 @@ from bench.report.data import curves
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import (
     Record,
-    Row,
     error,
     family,
     grouped,
@@ -25,12 +22,8 @@ from bench.report.data.records import (
     value_evaluations,
 )
 from bench.report.data.statistics import median
-from bench.report.write import chart, pictures
+from bench.report.write import chart
 from bench.report.write.table import Column, text
-
-ARRAYS = ("colours", "normals", "hit")  # of images.npz, of each row
-HELD_OUT = {"photograph": "held out"}  # arrays that are the same for all rows, and what they are
-MOST_COLUMNS = 8
 
 
 def _values(value: float | None) -> str:
@@ -125,76 +118,3 @@ def scene_of(record: Record) -> str:
     dataset = record["config"].get("dataset", {})
     own = dataset.get("path") and not dataset.get("strength") and not index(record)
     return family(record) if own else f"{family(record)} {index(record)}"
-
-
-@style.styled
-def draw_pictures(
-    experiment: Experiment,
-    rows: Sequence[Row],
-    scenes: Sequence[str],
-    photographs: Mapping[str, str] = HELD_OUT,
-    most: int = MOST_COLUMNS,
-    *,
-    side: str = "",
-) -> tuple[Figure, list[str]]:
-    """For each scene the photographs and each row's colours, normals below; a note for each missing one.
-
-    Args:
-        experiment: with the runs.
-        rows: that are shown.
-        scenes: that are shown, see `scene_of`.
-        photographs: arrays of images.npz that all rows share, and what they are.
-        most: pictures side by side.
-        side: prefix of the arrays of another view, such as "back_".
-    """
-    blocks, notes = [], []
-    for scene in scenes:
-        cells, missing = _cells(experiment, rows, scene, photographs, side)
-        blocks += [cells[start : start + most] for start in range(0, len(cells), most)]
-        notes += missing
-    columns = max(map(len, blocks), default=1)
-    figure, axes = chart.sheet(2.4 * style.WIDTH / columns * len(blocks), 2 * max(len(blocks), 1), columns)
-    figure.get_layout_engine().set(**pictures.CLOSE)
-    for axis in axes.flat:
-        axis.axis("off")
-    for place, cells in enumerate(blocks):
-        for (title, images), above, below in zip(cells, axes[2 * place], axes[2 * place + 1], strict=False):
-            above.set_title("\n".join(textwrap.wrap(title, 120 // most)), fontsize=5.5)
-            _pair(above, below, images)
-    return figure, notes
-
-
-def _cells(
-    experiment: Experiment, rows: Sequence[Row], scene: str, photographs: Mapping[str, str], side: str
-) -> tuple[list[Any], list[str]]:
-    cells, notes, shown, names = [], [], False, (*photographs, *(side + name for name in ARRAYS))
-    for row in rows:
-        record = next((r for r in experiment.records if scene_of(r) == scene and row_of(r) == row), None)
-        found, why = ({}, "no run") if record is None else pictures.arrays(experiment.folder(record), names)
-        if why:
-            notes.append(f"No pictures of {row.name}, {scene}: {why}.")
-        elif not shown:
-            cells = [(f"{scene}, {what}", {"colours": found[name]}) for name, what in photographs.items()] + cells
-            shown = True
-        cells.append((row.name, {name.removeprefix(side): array for name, array in found.items()}))
-    masks = [images["hit"] for _, images in cells if "hit" in images]
-    window = style.window(masks) if masks else (0.0, 0.0, 1.0)
-    return [(title, {**images, "window": window} if images else {}) for title, images in cells], notes
-
-
-def _pair(above: Any, below: Any, images: dict[str, Any]) -> None:
-    """Draws colours above and normals below, the same part of each: that with the shapes of all rows."""
-    if not images:
-        chart.say(above, "no picture", color="#777777", fontsize=5.5)
-        return
-    hit, colours = images.get("hit"), images["colours"].astype(float)
-    _draw_part(above, colours if hit is None else np.where(hit[..., None], colours, 1.0).clip(0, 1), images["window"])
-    if hit is not None:
-        _draw_part(below, pictures.coloured(images["normals"].astype(float), hit), images["window"])
-
-
-def _draw_part(axis: Any, picture: np.ndarray, window: tuple[float, float, float]) -> None:
-    height, width = (length / max(picture.shape[:2]) for length in picture.shape[:2])
-    top, left, side = window
-    axis.imshow(picture, extent=(0, width, height, 0), interpolation="auto")
-    axis.set(xlim=(left, left + side), ylim=(top + side, top))

@@ -10,11 +10,13 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
+from bench.report import gallery
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, definitions, measured
 from bench.report.data.subjects.oracle import PRIORS
-from bench.report.write import chart, pictures
+from bench.report.gallery import REFERENCE, Block, Scene
+from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, text, thousandfold, to_data, to_table
@@ -83,36 +85,26 @@ def make(experiment: Experiment) -> Result:
 @style.styled
 def draw(experiment: Experiment, families: dict[str, list[Record]]) -> Figure:
     """Draws a line per family: pairs of pictures, then the histogram."""
-    ratios = [1] * 2 * SHOWN + [1.7]
-    figure, axes = chart.sheet(1.05 * len(families) + 0.45, len(families), len(ratios), width_ratios=ratios)
-    figure.get_layout_engine().set(**pictures.CLOSE)
-    for line, (name, records) in zip(axes, families.items(), strict=True):
-        for axis in line[:-1]:
-            style.bare(axis)
-        line[0].set_ylabel(name)
-        for place, record in enumerate(records[:SHOWN]):
-            _pair(line[2 * place], line[2 * place + 1], experiment, record)
-        _histogram(line[-1], experiment, records)
-    for axis, title in zip(axes[0], ("truth", "fit") * SHOWN, strict=False):
-        axis.set_title(title)
-    axes[0, -1].set_title("length of the gradient")
+    figure, axes = chart.sheet(1.25 * len(families), len(families), 2, width_ratios=(4.7, 1))
+    for (left, right), (name, records) in zip(axes, families.items(), strict=True):
+        gallery.fill(left, _block(experiment, name, records[:SHOWN]), inches=0.87)
+        _histogram(right, experiment, records)
+    axes[0, -1].set_title("length of the gradient", fontsize=7)
     return figure
 
 
-def _pair(true: Axes, found: Axes, experiment: Experiment, record: Record) -> None:
-    images, why = pictures.load(experiment.folder(record))
-    if images is None:
-        chart.say(found, why, fontsize=5)
-        return
-    both = ((true, images.reference_normals, images.reference_hit), (found, images.normals, images.hit))
-    for axis, normals, hit in both:
-        axis.imshow(pictures.coloured(normals, hit), interpolation="auto")
-    ratio = _ratio(record)
-    found.set_xlabel("" if ratio is None else f"{format.number(ratio)} × floor", fontsize=6, labelpad=1)
+def _block(experiment: Experiment, name: str, records: list[Record]) -> Block:
+    """The truth and the fit of each record, which names how far the fit is from the floor."""
+    cells, titles = [], []
+    for record in records:
+        scene, ratio = Scene(experiment, [record], REFERENCE), _ratio(record)
+        cells += [scene.shared([record], gallery.normals("reference_")), scene.cell(record, gallery.normals())]
+        titles += ["truth", "fit" if ratio is None else f"fit: {format.number(ratio)} × floor"]
+    return Block("", titles, {name: cells})
 
 
 def _histogram(axis: Axes, experiment: Experiment, records: list[Record]) -> None:
-    found = [pictures.arrays(experiment.folder(record), ("gradient_length",))[0] for record in records]
+    found = [gallery.arrays(experiment.folder(record), ("gradient_length",))[0] for record in records]
     lengths = np.concatenate([np.asarray(arrays.get("gradient_length", ()), dtype=float) for arrays in found])
     lengths = lengths[np.isfinite(lengths)]
     if lengths.size:

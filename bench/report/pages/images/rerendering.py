@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.pictures import style
+from bench.report import gallery
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, grouped, row_of
+from bench.report.gallery import Arrays, Block, Cell, coloured
 from bench.report.pages.images import dvr_table2
-from bench.report.write import pictures
-from bench.report.write.gallery import Block, Cell, draw, shown_alone
 from bench.report.write.result import Result
 from bench.report.write.shapes import scene_of
 from bench.report.write.table import FAMILY, IDENTITY, metrics, to_data
@@ -54,31 +55,33 @@ def make(experiment: Experiment) -> Result:
         f"The shape of {row.name} in several sizes, from other sides, and under other lights.",
         remarks=(*(note.format(row=row.name) for note in NOTES), *missing),
         data=to_data(RUNS, kept),
-        figure=draw([Block("", columns, lines)], across=1),
+        figure=gallery.draw([Block("", columns, lines)]),
     )
 
 
 def _line(record: Record, folder: Path) -> tuple[list[str], list[Cell], str]:
     """The names of a line's columns, its cells, and why there are none."""
-    parts = [f"{prefix}{part}" for prefix in (*SIZES, *TURNED) for part in ("colours", "normals", "hit")]
-    found, why = pictures.arrays(folder, ("photograph", *parts))
     status = "" if record["status"] == "ok" else record["status"]
-    if why:
-        return [], [Cell(note=status or "no picture")], why
-    hits = {prefix: found[f"{prefix}hit"] for prefix in (*SIZES, *TURNED)}
-    last = SIZES[-1]
-    columns = {"photograph": shown_alone(found["photograph"].astype(float), hits[last])}
+    seen, why = {}, ""
     for prefix in (*SIZES, *TURNED):
-        name = TURNED.get(prefix, f"{max(hits[prefix].shape)} pixels")
-        columns[name] = shown_alone(_on_white(found[f"{prefix}colours"], hits[prefix]), hits[prefix])
-    for name, light in LIGHTS.items():
-        lit = found[f"{last}colours"] * _shade(found[f"{last}normals"].astype(float), light)
-        columns[name] = shown_alone(_on_white(lit, hits[last]), hits[last])
-    return [*columns], [Cell((picture,), status) for picture in columns.values()], ""
+        seen[prefix], said = gallery.arrays(folder, [prefix + part for part in ("colours", "normals", "hit")])
+        why = why or said
+    photograph, said = gallery.arrays(folder, ["photograph"])
+    if why or said:
+        return [], [Cell(note=status or "no picture")], why or said
+    last = seen[SIZES[-1]], SIZES[-1]
+    shown = {"photograph": (photograph["photograph"], last[0][f"{last[1]}hit"])}
+    for prefix, found in seen.items():
+        name = TURNED.get(prefix, f"{max(found[f'{prefix}hit'].shape)} pixels")
+        shown[name] = _lit(found, prefix)
+    shown |= {name: _lit(*last, light) for name, light in LIGHTS.items()}
+    return [*shown], [Cell([(picture, style.window([hit]))], status) for picture, hit in shown.values()], ""
 
 
-def _on_white(colours: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    return np.where(hit[..., None], colours.astype(float), 1.0).clip(0, 1)
+def _lit(found: Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The picture of a shape, as it is or under a light, and its hits."""
+    colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
+    return coloured(colours if light is None else colours * _shade(normals, light), hit), hit
 
 
 def _shade(normals: np.ndarray, light: tuple[float, float, float]) -> np.ndarray:

@@ -4,11 +4,13 @@ import math
 
 import pandas as pd
 
+from bench.report import gallery
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.data.records import definitions, grouped
+from bench.report.data.records import Record, definitions, grouped, row_of
+from bench.report.gallery import Block, Cell, Scene
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
-from bench.report.write.shapes import COST, draw_pictures, lines_of, scene_of
+from bench.report.write.shapes import COST, lines_of, scene_of
 from bench.report.write.table import (
     FAMILY,
     IDENTITY,
@@ -26,7 +28,8 @@ PLACE = 51
 READS = (Selection("unseen_back", ("reconstruction",), ("dataset", "task", "silhouette"), setup=("scenes", "machine")),)
 NAMES = ("seen_roughness", "unseen_roughness", "own_early_weight", "seen_chamfer_l1", "chamfer_l1", "mask_iou")
 DEFINED = {"seen_roughness": "Roughness", "unseen_roughness": "Roughness", "own_early_weight": "Early weight"}
-MOST_SCENES, MOST_COLUMNS = 3, 9  # of the figure: the truth, and four renderers under two losses of the mask
+MOST_SCENES = 3  # of the figure
+BACK = "back_"  # prefix of arrays of the view from behind
 NOTES = (
     "Users of NeuS report weights in front of the surface and a bumpy back where no photograph looks. All photographs "
     "are from within 45 degrees of one direction; pictures are from the opposite one.",
@@ -51,19 +54,29 @@ RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES), *LOOP)
 
 def make(experiment: Experiment) -> Result:
     """Makes the page, with a line per row and pictures from behind."""
-    scenes = list(grouped(experiment.records, scene_of))
-    rows, shown = list(experiment.rows()), {"back_truth": "true normals"}
-    figure, missing = draw_pictures(experiment, rows, scenes[:MOST_SCENES], shown, MOST_COLUMNS, side="back_")
+    every = grouped(experiment.records, scene_of)
+    arrays = [BACK + part for part in ("truth", "colours", "normals", "hit")]
+    scenes = {name: Scene(experiment, every[name], arrays) for name in list(every)[:MOST_SCENES]}
     return Result(
         experiment,
         "Photographs from one side, and the back that none shows.",
-        f"Medians over {len(scenes)} scene{'s' if len(scenes) > 1 else ''}, distances in scene units, times 1000; in "
+        f"Medians over {len(every)} scene{'s' if len(every) > 1 else ''}, distances in scene units, times 1000; in "
         "the figure, colours above and normals below, from behind.",
-        remarks=(*NOTES, *definitions(experiment.records, DEFINED), *missing),
+        remarks=(*NOTES, *definitions(experiment.records, DEFINED), *gallery.missing(scenes.values())),
         data=to_data(RUNS, experiment.records),
         table=to_table(COLUMNS, lines_of(experiment, NAMES)),
-        figure=figure,
+        figure=gallery.draw([_block(name, experiment, every[name], scene) for name, scene in scenes.items()]),
     )
+
+
+def _block(name: str, experiment: Experiment, records: list[Record], scene: Scene) -> Block:
+    """The colours of each row from behind, and normals below, beside the true ones."""
+    rows, at = list(experiment.rows()), {row_of(record): record for record in records}
+    colours = [scene.cell(at.get(row), gallery.colours(BACK)) for row in rows]
+    normals = [scene.cell(at.get(row), gallery.normals(BACK)) for row in rows]
+    truth = scene.shared(records, lambda found: [found["back_truth"]])
+    names = ["truth", *(row.name for row in rows)]
+    return Block(name, names, {"colours": [Cell(), *colours], "normals": [truth, *normals]})
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:

@@ -1,11 +1,9 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
 import pandas as pd
-from matplotlib.figure import Figure
 
-from bench.pictures import style
+from bench.report import gallery
 from bench.report.data.experiments import Experiment, Selection
-from bench.report.write import pictures
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
@@ -17,9 +15,9 @@ NOTES = (
     "largest size at which it did.",
 )
 MOST_COLUMNS = 5
-COLUMNS = (  # of a record and its cell of pictures
+COLUMNS = (  # of a record and the counts of its picture
     *through(lambda line: line[0], *IDENTITY),
-    *through(lambda line: line[1].images.counted() if line[1].images else {}, *map(Column, pictures.COUNTED)),
+    *through(lambda line: line[1], *map(Column, gallery.COUNTED)),
     *through(lambda line: line[0], metric("depth_error_median")),
 )
 
@@ -27,28 +25,16 @@ COLUMNS = (  # of a record and its cell of pictures
 def make(experiment: Experiment) -> Result:
     """Makes the page, with the reference and a column per row; rows without pictures keep their place."""
     chosen = experiment.of_newest_scene()
-    cells, missing = pictures.cells(chosen.named(), [chosen.folder(record) for record in chosen.records])
+    found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
     return Result(
         chosen,
         "Errors of each strategy in the image.",
         "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
         "normals.",
-        remarks=(*missing, *NOTES),
-        data=to_data(COLUMNS, zip(chosen.records, cells[1:], strict=True)),
-        figure=draw(cells),
+        remarks=(*found.missing, *NOTES),
+        data=to_data(COLUMNS, zip(chosen.records, found.counts, strict=True)),
+        figure=gallery.draw(found.blocks, largest=found.largest),
     )
-
-
-@style.styled
-def draw(cells: list[pictures.Cell]) -> Figure:
-    """Draws the pictures in as few lines of at most `MOST_COLUMNS` as possible."""
-    lines = -(-len(cells) // MOST_COLUMNS)
-    columns = -(-len(cells) // lines)
-    width = style.WIDTH - 0.7  # the rest is the colour bar's
-    figure = Figure(figsize=(style.WIDTH, lines * (2 * width / max(columns, 3) + 0.35)), layout="constrained")
-    figure.get_layout_engine().set(**pictures.CLOSE)
-    pictures.draw(figure, cells, columns)
-    return figure
 
 
 def answer(data: pd.DataFrame, notes: list[str]) -> Answer:

@@ -9,9 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from bench.pictures import style
+from bench.report import gallery
 from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import Record, measured, setting
-from bench.report.write import chart, pictures
+from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
@@ -35,32 +36,27 @@ def make(experiment: Experiment) -> Result:
     chosen = experiment.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
     several = len({record["renderer"] for record in chosen.records}) > 1
-    titled = [{**record, "name": _title(record, several=several)} for record in chosen.records]
-    cells, missing = pictures.cells(titled, [chosen.folder(record) for record in chosen.records])
-    data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, cells[1:]), strict=True))
+    titles = [_title(record, several=several) for record in chosen.records]
+    found = gallery.compared(chosen, titles, MOST_COLUMNS)
+    data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, found.counts), strict=True))
     unplaced = int(data["epsilon"].isna().sum())
-    missing += [f"Without an epsilon, and not in the chart: {unplaced} of {len(data)} rows."] if unplaced else []
+    unplaced_note = f"Without an epsilon, and not in the chart: {unplaced} of {len(data)} rows." if unplaced else ""
     return Result(
         chosen,
         "Erosion and dilation of the image by the convergence threshold.",
         "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
         "blue) above the angle to the reference's, and erosion, dilation and depth error over epsilon.",
-        remarks=(*missing, *NOTES),
+        remarks=(*found.missing, unplaced_note, *NOTES),
         data=data,
-        figure=draw(cells, data),
+        figure=draw(found, data),
     )
 
 
 @style.styled
-def draw(cells: list[pictures.Cell], data: pd.DataFrame) -> Figure:
+def draw(found: gallery.Compared, data: pd.DataFrame) -> Figure:
     """Draws pictures above and two charts over epsilon below."""
-    columns = min(len(cells), MOST_COLUMNS)
-    lines = -(-len(cells) // columns)
-    height = lines * (2 * (style.WIDTH - 0.7) / max(columns, 3) + 0.4)
-    figure = Figure(figsize=(style.WIDTH, height + 2.2), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(height, 2.2))
-    pictures.draw(above, cells, columns)
-    _charts(below, data[data["epsilon"].notna()])
+    figure = gallery.draw(found.blocks, largest=found.largest, below=2.4)
+    _charts(figure.subfigs[1], data[data["epsilon"].notna()])
     return figure
 
 
@@ -94,9 +90,8 @@ def _lines(shares: Axes, depth: Axes, rows: pd.DataFrame, name: str, *, several:
     chart.line(depth, name, epsilon, style.finite(rows["depth_error_median"]), label=name)
 
 
-def _counts(record: Record, cell: pictures.Cell) -> dict[str, Any]:
+def _counts(record: Record, drawn: dict[str, Any]) -> dict[str, Any]:
     """The counts of a record, or else of its picture, and their shares of the reference's hits."""
-    drawn = cell.images.counted() if cell.images is not None else {}
     counts = {name: measured(record, name) for name in ("size", "hits", "lost", "false")}
     counts = {name: drawn.get(name) if value is None else value for name, value in counts.items()}
     return {**drawn, **counts, **{f"{name}_share": _share(counts[name], counts["hits"]) for name in ("lost", "false")}}
@@ -120,7 +115,7 @@ def _title(record: Record, *, several: bool) -> str:
 
 COLUMNS = (  # of a record and its counts
     *through(lambda line: line[0], *IDENTITY, Column("epsilon", value=_epsilon)),
-    *through(lambda line: line[1], *map(Column, (*pictures.COUNTED, "lost_share", "false_share"))),
+    *through(lambda line: line[1], *map(Column, (*gallery.COUNTED, "lost_share", "false_share"))),
     *through(lambda line: line[0], metric("depth_error_median")),
 )
 
