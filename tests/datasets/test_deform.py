@@ -6,6 +6,7 @@ import trimesh
 
 from datasets.deform import STRETCH, TAPER, TWIST, Deformation, deform
 from datasets.mesh import Mesh
+from tests.looped import each
 
 
 def ball() -> Mesh:
@@ -60,7 +61,7 @@ def test_orientation_is_kept_in_the_unit_sphere():
     assert np.min(determinants) > 0.1
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@each("axis", [0, 1, 2])
 def test_taper_scales_cross_sections_and_stretch_scales_axes(axis):
     point = np.full(3, 0.4)
     tapered = Deformation(taper=0.25, taper_axis=axis).apply(point)
@@ -69,7 +70,7 @@ def test_taper_scales_cross_sections_and_stretch_scales_axes(axis):
     assert Deformation(stretch=stretch).apply(point) == pytest.approx(0.4 * np.exp(stretch))
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@each("axis", [0, 1, 2])
 def test_twist_keeps_volume_and_bend_turns_the_axis_into_an_arc(axis):
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 3))
     assert np.linalg.det(jacobians(Deformation(twist=0.4, twist_axis=axis), points)) == pytest.approx(1)

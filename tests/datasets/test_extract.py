@@ -8,6 +8,7 @@ from datasets.extract import extract
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import Decoder
+from tests.looped import each
 
 CENTRE = (0.3, -0.1, 0.2)
 
@@ -31,7 +32,7 @@ def test_each_axis_keeps_its_own_size():
     assert mesh.vertices.min(0) == pytest.approx([-0.2, -0.4, -0.7], abs=1e-5)
 
 
-@pytest.mark.parametrize("value", [1.0, -1.0, float("nan")])
+@each("value", [1.0, -1.0, float("nan")])
 def test_values_of_one_sign_have_no_surface(value):
     assert extract(Shape(lambda p: torch.full_like(p[..., 0], value)), grid=8, reach=1.0) is None
 
@@ -50,7 +51,7 @@ def test_a_network_is_sampled_without_a_graph():
     assert extract(Shape(lambda p: field(p) - middle), grid=12, reach=1.0) is not None
 
 
-@pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
+@each("scale", [0.2, 1.0, 3.0])
 def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_lost(scale):
     # a thin plate and a small ball apart from it; a field three times too steep is followed from block to block
     shape = box((0.8, 0.03, 0.6)) | sphere(0.1, (0.0, 0.7, 0.0))

@@ -13,15 +13,15 @@ from bench.records.files import digest
 from datasets.dataset import SPLIT_STRIDE, Split, seed_of
 from datasets.families import BUILDERS, FAMILIES, HALF_GRID, Family, bounded
 from renderers.field import Kind, autograd_gradients
+from tests.looped import each
 
 NAMES = sorted(
     path.stem for path in (CONF / "dataset").glob("*.yaml") if OmegaConf.load(path)._target_.endswith("Family")
 )
 
 
-@pytest.fixture(params=NAMES)
-def family(request) -> Family:
-    return replace(build(OmegaConf.load(CONF / "dataset" / f"{request.param}.yaml"), "dataset"), resolution=48)
+FAMILY = [replace(build(OmegaConf.load(CONF / "dataset" / f"{name}.yaml"), "dataset"), resolution=48) for name in NAMES]
+by_family = each("family", FAMILY)
 
 
 @pytest.fixture
@@ -38,11 +38,13 @@ def test_every_builder_is_configured_under_its_own_name():
     assert sorted(BUILDERS) == NAMES
 
 
+@by_family
 def test_a_family_has_8_to_15_parameters_with_room(family):
     assert len(family.ranges) in (range(8, 16) if family.name in FAMILIES else range(1, 8))
     assert all(low < high for low, high in family.ranges.values())
 
 
+@by_family
 def test_a_shape_is_a_closed_solid_that_touches_its_sphere(family):
     mesh = family.mesh(Split.TEST, 0)
     radii = np.linalg.norm(mesh.vertices, axis=1)
@@ -53,7 +55,8 @@ def test_a_shape_is_a_closed_solid_that_touches_its_sphere(family):
     assert (mesh.vertices.max(0) + mesh.vertices.min(0)) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-@pytest.mark.parametrize("split", Split)
+@by_family
+@each("split", list(Split))
 def test_shapes_of_every_part_are_closed_solids(family, split):
     volumes = set()
     for index in range(3):
@@ -65,12 +68,14 @@ def test_shapes_of_every_part_are_closed_solids(family, split):
     assert len(volumes) == 3
 
 
+@by_family
 def test_a_shape_is_always_the_same(family):
     again = replace(family)
     assert np.array_equal(family.mesh(Split.TEST, 2).vertices, again.mesh(Split.TEST, 2).vertices)
     assert family.draw(Split.TEST, 2) == again.draw(Split.TEST, 2)
 
 
+@by_family
 def test_draws_fill_their_ranges_and_no_two_are_alike(family):
     drawn = [family.draw(split, index) for split in Split for index in range(100)]
     for name, (low, high) in family.ranges.items():
@@ -80,6 +85,7 @@ def test_draws_fill_their_ranges_and_no_two_are_alike(family):
         assert len(np.unique(values)) == len(drawn)
 
 
+@by_family
 def test_each_parameter_changes_the_shape(family):
     points = torch.empty(50_000, 3).uniform_(-1.2, 1.2, generator=torch.Generator().manual_seed(0))
     middle = {name: (low + high) / 2 for name, (low, high) in family.ranges.items()}
@@ -88,6 +94,7 @@ def test_each_parameter_changes_the_shape(family):
         assert (least != most).sum() > 5, f"{name} of {family.name} does nothing"
 
 
+@by_family
 def test_shapes_stay_clear_of_the_sampled_cube(family):
     faces = torch.empty(20_000, 3).uniform_(-HALF_GRID, HALF_GRID, generator=torch.Generator().manual_seed(0))
     rows = torch.arange(len(faces))
@@ -104,6 +111,7 @@ def corners(family: Family, n: int) -> list[dict[str, float]]:
     return [{name: family.ranges[name][end] for name, end in zip(family.ranges, row, strict=True)} for row in ends]
 
 
+@by_family
 def test_a_formula_is_nowhere_steeper_than_its_bound(family):
     generator = torch.Generator().manual_seed(0)
     shapes = [*corners(family, 10), *(family.draw(Split.TRAIN, index) for index in range(10))]
@@ -117,6 +125,7 @@ def test_a_formula_is_nowhere_steeper_than_its_bound(family):
         assert torch.equal(raw(points) < 0, field(points) < 0)
 
 
+@by_family
 def test_a_steep_shear_makes_a_formula_a_level_set_until_it_is_divided(family):
     steepest = {name: high for name, (_, high) in family.ranges.items()}
     raw = BUILDERS[family.name](SimpleNamespace(**steepest))
@@ -149,6 +158,7 @@ def test_an_index_beyond_the_part_is_refused(index):
         seed_of(Split.TEST, index)
 
 
+@by_family
 def test_identity_is_plain_and_changes_with_all_that_decides_the_shapes(family):
     def key(**changed):
         return digest(replace(family, **changed).identity())

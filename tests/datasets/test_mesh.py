@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from datasets.mesh import Mesh, normalise
+from tests.looped import each
 
 
 def box(extents=(1.0, 2.0, 3.0)) -> Mesh:
@@ -32,7 +33,7 @@ def test_two_boxes_are_two_parts():
     assert both.part_volumes == pytest.approx([1, 8])
 
 
-@pytest.mark.parametrize("spoil", [lambda f: f[1:], lambda f: np.concatenate([f[:1, ::-1], f[1:]])])
+@each("spoil", [lambda f: f[1:], lambda f: np.concatenate([f[:1, ::-1], f[1:]])])
 def test_a_rim_or_a_wrong_winding_is_not_watertight(spoil):
     mesh = box()
     spoilt = Mesh(mesh.vertices, spoil(mesh.faces))
@@ -56,7 +57,7 @@ def test_compact_drops_only_unused_vertices():
     assert padded.diagonal == pytest.approx(mesh.diagonal)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+@each("bad", [np.nan, np.inf, 1e30])
 def test_numbers_that_are_no_positions_are_refused(bad):
     vertices = np.zeros((3, 3))
     vertices[1, 2] = bad
@@ -64,8 +65,8 @@ def test_numbers_that_are_no_positions_are_refused(bad):
         Mesh(vertices, np.array([[0, 1, 2]]))
 
 
-@pytest.mark.parametrize(
-    ("faces", "message"),
+@each(
+    "faces, message",
     [
         ([[0, 1, 3]], "faces: must index the 3 vertices from 0, found 0 to 3"),
         ([[-1, 1, 2]], "faces: must index the 3 vertices from 0, found -1 to 2"),

@@ -10,6 +10,7 @@ import trimesh
 from datasets.mesh import Mesh
 from datasets.meshes import find_meshes, load_mesh, repair
 from datasets.truth import Truth, sample_surface
+from tests.looped import each
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -157,7 +158,7 @@ def test_doubled_faces_are_dropped():
     assert mesh.repairs == ("12 doubled faces dropped",)
 
 
-@pytest.mark.parametrize("inverted", [False, True])
+@each("inverted", [False, True])
 def test_overlapping_boxes_are_inside_where_either_is(inverted):
     mesh = repair(joined(box(), box(at=(0.5, 0.1, 0.2), inverted=inverted)))
     assert mesh.volume == pytest.approx(2 - 0.5 * 0.9 * 0.8)

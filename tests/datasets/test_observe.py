@@ -5,6 +5,7 @@ import torch
 
 from datasets.scene import View
 from datasets.views import ViewSampler, observed_pixels
+from tests.looped import each
 
 FOREGROUND = 200
 
@@ -19,8 +20,8 @@ def view() -> View:
     return View(sampler.camera(0.0, 0.0), mask.float(), torch.zeros(20, 20, 3), mask)
 
 
-@pytest.mark.parametrize(
-    ("points", "count"),
+@each(
+    "points, count",
     [
         ("dense", 200),
         ("100%", 200),
@@ -55,8 +56,8 @@ def test_every_pixel_of_the_foreground_can_be_drawn(view):
     assert times.max() < 30  # 12 on average
 
 
-@pytest.mark.parametrize(
-    ("points", "rule"),
+@each(
+    "points, rule",
     [
         (0, "must be positive, not '0'"),
         ("0%", "must be positive, not '0%'"),

@@ -14,6 +14,7 @@ from datasets.photographs import HIGHEST, Photography, around, turned
 from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
 from datasets.truth import Truth
+from tests.looped import each
 from tests.tiny import camera_of
 
 PLAINLY = Photography(
@@ -36,7 +37,7 @@ def ball() -> Truth:
     return Truth(Mesh(np.array(made.vertices), np.array(made.faces)))
 
 
-@pytest.mark.parametrize("name", TEXTURES)
+@each("name", TEXTURES)
 def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
     generator = np.random.default_rng(0)
     points = generator.uniform(-1, 1, (300, 3))
@@ -51,7 +52,7 @@ def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
     assert (colours.std(axis=0).max() > 0.05) == (name not in ONE_COLOUR)
 
 
-@pytest.mark.parametrize("name", ["noise", "painted"])
+@each("name", ["noise", "painted"])
 def test_each_seed_has_colours_of_its_own(name):
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     first, second = (make_texture(name, 0.3, seed)(points, points) for seed in (0, 1))
@@ -77,7 +78,7 @@ def test_cameras_stand_on_a_circle_and_look_at_the_origin():
     assert torch.allclose(four.world_to_camera, CAMERA.world_to_camera, atol=1e-5)
 
 
-@pytest.mark.parametrize("count", [2, 7, 40])
+@each("count", [2, 7, 40])
 def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
     cameras = around(CAMERA, count)
     centres = torch.stack([camera.center for camera in cameras])
@@ -117,7 +118,7 @@ def test_places_choose_between_a_circle_and_all_around(ball):
         replace(PLAINLY, places="cube")
 
 
-@pytest.mark.parametrize("texture", ["noise", "astronaut"])
+@each("texture", ["noise", "astronaut"])
 def test_a_point_that_two_views_see_has_one_colour(ball, texture):
     size = 1.0 if texture == "noise" else 4.0
     first, second, *_ = replace(PLAINLY, texture=texture, texture_size=size).take(ball, CAMERA, seed=0)
@@ -180,8 +181,8 @@ def test_a_camera_that_sees_nothing_is_refused(ball):
         PLAINLY.take(ball, away, seed=0)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
+@each(
+    "changed, message",
     [
         ({"views": 1}, "views must be at least 2"),
         ({"texture": "wood"}, "texture must be one of noise, painted, plain"),

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from datasets.views import ViewSampler, look_at
+from tests.looped import each
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=33)
 
@@ -28,14 +29,14 @@ def test_the_camera_at_no_angles_is_the_one_worked_out_by_hand():
     assert (camera.height, camera.width) == (33, 33)
 
 
-@pytest.mark.parametrize(("azimuth", "elevation"), [(90.0, 0.0), (0.0, 30.0), (200.0, -40.0), (355.0, 89.0)])
+@each("azimuth, elevation", [(90.0, 0.0), (0.0, 30.0), (200.0, -40.0), (355.0, 89.0)])
 def test_angles_place_the_camera(azimuth, elevation):
     across, up = radians(azimuth), radians(elevation)
     eye = [2.5 * cos(up) * sin(across), 2.5 * sin(up), 2.5 * cos(up) * cos(across)]
     assert VIEWS.camera(azimuth, elevation).center.tolist() == pytest.approx(eye, abs=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_the_image_has_the_origin_in_its_middle_and_world_y_up(seed):
     camera = VIEWS.draw(seed)
     assert project(camera, (0, 0, 0)) == pytest.approx([16.5, 16.5], abs=1e-4)
@@ -72,8 +73,8 @@ def test_draws_follow_the_seed_and_stay_in_range():
     assert len(drawn.unique(dim=0)) == 200
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
+@each(
+    "changed, message",
     [
         ({"distance": 0.0}, "distance must be positive, not 0.0"),
         ({"distance": float("nan")}, "distance must be positive, not nan"),
@@ -91,7 +92,7 @@ def test_invalid_views_are_errors(changed, message):
         replace(VIEWS, **changed)
 
 
-@pytest.mark.parametrize("eye", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (0.0, 0.0, 0.0)])
+@each("eye", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_camera_above_or_at_its_target_is_an_error(eye):
     with pytest.raises(ValueError, match=r"eye must not lie on, above or below target.*lower the elevation"):
         look_at(torch.tensor(eye), torch.zeros(3))
@@ -117,7 +118,7 @@ def test_the_view_of_a_shape_is_not_drawn_as_the_shape_is():
     assert abs(np.corrcoef(shares, shapes)[0, 1]) < 0.5
 
 
-@pytest.mark.parametrize("direction", [(0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0)])
+@each("direction", [(0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0)])
 def test_the_camera_towards_a_direction_stands_in_it(direction):
     camera = VIEWS.towards(torch.tensor(direction))
     expected = 2.5 * np.array(direction) / np.linalg.norm(direction)

@@ -13,6 +13,7 @@ from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, sphere
 from renderers.rendering import Capabilities, Observed, Rendering
+from tests.looped import each
 from tests.tiny import camera_of
 
 IDR = load("renderer", "idr")
@@ -98,7 +99,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("name", BROKEN)
+@each("name", BROKEN)
 def test_a_broken_rendering_is_an_error_that_names_renderer_and_part(name):
     change, message = BROKEN[name]
     with pytest.raises(BrokenContract, match=message):
@@ -126,8 +127,8 @@ def test_a_claimed_gradient_that_is_missing_is_an_error():
         rendered(Mine(detached), ball(), free_rays())
 
 
-@pytest.mark.parametrize(
-    ("renderer", "field", "rays"),
+@each(
+    "renderer, field, rays",
     [
         (Mine(detached, capabilities=NEITHER), ball(free=True), RAYS),  # it claims none
         (Mine(detached, capabilities=NEITHER), ball(), free_rays()),
@@ -154,7 +155,7 @@ LOSSES = {
 }
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@each("name", LOSSES)
 def test_a_broken_silhouette_loss_is_an_error(name):
     change, message = LOSSES[name]
     field = ball(free=True)
@@ -204,8 +205,8 @@ def test_missing_gradients_of_a_hit_are_errors_where_they_are_claimed():
         check_gradients(Mine(), some, None)
 
 
-@pytest.mark.parametrize("name", ["dist", "naive", "idr", "dvr"])
-@pytest.mark.parametrize("free", [True, False])
+@each("name", ["dist", "naive", "idr", "dvr"])
+@each("free", [True, False])
 def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
     renderer, counts = load("renderer", name), (Counts(), Counts())
     plain, checked = (Meter(ball(free=free), count) for count in counts)

@@ -7,6 +7,7 @@ from renderers.bracket import REFINEMENTS, Bracket, first_crossing, narrow, refi
 from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, plane, sphere
+from tests.looped import each
 from tests.renderers.analytic_cases import vector
 
 NAN = float("nan")
@@ -24,8 +25,8 @@ def bracket(*ends: tuple[float, float]) -> Bracket:
     return Bracket(near, far, 2 - near, 2 - far)
 
 
-@pytest.mark.parametrize(
-    ("values", "first"),
+@each(
+    "values, first",
     [
         ((3, 1, -1, -2), 1),
         ((3, -1, 2, -2), 0),  # the first of two
@@ -57,7 +58,7 @@ def test_only_rays_with_a_crossing_have_a_bracket():
     assert (none.shape, empty.near.shape) == ((0,), (0,))
 
 
-@pytest.mark.parametrize("steps", [0, 1, 5])
+@each("steps", [0, 1, 5])
 def test_bisection_halves_the_bracket_at_a_value_a_step(steps):
     meter = Meter(WALL)
     closer = narrow(meter, rays(2), bracket((1, 2.5), (0.5, 2.25)), method="bisection", steps=steps)
@@ -77,7 +78,7 @@ def test_the_secant_of_a_line_is_its_root():
     assert abs(left.item()) < 1e-15
 
 
-@pytest.mark.parametrize("method", REFINEMENTS)
+@each("method", REFINEMENTS)
 def test_the_root_stays_in_the_bracket_and_comes_closer(method):
     ball = sphere(0.5)
     start = Bracket(*(vector((x,)) for x in (1.3, 1.9, 0.2, -0.4)))
@@ -93,7 +94,7 @@ def test_the_root_stays_in_the_bracket_and_comes_closer(method):
     assert errors[-1] <= errors[0]
 
 
-@pytest.mark.parametrize("method", REFINEMENTS)
+@each("method", REFINEMENTS)
 def test_a_hole_in_the_field_counts_as_occupied(method):
     holed = Shape(lambda p: torch.where(p[..., 2] > -0.5, NAN, -p[..., 2]), Kind.LEVEL, None)
     distance, left = refine(holed, rays(1), bracket((1.0, 3.0)), method=method, steps=40)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
 from renderers.camera import Camera, Rays, distance_to_origin, rigid, sphere_span
+from tests.looped import each
 from tests.renderers.analytic_cases import vector
 
 INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.float64)
@@ -73,7 +74,7 @@ def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_
     assert torch.equal(rays.origins, view.center.expand(40, 64, 3))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@each("dtype", [torch.float32, torch.float64])
 def test_dtype_comes_from_the_matrices(dtype):
     view = Camera(INTRINSICS.to(dtype), motion(0.3, (0, 0, 2)).to(dtype), 3, 5)
     rays = view.rays()
@@ -101,9 +102,7 @@ def test_gradients_reach_intrinsics_and_extrinsics():
     assert torch.autograd.grad(heading, angle)[0].item() == pytest.approx(-1, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("row", "column", "value"), [(0, 0, 0.0), (1, 1, 0.0), (1, 1, -50.0), (0, 0, float("nan")), (0, 2, float("inf"))]
-)
+@each("row, column, value", [(0, 0, 0.0), (1, 1, 0.0), (1, 1, -50.0), (0, 0, float("nan")), (0, 2, float("inf"))])
 def test_intrinsics_that_are_none_are_refused(row, column, value):
     intrinsics = INTRINSICS.clone()
     intrinsics[row, column] = value
@@ -111,7 +110,7 @@ def test_intrinsics_that_are_none_are_refused(row, column, value):
         Camera(intrinsics, motion(), 4, 4)
 
 
-@pytest.mark.parametrize(
+@each(
     "rotation",
     [
         2 * torch.eye(3),  # a scale
@@ -128,7 +127,7 @@ def test_a_motion_that_is_not_rigid_is_refused(rotation):
         camera(matrix)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@each("value", [float("nan"), float("inf")])
 def test_a_camera_that_is_nowhere_is_refused(value):
     with pytest.raises(ValueError, match="world_to_camera must"):
         camera(motion(0.0, (0, value, 0)))
@@ -156,7 +155,7 @@ def test_rays_of_other_shapes_or_lengths_are_refused():
     Rays(torch.zeros(0, 3), torch.zeros(0, 3))  # no rays are fine
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@each("value", [float("nan"), float("inf")])
 def test_rays_from_nowhere_are_refused(value):
     with pytest.raises(ValueError, match="origins"):
         Rays(vector((0, value, 0)), vector((0, 0, 1)))
@@ -197,7 +196,7 @@ def test_blocks_over_the_edge_repeat_the_edge():
     assert parallel(1, 1).coarser(4).origins[..., :2].tolist() == [[[0.5, 0.5]]]
 
 
-@pytest.mark.parametrize("shape", [(), (2,), (2, 3), (0,)])
+@each("shape", [(), (2,), (2, 3), (0,)])
 def test_leading_dimensions_of_images_are_kept(shape):
     sheet = parallel(6, 5)
     many = Rays(*(part.expand(*shape, 6, 5, 3) for part in (sheet.origins, sheet.directions)), image=True)
@@ -218,8 +217,8 @@ def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     return Rays(vector(origin), torch.nn.functional.normalize(vector(direction), dim=0))
 
 
-@pytest.mark.parametrize(
-    ("origin", "direction", "radius", "entry", "leave", "meets"),
+@each(
+    "origin, direction, radius, entry, leave, meets",
     [
         ((0, 0, -2), (0, 0, 1), 1, 1, 3, True),
         ((0.6, 0, -2), (0, 0, 1), 1, 1.2, 2.8, True),  # half a chord is (1 - 0.36)^(1/2) = 0.8
@@ -290,8 +289,8 @@ def test_moved_by_nothing_is_the_same_camera():
     torch.testing.assert_close(same.world_to_camera, camera.world_to_camera)
 
 
-@pytest.mark.parametrize(
-    ("twist", "seen"),
+@each(
+    "twist, seen",
     [
         ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
         ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it

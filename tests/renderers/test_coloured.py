@@ -15,6 +15,7 @@ from renderers.fields.coloured import (
     ColouredOccupancy,
     encoded,
 )
+from tests.looped import each
 
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
 
@@ -28,7 +29,7 @@ def draw(*shape: int) -> Tensor:
     return torch.randn(*shape, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("layers", "width"), [(2, 256), (4, 256), (6, 512)])
+@each("layers, width", [(2, 256), (4, 256), (6, 512)])
 def test_it_begins_as_a_sphere(layers, width):
     torch.manual_seed(0)
     network = ColouredDistance(layers=layers, width=width, octaves=5, radius=0.5, directional=True)
@@ -86,7 +87,7 @@ class _Call(nn.Module):
         return self.function(points)
 
 
-@pytest.mark.parametrize("directional", [True, False])
+@each("directional", [True, False])
 def test_colours_follow_the_direction_where_they_may(directional):
     network, points = make(directional=directional), 0.3 * draw(20)
     normals = autograd_gradients(network.field, points)
@@ -122,8 +123,8 @@ def test_its_operations_are_counted():
     assert meter.counts.value == 5
 
 
-@pytest.mark.parametrize(
-    ("setting", "value", "remedy"),
+@each(
+    "setting, value, remedy",
     [("layers", 0, "4 suit"), ("width", 4, "128 suit"), ("octaves", -1, "5 follow"), ("radius", 0.0, "0.5 lies")],
 )
 def test_settings_that_cannot_be_are_refused(setting, value, remedy):
@@ -136,8 +137,8 @@ def on_sphere(count: int = 500) -> Tensor:
     return torch.nn.functional.normalize(draw(count).float(), dim=-1)
 
 
-@pytest.mark.parametrize("radius", [0.5, 0.8])
-@pytest.mark.parametrize("width", [128, 255])
+@each("radius", [0.5, 0.8])
+@each("width", [128, 255])
 def test_an_occupancy_network_begins_as_a_sphere_and_is_negative_inside(width, radius):
     torch.manual_seed(0)
     field, points = ColouredOccupancy(width=width, radius=radius).field, on_sphere()
@@ -179,7 +180,7 @@ def test_a_grid_begins_as_a_sphere_of_one_grey():
     assert torch.equal(field.colours(points, points, points), torch.full((500, 3), 0.5))
 
 
-@pytest.mark.parametrize("corner", [(0, 0, 0), (8, 0, 0), (0, 8, 0), (0, 0, 8), (5, 2, 7)])
+@each("corner", [(0, 0, 0), (8, 0, 0), (0, 8, 0), (0, 0, 8), (5, 2, 7)])
 def test_a_grids_colours_have_the_axes_x_y_and_z(corner):
     grid = make_grid()
     with torch.no_grad():
@@ -211,8 +212,8 @@ def test_a_grids_colours_are_interpolated_linearly_and_kept_outside():
     assert gradient[0].abs().sum() > 0 and not gradient[1:].any()
 
 
-@pytest.mark.parametrize(
-    ("make", "setting", "remedy"),
+@each(
+    "make, setting, remedy",
     [
         (lambda: ColouredOccupancy(width=8, radius=0.0), "radius", "0.5 lies"),
         (lambda: ColouredOccupancy(width=0, radius=0.5), "width", "128 suits"),

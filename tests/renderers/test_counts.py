@@ -12,6 +12,7 @@ from renderers.camera import Rays, distance_to_origin
 from renderers.field import Counts, Field, Meter
 from renderers.fields.analytic import plane, sphere
 from renderers.rendering import Renderer
+from tests.looped import each
 from tests.renderers.analytic_cases import sphere_hits, vector
 
 EPSILON = 5e-5
@@ -56,14 +57,14 @@ def plane_queries(degrees: float, alpha: float) -> int:
     return 1 + ceil((log(EPSILON) - log(cosine)) / log(rate)) if rate > 1e-12 else 2
 
 
-@pytest.mark.parametrize("degrees", [5.0, 20.0, 33.0, 47.0, 60.0, 72.0])
-@pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5, 1.9])
+@each("degrees", [5.0, 20.0, 33.0, 47.0, 60.0, 72.0])
+@each("alpha", [1.0, 1.2, 1.5, 1.9])
 def test_dist_on_a_plane_asks_as_often_as_equation_8_says(degrees, alpha):
     renderer = replace(PLAIN, alpha=alpha, steps=200)
     assert forward(renderer, GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, alpha)
 
 
-@pytest.mark.parametrize("degrees", [5.0, 33.0, 60.0, 72.0])
+@each("degrees", [5.0, 33.0, 60.0, 72.0])
 def test_idr_on_a_plane_asks_as_often_as_plain_sphere_tracing(degrees):
     assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, 1.0)
 
@@ -84,7 +85,7 @@ def test_a_ray_that_does_not_converge_asks_once_a_step():
             assert forward(renderer, GROUND, down(80.0, 2)) == 2 * steps
 
 
-@pytest.mark.parametrize("radius", [0.4, 0.6])  # smaller, and the first step passes the centre
+@each("radius", [0.4, 0.6])  # smaller, and the first step passes the centre
 def test_head_on_at_a_sphere_the_rest_shrinks_by_one_minus_alpha(radius):
     head_on = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
     assert forward(PLAIN, sphere(radius), head_on) == 2  # the first step ends on the surface
@@ -112,7 +113,7 @@ def marched(rays: Rays, radius: float, *, alpha: float, steps: int) -> int:
     return queries
 
 
-@pytest.mark.parametrize("alpha", [1.0, 1.5])
+@each("alpha", [1.0, 1.5])
 def test_the_evaluations_of_an_image_are_the_sum_of_its_rays(alpha):
     rays = picture()
     expected = marched(rays, 0.5, alpha=alpha, steps=50)
@@ -121,7 +122,7 @@ def test_the_evaluations_of_an_image_are_the_sum_of_its_rays(alpha):
         assert forward(load("renderer", "idr"), sphere(0.5), rays) == expected
 
 
-@pytest.mark.parametrize("name", FULL)
+@each("name", FULL)
 def test_who_asks_all_rays_asks_steps_times_the_rays_that_meet_the_sphere(name):
     renderer, steps = FULL[name]
     rays = picture(12)
@@ -130,8 +131,8 @@ def test_who_asks_all_rays_asks_steps_times_the_rays_that_meet_the_sphere(name):
     assert forward(renderer, sphere(0.5), rays) == steps * meets
 
 
-@pytest.mark.parametrize("samples", [2, 16, 33])
-@pytest.mark.parametrize("refinement", [0, 8])
+@each("samples", [2, 16, 33])
+@each("refinement", [0, 8])
 def test_dvr_asks_all_samples_of_all_rays_and_refines_each_hit(samples, refinement):
     renderer = load("renderer", "dvr", n_ray_samples=samples, refinement_steps=refinement)
     rays = picture()
@@ -143,7 +144,7 @@ def test_dvr_asks_all_samples_of_all_rays_and_refines_each_hit(samples, refineme
         assert hits == pytest.approx(int(sphere_hits(rays, 0.5)[1].sum()), abs=8)
 
 
-@pytest.mark.parametrize(("samples", "asked"), [(2, 2), (16, 9), (17, 9), (128, 65)])
+@each("samples, asked", [(2, 2), (16, 9), (17, 9), (128, 65)])
 def test_dvr_that_stops_early_asks_up_to_the_surface(samples, asked):
     # The ground is half way through the sphere: the first sample at or beyond it is number ceil((n - 1) / 2), from 0.
     renderer = load("renderer", "dvr", n_ray_samples=samples, early_stop=True)
@@ -172,7 +173,7 @@ def test_coarse_to_fine_counts_by_hand():
     assert forward(replace(fine, alpha=1.5, steps=8), wall, rays) == 3 * 4 + 3 * 16 + 2 * 64
 
 
-@pytest.mark.parametrize("name", ["dist", "idr", "dvr", "naive"])
+@each("name", ["dist", "idr", "dvr", "naive"])
 def test_evaluations_of_the_gradient(name):
     """Beside the search: each ray once more for its closest sample, and what the rule asks of each hit."""
     settings = {"coarse_to_fine": False} if name == "dist" else {"steps": 9} if name == "naive" else {}

@@ -7,6 +7,7 @@ from torch import Tensor
 from renderers.field import Field, Flops, Kind
 from renderers.fields import mlp
 from renderers.fields.mlp import Decoder
+from tests.looped import each
 
 NETWORKS = {
     "no-skip": {"layers": 3, "width": 8, "code_length": 4, "skip": 0, "narrow": False},
@@ -43,15 +44,15 @@ def draw(decoder: Decoder, *shape: int) -> tuple[Tensor, Tensor]:
     return code, points
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("shape", [(5,), (), (0,), (2, 3)])
+@each("name", NETWORKS)
+@each("shape", [(5,), (), (0,), (2, 3)])
 def test_a_folded_code_gives_the_plain_network(name, shape):
     decoder = make(name)
     code, points = draw(decoder, *shape)
     torch.testing.assert_close(decoder.at(code)(points), plain(decoder, code, points), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@each("name", NETWORKS)
 def test_gradients_are_those_of_the_plain_network(name):
     decoder = make(name)
     code, points = draw(decoder, 6)
@@ -64,8 +65,8 @@ def test_gradients_are_those_of_the_plain_network(name):
     assert all(gradient.abs().sum() > 0 for gradient in folded)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("batch", [(3,), (2, 3)])
+@each("name", NETWORKS)
+@each("batch", [(3,), (2, 3)])
 def test_a_batch_of_codes_is_each_code_by_itself(name, batch):
     decoder = make(name)
     codes = torch.randn(*batch, decoder.code_length, dtype=torch.float64)
@@ -116,8 +117,8 @@ def test_a_bound_decoder_is_a_field_that_claims_a_distance_and_no_lipschitz_boun
     assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+@each(
+    "change, message",
     [
         ({"skip": 4}, "skip must lie between 0 .* layers - 1 = 3, not 4"),
         ({"skip": -1}, "skip must lie between 0 .*, not -1"),
@@ -132,7 +133,7 @@ def test_impossible_networks_are_refused(change, message):
         Decoder(**(NETWORKS["skip"] | change))
 
 
-@pytest.mark.parametrize("length", [3, 5, 0])
+@each("length", [3, 5, 0])
 def test_a_code_of_the_wrong_length_is_refused(length):
     with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
         make("skip").at(torch.zeros(length, dtype=torch.float64))

@@ -16,13 +16,14 @@ from renderers.fields.occupancy import OccupancyNetwork
 from renderers.gradients import implicit
 from renderers.rendering import Observed, Rendering, Spaced, Status, at_iteration
 from renderers.silhouette import Own
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, vector
 
 DVR = load("renderer", "dvr", mask_weight=1.0)
 IDR = load("renderer", "idr", epsilon=1e-11, steps=300)
 EXACT = {"dvr": replace(DVR, refinement_steps=60), "idr": IDR}
-by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-by_name = pytest.mark.parametrize("name", EXACT)
+by_case = each("case", CASES)
+by_name = each("name", EXACT)
 
 
 def along_z(*heights: float) -> Rays:
@@ -34,7 +35,7 @@ def slab(thickness: float) -> Shape:
     return box((2.0, 2.0, thickness / 2))
 
 
-@pytest.mark.parametrize("samples", [8, 17, 64])
+@each("samples", [8, 17, 64])
 def test_a_slab_thinner_than_the_spacing_is_met_only_by_luck(samples):
     spacing = 2 / (samples - 1)
     renderer = replace(DVR, n_ray_samples=samples)
@@ -128,7 +129,7 @@ def test_no_field_is_asked_for_a_gradient_that_nobody_wants(name):
     assert meter.counts.gradient == 0
 
 
-@pytest.mark.parametrize(("slope", "used"), [(-2e-4, -1e-3), (2e-4, 1e-3), (-0.5, -0.5), (0.5, 0.5), (0.0, -1e-3)])
+@each("slope, used", [(-2e-4, -1e-3), (2e-4, 1e-3), (-0.5, -0.5), (0.5, 0.5), (0.0, -1e-3)])
 def test_a_flat_slope_keeps_its_sign(slope, used):
     offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
     field = Shape(lambda p: slope * p[..., 2] + offset, Kind.LEVEL, None)
@@ -161,7 +162,7 @@ def test_dvr_mask_losses_by_hand():
     assert loss.item() == pytest.approx((log(2) + free + occupied) / 6, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["own", "occupancy"])
+@each("name", ["own", "occupancy"])
 def test_a_shrunk_sphere_grows_where_depth_is_given(name):
     """A ray through the mask that passes the sphere by is judged exactly at its given distance, by hand."""
     width, rays = 0.1, along_z(0.6)
@@ -198,7 +199,7 @@ CASES_AT_RANDOM = {  # mask, distance; a chord at height 0.6 goes from distance 
 }
 
 
-@pytest.mark.parametrize("case", CASES_AT_RANDOM)
+@each("case", CASES_AT_RANDOM)
 def test_a_point_is_drawn_where(case):
     mask, given = CASES_AT_RANDOM[case]
     with_depth, without = observed_losses(replace(DVR, occupied_at="depth"), [mask], [given], 0.6)

@@ -20,6 +20,7 @@ from renderers.fields.analytic import (
     torus,
 )
 from renderers.fields.mlp import CHUNK, Decoder
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, vector
 
 PRIMITIVES = {
@@ -54,8 +55,8 @@ BOX, ROUND, TORUS, CYLINDER = box((1, 2, 3)), rounded_box((1, 2, 3), 0.5), torus
 CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
 
 
-@pytest.mark.parametrize(
-    ("shape", "point", "distance"),
+@each(
+    "shape, point, distance",
     [
         (sphere(0.5, (1, 0, 0)), (1, 0, 0), -0.5),
         (sphere(0.5, (1, 0, 0)), (1, 2, 0), 1.5),
@@ -229,8 +230,8 @@ def tensor(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64, requires_grad=True)
 
 
-@pytest.mark.parametrize(
-    ("make", "parameters"),
+@each(
+    "make, parameters",
     [
         (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))),
         (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
@@ -259,7 +260,7 @@ def turn(angle: torch.Tensor) -> torch.Tensor:
     return torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one]).view(3, 3)
 
 
-@pytest.mark.parametrize("name", [*PRIMITIVES, *COMBINATIONS])
+@each("name", [*PRIMITIVES, *COMBINATIONS])
 def test_gradients_are_finite_where_a_length_is_zero(name):
     # The centres, the capsule's axis, the torus' ring and axis, faces and edges.
     points = vector((0, 0, 0, 0.1, -0.2, 0.3, -0.3, 0.1, 0.2, 0.6, 0, 0, 0.3, 0.5, 0.7, 0.3, 0, 0, 0.4, 0.6, 0))
@@ -268,7 +269,7 @@ def test_gradients_are_finite_where_a_length_is_zero(name):
     assert gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@each("case", CASES)
 def test_fields_agree_with_the_closed_form_cases(case):
     parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
     rays = case.rays()
@@ -299,7 +300,7 @@ def test_normals_keep_leading_shapes_leave_no_graph_and_vanish_with_the_gradient
     assert autograd_normals(flat, points[1]).tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (7,), (2, 3, 5)])
+@each("shape", [(), (0,), (7,), (2, 3, 5)])
 def test_the_meter_counts_points_and_leaves_values_and_gradients_as_they_are(shape):
     points = torch.randn(*shape, 3, requires_grad=True)
     meter = Meter(B)

@@ -13,9 +13,10 @@ from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
 from renderers.gradients import approximate
 from renderers.rendering import Rendering, Status
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, ground, vector
 
-NAIVE = load("renderer", "naive", steps=300, epsilon=1e-11, silhouette_average="all")
+NAIVE = load("renderer", "naive", steps=100, epsilon=1e-11, silhouette_average="all")
 DIST_PLAIN = DIST(
     steps=300, epsilon=1e-11, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=False,
     careful_split=True,
@@ -23,7 +24,7 @@ DIST_PLAIN = DIST(
     silhouette_signed=True,
     silhouette_average="all",
 )  # fmt: skip
-by_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+by_case = each("case", CASES)
 
 
 def render(renderer, case: Case, *, parameter: float | None = None, shift: Tensor | None = None):
@@ -44,26 +45,21 @@ def rates(renderer, case: Case) -> tuple[float, Tensor]:
 
 
 @by_case
-def test_naive_is_exact_towards_the_field(case):
-    found, _ = rates(NAIVE, case)
-    assert found == pytest.approx(case.parameter_rate, rel=1e-7)
+def test_naive_is_exact_towards_the_field_and_the_ray(case):
+    by_parameter, by_origin = rates(NAIVE, case)
+    assert by_parameter == pytest.approx(case.parameter_rate, rel=1e-7)
+    torch.testing.assert_close(by_origin, case.origin_rate, rtol=1e-7, atol=1e-7)
     h = 1e-5
-    ahead, behind = (render(NAIVE, case, parameter=case.parameter + s)[0].distance.item() for s in (h, -h))
-    assert found == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
+    with torch.no_grad():
+        ahead, behind = (render(NAIVE, case, parameter=case.parameter + s)[0].distance.item() for s in (h, -h))
+        assert by_parameter == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
+        for axis, offset in enumerate(h * torch.eye(3, dtype=torch.float64)):
+            ahead, behind = (render(NAIVE, case, shift=s * offset)[0].distance.item() for s in (1, -1))
+            assert by_origin[axis].item() == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
-@by_case
-def test_naive_is_exact_towards_the_ray(case):
-    _, found = rates(NAIVE, case)
-    torch.testing.assert_close(found, case.origin_rate, rtol=1e-7, atol=1e-7)
-    h = 1e-5
-    for axis, offset in enumerate(h * torch.eye(3, dtype=torch.float64)):
-        ahead, behind = (render(NAIVE, case, shift=s * offset)[0].distance.item() for s in (1, -1))
-        assert found[axis].item() == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
-
-
-@pytest.mark.parametrize("steps", [1, 2, 5, 10])
-@pytest.mark.parametrize("name", ["plane-oblique", "plane-grazing"])
+@each("steps", [1, 2, 5, 10])
+@each("name", ["plane-oblique", "plane-grazing"])
 def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
     case = next(case for case in CASES if case.name == name)
     rendering, parameter, _ = render(replace(NAIVE, steps=steps), case)
@@ -73,7 +69,7 @@ def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
 
 
 @by_case
-@pytest.mark.parametrize(("alpha", "samples"), [(1.0, 1), (1.5, 1), (1.5, 3)])
+@each("alpha, samples", [(1.0, 1), (1.5, 1), (1.5, 3)])
 def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
     renderer = replace(DIST_PLAIN, alpha=alpha, n_gradient_samples=samples)
     by_parameter, by_origin = rates(renderer, case)
@@ -102,8 +98,8 @@ def test_dist_keeps_the_values_that_it_marched_to():
     assert not plain.distance.requires_grad
 
 
-@pytest.mark.parametrize("steps", [30, 300])
-@pytest.mark.parametrize("samples", [1, 3])
+@each("steps", [30, 300])
+@each("samples", [1, 3])
 def test_dist_back_propagates_one_value_a_sample_whatever_the_steps(steps, samples):
     case = CASES[2]
     parameter = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
@@ -163,7 +159,7 @@ def test_rays_that_hit_nothing_carry_one_sample_and_no_gradient_of_distance():
 BESIDE = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a ball of radius 0.5 by 0.2
 
 
-@pytest.mark.parametrize("alpha", [1.0, 1.5])
+@each("alpha", [1.0, 1.5])
 def test_the_soft_silhouette_of_dist_moves_as_the_field_does_at_its_fixed_sample(alpha):
     center = vector((0, 0, 0)).requires_grad_(True)
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
@@ -190,7 +186,7 @@ def test_the_soft_silhouette_of_naive_moves_with_its_sample():
     assert found.item() < -1  # a fixed sample would give -1
 
 
-@pytest.mark.parametrize("renderer", [NAIVE, DIST_PLAIN, replace(DIST_PLAIN, coarse_to_fine=True)])
+@each("renderer", [NAIVE, DIST_PLAIN, replace(DIST_PLAIN, coarse_to_fine=True)])
 def test_rays_that_pass_the_unit_sphere_tell_the_camera_by_how_much(renderer):
     # DIST, A.3: the distance from the origin to the ray, less the radius.
     origin = vector((1.5, 0.5, -2)).requires_grad_(True)
@@ -203,7 +199,7 @@ def test_rays_that_pass_the_unit_sphere_tell_the_camera_by_how_much(renderer):
     torch.testing.assert_close(gradient, vector((1.5, 0.5, 0)) / far)
 
 
-@pytest.mark.parametrize("renderer", [replace(NAIVE, steps=50), replace(DIST_PLAIN, coarse_to_fine=True, epsilon=1e-6)])
+@each("renderer", [replace(NAIVE, steps=50), replace(DIST_PLAIN, coarse_to_fine=True, epsilon=1e-6)])
 def test_gradients_reach_the_camera_from_hits_and_misses(renderer):
     def see(height: Tensor) -> tuple[Rendering, Camera]:
         world_to_camera = torch.eye(4, dtype=torch.float64)

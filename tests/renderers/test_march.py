@@ -13,6 +13,7 @@ from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import Status
+from tests.looped import each
 from tests.renderers.analytic_cases import beam, sphere_hits, vector
 from tests.tiny import camera_of
 
@@ -100,8 +101,8 @@ def test_the_value_that_makes_a_step_is_clamped():
     assert front.distance.item() == 2
 
 
-@pytest.mark.parametrize(
-    ("alpha", "cap", "clamp", "expected"),
+@each(
+    "alpha, cap, clamp, expected",
     [
         (1.0, None, None, [1, 0.1, 0, -0.1, -1]),
         (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
@@ -136,8 +137,8 @@ def test_finished_rays_are_asked_only_where_every_ray_is():
     assert active.status.tolist() == [Status.HIT, Status.HIT, Status.MISS, Status.MISS]
 
 
-@pytest.mark.parametrize(
-    ("steps", "queries"),
+@each(
+    "steps, queries",
     [(1, 4), (2, 2 * 4), (3, 12), (4, 12 + 16), (6, 12 + 48), (7, 12 + 48 + 64), (10, 12 + 48 + 4 * 64)],
 )
 def test_coarse_to_fine_asks_blocks_of_16_then_of_4_then_pixels(steps, queries):
@@ -218,8 +219,8 @@ def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
         assert 0 < (plain != fine).sum() < 0.1 * (fine == Status.HIT).sum()
 
 
-@pytest.mark.parametrize(
-    ("apart", "careful", "start"),
+@each(
+    "apart, careful, start",
     [
         (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
         (0.03, True, 1.2),  # it may have passed what the finer ray meets: back to where it was closest
@@ -274,9 +275,8 @@ def stuck(limit: float) -> Shape:
     return Shape(lambda p: torch.where(p[..., 2] > limit, torch.nan, WALL(p)))
 
 
-@pytest.mark.parametrize("renderer", [NAIVE, FINE, COARSE], ids=["naive", "dist", "dist-coarse"])
-@pytest.mark.parametrize(
-    ("field", "origin", "steps", "status", "distance"),
+@each("renderer", [NAIVE, FINE, COARSE])
+@each("field, origin, steps, status, distance",
     [
         (sphere(0.5), (0, 0, -2), 50, Status.HIT, 1.5),
         (sphere(0.2, (0, 0.5, 0)), (0, 0, -2), 50, Status.MISS, 3),  # leaves the unit sphere
@@ -317,8 +317,8 @@ def bumpy(points: Tensor) -> Tensor:
     return (0.08 + 0.05 * torch.sin(17 * points[..., 2] + 5 * points[..., 0])) * torch.sign(0.2 - points[..., 2])
 
 
-@pytest.mark.parametrize("samples", [1, 3, 80])
-@pytest.mark.parametrize("alpha", [1.0, 1.5])
+@each("samples", [1, 3, 80])
+@each("alpha", [1.0, 1.5])
 def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples, alpha):
     rays = beam(*((0.1 * i, -0.05 * i, -2) for i in range(8)))
     together, _ = trace(Shape(bumpy, Kind.LEVEL, None), rays, replace(PLAIN, alpha=alpha), steps=60, samples=samples)
@@ -342,7 +342,7 @@ def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples, alph
         assert together.sample_distance[index, :kept].tolist() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("renderer", [NAIVE, replace(FINE, alpha=1.0)], ids=["naive", "dist"])
+@each("renderer", [NAIVE, replace(FINE, alpha=1.0)])
 def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
     def render(field: Shape, ray: Rays) -> tuple[float, list[float]]:
         recorded = []
@@ -396,7 +396,7 @@ def plate(at: float, thickness: float) -> Shape:
     return plane((0, 0, -1), thickness / 2 - at) & plane((0, 0, 1), thickness / 2 + at)
 
 
-@pytest.mark.parametrize("at", [0.0, -0.5, 0.85], ids=["middle", "near", "before the exit"])
+@each("at", [0.0, -0.5, 0.85])
 def test_a_step_over_a_plate_is_taken_back(at):
     rays, thin = beam((0, 0, -2)), plate(at, 0.04)
     assert marched(thin, rays, AGGRESSIVE).status.item() == Status.MISS

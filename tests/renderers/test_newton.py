@@ -14,6 +14,7 @@ from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
 from renderers.packed_march import CLEAR, FURTHER, Reached, Stop, Stride, march
 from renderers.rendering import Rendering, Status, closest_values
 from renderers.tracer import PAIRS
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, beam
 from tests.tiny import camera_of
 
@@ -24,7 +25,7 @@ SHAPES = {
     "brick": box((0.5, 0.4, 0.3)),
     "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1),
 }
-by_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+by_shape = each("shape", list(SHAPES.values()))
 
 
 def camera(size: int = 64, dtype: torch.dtype = torch.float32) -> Camera:
@@ -57,8 +58,8 @@ def test_its_hits_are_exact_and_cost_no_more_values_than_those_of_dist(shape):
     assert counts.value <= 1.05 * (found["dist"][1].value + counts.gradient)
 
 
-@pytest.mark.parametrize(("near", "relative"), [(1e-3, 0.04), (1e-6, 1e-4)])
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@each("near, relative", [(1e-3, 0.04), (1e-6, 1e-4)])
+@each("case", CASES)
 def test_its_gradient_is_that_of_the_hit_up_to_the_newton_step(case, near, relative):
     parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
     rays = case.rays()
@@ -133,8 +134,8 @@ WRONG = {  # fields with the zero set of a distance d, and the most values that 
 }
 
 
-@pytest.mark.parametrize("image", [True, False], ids=["image", "rays"])
-@pytest.mark.parametrize(("of", "most"), WRONG.values(), ids=WRONG)
+@each("image", [True, False])
+@each("of, most", WRONG.values())
 def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most, image):
     ring, seen = SHAPES["ring"], camera().rays()
     truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p))))
@@ -214,7 +215,7 @@ def test_the_silhouette_asks_values_only_where_a_ray_is_wrong():
             assert gradient.item() == pytest.approx(sign)  # the mean over rays that violate it
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 6, 7, 10])
+@each("steps", [1, 2, 3, 6, 7, 10])
 def test_in_an_image_few_steps_leave_all_hits_to_the_search(steps):
     rays, few = camera(48).rays(), replace(NEWTON, steps=steps)
     apart, together = few.render(sphere(0.6), rays.flat()), few.render(sphere(0.6), rays)
@@ -222,9 +223,7 @@ def test_in_an_image_few_steps_leave_all_hits_to_the_search(steps):
     assert not ((together.status == Status.MISS) & (together.closest < 0)).any()
 
 
-@pytest.mark.parametrize(
-    "shape", [sphere(0.995), plane((0, 0, -1), -0.9), plane((0, 0, -1), -0.95)], ids=["ball", "wall", "far wall"]
-)
+@each("shape", [sphere(0.995), plane((0, 0, -1), -0.9), plane((0, 0, -1), -0.95)])
 def test_in_an_image_surfaces_near_the_bounding_sphere_are_found(shape):
     rays = camera().rays()
     for renderer in (NEWTON, replace(NEWTON, unseen=1e-4)):
@@ -255,13 +254,12 @@ def test_a_thin_sheet_in_front_of_a_wall_is_hit_and_not_the_wall():
     torch.testing.assert_close(before.distance, alone.distance, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@each(
     "thin",
     [
         capsule((-0.5, 0.1, -0.3), (0.5, -0.1, 0.4), 0.015),
         box((0.5, 0.01, 0.3)).translate((0.0, 0.2, 0.0)) | box((0.01, 0.3, 0.5)),
     ],
-    ids=["wire", "plates"],
 )
 def test_in_an_image_what_is_thin_is_hit_and_not_the_wall_behind(thin):
     rays = camera(64, torch.float64).rays()
@@ -422,7 +420,7 @@ def test_a_plate_that_a_long_step_would_pass_is_hit():
     torch.testing.assert_close(found.distance, torch.full((40,), 2.306).double(), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("thickness", [0.008, 0.02])
+@each("thickness", [0.008, 0.02])
 def test_a_step_that_lands_in_a_wall_does_not_pass_the_plate_before_it(thickness):
     """Rays over a floor take long steps; behind the plate across them stands a wall."""
     for place in range(12):
@@ -433,7 +431,7 @@ def test_a_step_that_lands_in_a_wall_does_not_pass_the_plate_before_it(thickness
         torch.testing.assert_close(found.distance, torch.full((20,), 2.0 + front).double(), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("pitch", [0.001, 0.008])
+@each("pitch", [0.001, 0.008])
 def test_finer_rays_do_not_pass_what_their_coarse_ray_left_unseen(pitch):
     y, x = torch.meshgrid(*[pitch * torch.arange(32).double()] * 2, indexing="ij")
     origins = torch.stack([x, 0.03 + y, torch.full_like(x, -2.0)], dim=-1)
@@ -445,7 +443,7 @@ def test_finer_rays_do_not_pass_what_their_coarse_ray_left_unseen(pitch):
         assert (found.distance - 2.0 - front).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("half_side", [0.02, 0.05, 0.2])
+@each("half_side", [0.02, 0.05, 0.2])
 def test_rays_that_cut_little_off_an_edge_hit_it(half_side):
     """A ray at the depth d behind the edge is inside the box over 2.08 d."""
     turned = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]], dtype=torch.float64)
@@ -490,8 +488,8 @@ def test_the_gradient_of_an_image_is_that_of_each_of_its_rays():
     torch.testing.assert_close(towards[1], expected, rtol=0.05, atol=0.02)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value", "remedy"),
+@each(
+    "setting, value, remedy",
     [
         ("steps", 0, "at least 1"),
         ("march_epsilon", 0.0, "positive"),
@@ -504,7 +502,7 @@ def test_settings_that_cannot_be_are_refused(setting, value, remedy):
         replace(NEWTON, **{setting: value})
 
 
-@pytest.mark.parametrize("image", [True, False])
+@each("image", [True, False])
 def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
     field, rays = SHAPES["ring"] | sphere(0.2, (0.0, 0.0, -0.7)), camera().rays()
     reached = NEWTON.tracer.trace(field, rays if image else rays.flat())[0]

@@ -10,6 +10,7 @@ from renderers.field import Field, Flops, Kind, Meter, occupancy_field, occupanc
 from renderers.fields import occupancy
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.occupancy import OccupancyNetwork
+from tests.looped import each
 
 LEVEL = Shape(lambda p: p.square().sum(-1) - 0.25, Kind.LEVEL, None)
 BOUND = Shape(lambda p: 0.5 * (p.norm(dim=-1) - 0.5), Kind.BOUND, 0.5)
@@ -49,8 +50,8 @@ def both(network: OccupancyNetwork, code: Tensor, points: Tensor) -> tuple[Tenso
     return bound.logits(points), bound.colours(points)
 
 
-@pytest.mark.parametrize("code_length", [0, 4])
-@pytest.mark.parametrize("shape", [(5,), (), (0,), (2, 3), (2, 0)])
+@each("code_length", [0, 4])
+@each("shape", [(5,), (), (0,), (2, 3), (2, 0)])
 def test_a_bound_code_gives_the_unbound_network_in_any_leading_shape(code_length, shape):
     network, (code, points) = make(code_length), draw(code_length, *shape)
     logits, colours = both(network, code, points)
@@ -59,8 +60,8 @@ def test_a_bound_code_gives_the_unbound_network_in_any_leading_shape(code_length
     assert ((colours > 0) & (colours < 1)).all()
 
 
-@pytest.mark.parametrize("batch", [(3,), (2, 3)])
-@pytest.mark.parametrize("code_length", [0, 4])
+@each("batch", [(3,), (2, 3)])
+@each("code_length", [0, 4])
 def test_a_batch_of_codes_is_each_code_by_itself(code_length, batch):
     network = make(code_length)
     codes = torch.randn(*batch, code_length, dtype=torch.float64)
@@ -73,8 +74,8 @@ def test_a_batch_of_codes_is_each_code_by_itself(code_length, batch):
         torch.testing.assert_close((logits[one], colours[one]), alone, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("output", [0, 1], ids=["logits", "colours"])
-@pytest.mark.parametrize("code_length", [0, 4])
+@each("output", [0, 1])
+@each("code_length", [0, 4])
 def test_gradients_flow_to_weights_code_and_points_as_in_the_unbound_network(code_length, output):
     network, (code, points) = make(code_length), draw(code_length, 6)
     other = (network.texture_head, network.occupancy_head)[output]
@@ -162,8 +163,8 @@ def test_the_field_of_an_occupancy_is_a_level_set_that_a_meter_can_wrap():
     assert meter.counts.flops(meter) == 7 * 10 + 7 * 20
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.9])
+@each("dtype", [torch.float32, torch.float64])
+@each("threshold", [0.2, 0.5, 0.9])
 def test_logits_to_field_and_back_are_the_logits_less_the_threshold(dtype, threshold):
     bound = make(0).to(dtype).at(torch.zeros(0, dtype=dtype))
     points = torch.randn(2, 5, 3, dtype=dtype)
@@ -176,9 +177,7 @@ def test_logits_to_field_and_back_are_the_logits_less_the_threshold(dtype, thres
     torch.testing.assert_close(occupancy_field(lambda _: back, 0.5)(points), values, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("field", "factor"), [(sphere(0.5), 4.0), (BOUND, 4.0), (LEVEL, 1.0)], ids=["distance", "bound", "level"]
-)
+@each("field, factor", [(sphere(0.5), 4.0), (BOUND, 4.0), (LEVEL, 1.0)])
 def test_logits_of_a_fields_values_are_positive_inside_and_scaled_by_the_width_of_a_length(field, factor):
     points = torch.tensor([[0.0, 0, 0], [0.25, 0, 0], [2, 0, 0]], dtype=torch.float64, requires_grad=True)
     values = field(points)
@@ -189,21 +188,21 @@ def test_logits_of_a_fields_values_are_positive_inside_and_scaled_by_the_width_o
     assert gradient.tolist() == [-factor] * 3
 
 
-@pytest.mark.parametrize("threshold", [0.0, 1.0, -0.5, 2.0, float("nan")])
+@each("threshold", [0.0, 1.0, -0.5, 2.0, float("nan")])
 def test_a_threshold_that_is_no_probability_is_refused(threshold):
     with pytest.raises(ValueError, match=f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5"):
         occupancy_field(vector_of_logits(0.5), threshold)
 
 
-@pytest.mark.parametrize("field", [sphere(), LEVEL], ids=["distance", "level"])
-@pytest.mark.parametrize("width", [0.0, -0.1, float("inf"), float("nan")])
+@each("field", [sphere(), LEVEL])
+@each("width", [0.0, -0.1, float("inf"), float("nan")])
 def test_a_width_that_is_no_length_is_refused(field, width):
     with pytest.raises(ValueError, match=rf"width must be positive, not {width}: 0\.02 suits"):
         occupancy_logits(field, torch.zeros(3), width=width)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+@each(
+    "change, message",
     [
         ({"width": 0}, "width must be at least 1, not 0: 128 suits"),
         ({"code_length": -1}, "code_length must be at least 0, not -1: .* 0 is for one shape"),
@@ -214,7 +213,7 @@ def test_impossible_networks_are_refused(change, message):
         OccupancyNetwork(**({"width": 8, "code_length": 4} | change))
 
 
-@pytest.mark.parametrize("length", [3, 5, 0])
+@each("length", [3, 5, 0])
 def test_a_code_of_the_wrong_length_is_refused(length):
     with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
         make().at(torch.zeros(length, dtype=torch.float64))

@@ -8,6 +8,7 @@ from renderers.field import steepest
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.reference import trace
 from renderers.rendering import Status
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, sphere_hits, vector
 
 
@@ -20,7 +21,7 @@ def along_z(*heights: float, start: float = -2.0) -> Rays:
     return Rays(origins, vector((0, 0, 1)).expand_as(origins))
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@each("case", CASES)
 def test_closed_forms_to_the_last_digits(case):
     rendering = evaluate(case.field(), case.rays())
     assert rendering.status.item() == Status.HIT
@@ -37,7 +38,7 @@ def test_grazing_rays_hit_or_miss_as_they_should():
     assert rendering.distance[:2].tolist() == pytest.approx(distance[:2].tolist(), abs=1e-9)
 
 
-@pytest.mark.parametrize("degrees", [0.0, 60.0])
+@each("degrees", [0.0, 60.0])
 def test_a_plate_of_a_thousandth_is_found(degrees):
     turn = torch.tensor(degrees).deg2rad().double()
     zero, one = torch.zeros_like(turn), torch.ones_like(turn)

@@ -31,8 +31,11 @@ VARIANTS = [name for name, file in FILES.items() if "defaults" in file]
 
 @pytest.fixture(scope="module", params=[name for name in FILES if name not in VARIANTS])
 def renderer(request, compose_config) -> Renderer:
-    yours = [f"renderer._target_={request.config.getoption('--renderer')}"] if request.param == "custom" else []
-    return build(compose_config(f"renderer={request.param}", *yours).renderer, "renderer")
+    changed = {
+        "custom": [f"renderer._target_={request.config.getoption('--renderer')}"],
+        "mesh_proxy": ["renderer.grid=48"],  # an eighth of the values; its accuracy is stated
+    }
+    return build(compose_config(f"renderer={request.param}", *changed.get(request.param, [])).renderer, "renderer")
 
 
 def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:
@@ -109,22 +112,22 @@ def test_it_is_a_renderer_with_capabilities(renderer):
         assert line in text, f"the docstring of {type(renderer).__name__} lacks the line {line!r}: see renderers/idr.py"
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_hits_are_those_of_the_closed_forms(renderer, case, dtype):
-    rays = case.rays(dtype)
-    for kind in renderer.capabilities.needs:
-        rendering = renderer.render(stated(case.field(), kind), rays)
-        check_rendering(rendering, rays)
-        assert rendering.status.item() == Status.HIT
-        assert rendering.distance.item() == pytest.approx(case.distance, abs=tolerance(renderer, case.cosine, dtype))
-        assert rendering.residual.abs().item() <= getattr(renderer, "epsilon", torch.inf)
+def test_hits_are_those_of_the_closed_forms(renderer):
+    for case in CASES:
+        for dtype in (torch.float64, torch.float32) if case is CASES[0] else (torch.float64,):
+            rays = case.rays(dtype)
+            for kind in renderer.capabilities.needs:
+                rendering = renderer.render(stated(case.field(), kind), rays)
+                check_rendering(rendering, rays)
+                assert rendering.status.item() == Status.HIT, case.name
+                near = tolerance(renderer, case.cosine, dtype)
+                assert rendering.distance.item() == pytest.approx(case.distance, abs=near), case.name
+                assert rendering.residual.abs().item() <= getattr(renderer, "epsilon", torch.inf)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("size", [(48, 48), (45, 51)])
-def test_images_are_those_of_the_closed_forms(renderer, dtype, size):
-    rays = pinhole(*size, dtype).rays()
+def test_images_are_those_of_the_closed_forms(renderer):
+    """In float32, of an odd size."""
+    dtype, rays = torch.float32, pinhole(45, 51).rays()
     half = (0.45, 0.5, 0.4)
     for field, (distance, hit) in ((sphere(0.6), sphere_hits(rays, 0.6)), (box(half), box_hits(rays, half))):
         rendering = renderer.render(field, rays)
@@ -138,26 +141,27 @@ def test_images_are_those_of_the_closed_forms(renderer, dtype, size):
         assert (rendering.distance - distance)[clear & hit].abs().max() < tolerance(renderer, 0.5, dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (30,), (2, 3, 5), (3, 0, 2)])
-def test_rays_may_have_any_leading_shape(renderer, shape, dtype):
-    rays, field = mixed(*shape, dtype=dtype), sphere(0.5)
-    rendering = renderer.render(field, rays)
-    check_rendering(rendering, rays)
-    same(rendering, renderer.render(field, rays.flat()))
-    if len(shape) == 3 and rendering.hit.numel():
-        assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
+def test_rays_may_have_any_leading_shape(renderer):
+    field = sphere(0.5)
+    for shape in ((), (0,), (1,), (2, 3, 5), (3, 0, 2)):
+        rays = mixed(*shape, dtype=torch.float32 if shape == (2, 3, 5) else torch.float64)
+        rendering = renderer.render(field, rays)
+        check_rendering(rendering, rays)
+        same(rendering, renderer.render(field, rays.flat()))
+        if shape == (2, 3, 5):
+            assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (2, 4, 6), (0, 4, 4)])
-def test_images_may_have_any_size_and_come_in_batches(renderer, shape):
-    one = pinhole(*shape[-2:], dtype=torch.float64).rays()
-    rays = Rays(one.origins.expand(*shape, 3), one.directions.expand(*shape, 3), image=True)
-    rendering = renderer.render(sphere(0.5), rays)
-    check_rendering(rendering, rays)
-    alone = renderer.render(sphere(0.5), one)
-    for part in PARTS:
-        torch.testing.assert_close(getattr(alone, part).expand_as(getattr(rendering, part)), getattr(rendering, part))
+def test_images_may_have_any_size_and_come_in_batches(renderer, shapes=((1, 1), (5, 7), (2, 4, 6), (0, 4, 4))):
+    for shape in shapes:
+        one = pinhole(*shape[-2:], dtype=torch.float64).rays()
+        rays = Rays(one.origins.expand(*shape, 3), one.directions.expand(*shape, 3), image=True)
+        rendering = renderer.render(sphere(0.5), rays)
+        check_rendering(rendering, rays)
+        alone = renderer.render(sphere(0.5), one)
+        for part in PARTS:
+            expected = getattr(alone, part).expand_as(getattr(rendering, part))
+            torch.testing.assert_close(expected, getattr(rendering, part))
 
 
 def test_inputs_are_left_as_they_are(renderer):
@@ -182,10 +186,8 @@ def test_the_same_input_gives_the_same_output(renderer):
 
 
 def test_rays_that_find_nothing_miss(renderer):
-    aside = Rays(vector((2, 0, -2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
-    behind = Rays(vector((0, 0, 2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
-    through = Rays(vector((0.8, 0, -2)).expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3))
-    for rays in (aside, behind, through):
+    for start in ((2, 0, -2), (0, 0, 2), (0.8, 0, -2)):  # aside, behind, through
+        rays = Rays(vector(start).expand(3, 2, 3), vector((0, 0, 1)).expand(3, 2, 3))
         for image in (False, True):
             rays = Rays(rays.origins, rays.directions, image)
             rendering = renderer.render(sphere(0.5), rays)
@@ -215,21 +217,17 @@ def leaves() -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
     return radius, Rays(origins, directions), (radius, origins, directions)
 
 
-@pytest.mark.parametrize("part", ["distance", "closest", "points", "silhouette"])
-def test_gradients_are_finite_on_every_kind_of_ray(renderer, part):
+def test_gradients_are_finite_on_every_kind_of_ray(renderer):
     radius, rays, wanted = leaves()
     rendering = renderer.render(sphere(radius), rays)
     assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
-    mask = torch.arange(35) % 2 == 0
-    if part == "silhouette":
-        output = renderer.silhouette_loss(sphere(radius), rays, rendering, mask)
-        assert output.shape == ()
-        assert output.isfinite()
-        assert output > 0
-    else:
-        output = getattr(rendering, part).sum()
-    for gradient in torch.autograd.grad(output, wanted, allow_unused=True):
-        assert gradient is None or gradient.isfinite().all()
+    loss = renderer.silhouette_loss(sphere(radius), rays, rendering, torch.arange(35) % 2 == 0)
+    assert loss.shape == ()
+    assert loss.isfinite()
+    assert loss > 0
+    for output in (rendering.distance.sum(), rendering.closest.sum(), rendering.points.sum(), loss):
+        for gradient in torch.autograd.grad(output, wanted, retain_graph=True, allow_unused=True):
+            assert gradient is None or gradient.isfinite().all()
 
 
 def test_gradients_of_hits_point_the_right_way(renderer):
@@ -293,31 +291,23 @@ def variant(request, compose_config) -> Renderer:
     return build(compose_config(f"renderer={request.param}").renderer, "renderer")
 
 
-def test_a_variant_gives_what_a_renderer_gives(variant):
+def test_a_variant_gives_what_a_renderer_gives_and_what_it_hits_is_there(variant):
     test_it_is_a_renderer_with_capabilities(variant)
-    test_the_same_input_gives_the_same_output(variant)
-    test_inputs_are_left_as_they_are(variant)
-    test_rays_may_have_any_leading_shape(variant, (2, 3, 5), torch.float32)
-    test_rays_may_have_any_leading_shape(variant, (3, 0, 2), torch.float64)
-    test_images_may_have_any_size_and_come_in_batches(variant, (2, 4, 6))
-
-
-def test_what_a_variant_hits_is_there_and_what_it_misses_is_not(variant):
+    test_images_may_have_any_size_and_come_in_batches(variant, ((2, 3, 5),))
     test_rays_that_find_nothing_miss(variant)
     rays = aimed(0)
     truth, hit = sphere_hits(rays, 0.5)
     rendering = variant.render(sphere(0.5), rays)
     check_rendering(rendering, rays)
+    same(rendering, variant.render(sphere(0.5), rays), atol=0)
     assert hit.all() and not (rendering.status == Status.MISS).any()
     wrong = (rendering.distance - truth).abs()[rendering.hit]
     assert wrong.numel() == 0 or wrong.max() < tolerance(variant, 0.9)
     assert (rendering.residual.abs()[rendering.hit] <= getattr(variant, "epsilon", torch.inf)).all()
 
 
-@pytest.mark.parametrize("part", ["distance", "silhouette"])
-def test_a_variants_gradients_are_finite_and_its_points_move_as_its_distances(variant, part):
-    test_gradients_are_finite_on_every_kind_of_ray(variant, part)
-    test_points_move_as_distances_do_and_residuals_do_not(variant)
+def test_a_variants_gradients_are_finite(variant):
+    test_gradients_are_finite_on_every_kind_of_ray(variant)
 
 
 def rotation(seed: int) -> Tensor:
@@ -327,7 +317,7 @@ def rotation(seed: int) -> Tensor:
     return q * torch.linalg.det(q)
 
 
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(
     seed=st.integers(0, 2**32),
     offset=st.tuples(*[st.floats(-0.15, 0.15)] * 3),
@@ -344,7 +334,7 @@ def test_a_rigid_motion_moves_the_hit_with_the_ray(renderer, seed, offset, half)
     torch.testing.assert_close(after.points, before.points @ turn.T + offset, rtol=0, atol=tolerance(renderer, 0.25))
 
 
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 2**32), factor=st.floats(0.5, 1.6))
 def test_scaling_scales_the_distance(renderer, seed, factor):
     rays = aimed(seed)
@@ -356,7 +346,7 @@ def test_scaling_scales_the_distance(renderer, seed, factor):
     assert (factor * before.distance - after.distance).abs().max() < 2 * tolerance(renderer, 0.25)
 
 
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 2**32))
 def test_a_tighter_epsilon_never_raises_the_residual(renderer, seed):
     if not hasattr(renderer, "epsilon"):

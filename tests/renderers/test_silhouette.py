@@ -12,6 +12,7 @@ from renderers.camera import Rays
 from renderers.fields.analytic import sphere
 from renderers.rendering import Capabilities, Observed, Renderer, at_iteration
 from renderers.silhouette import Hinge, SilhouetteLoss
+from tests.looped import each
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
 CLOSEST = torch.tensor([0.5, 0.03, -0.3, -0.04], dtype=torch.float64)
@@ -22,8 +23,8 @@ def loss(mask, *, signed=False, average="all", closest=CLOSEST):
     return Hinge(0.1, signed, average).of(closest, mask)
 
 
-@pytest.mark.parametrize(
-    ("mask", "signed", "average", "expected"),
+@each(
+    "mask, signed, average, expected",
     [
         # Foreground should be below 0: 0.4 and 0.2 are not. Background should be above: -0.07 and -0.06 are not.
         (ALL, False, "all", (0.4 + 0.2) / 4),
@@ -55,7 +56,7 @@ def test_a_background_ray_just_inside_is_pushed_out_with_its_sign_and_deeper_wit
     assert slope(signed=False) == 1  # descent lowers it: deeper
 
 
-@pytest.mark.parametrize("signed", [False, True])
+@each("signed", [False, True])
 def test_gradients_pull_a_missed_ray_in_and_push_a_grazing_one_out(signed):
     def slopes(average: str, value: float, mask: bool) -> float:
         closest = torch.tensor([value, 5.0], dtype=torch.float64, requires_grad=True)
@@ -75,7 +76,7 @@ def test_any_leading_shape_gives_one_number():
     assert loss(ALL[0], closest=CLOSEST[0]).shape == ()
 
 
-@pytest.mark.parametrize("average", ["all", "violating"])
+@each("average", ["all", "violating"])
 def test_no_rays_cost_nothing(average):
     assert loss(ALL[:0], average=average, closest=CLOSEST[:0]).item() == 0
 
@@ -96,17 +97,15 @@ def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tup
     return value.item(), 0.0 if slope is None else slope.item()
 
 
-@pytest.mark.parametrize(
-    ("renderer", "loss"), [("dist", "hinge"), ("naive", "hinge"), ("idr", "cross_entropy"), ("dvr", "occupancy")]
-)
+@each("renderer, loss", [("dist", "hinge"), ("naive", "hinge"), ("idr", "cross_entropy"), ("dvr", "occupancy")])
 def test_the_loss_of_a_paper_is_that_of_its_renderer_to_the_last_digit(renderer, loss):
     mine, own, named = load("renderer", renderer), load("silhouette", "own"), load("silhouette", loss)
     for mask in ([True] * 4 + [False], [False] * 5, [True, False, True, False, False]):
         assert of_sphere(mine, named, mask) == of_sphere(mine, own, mask)
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
+@each("loss", LOSSES)
+@each("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too_large(renderer, loss):
     mine, given = load("renderer", renderer), load("silhouette", loss)
     small, large = of_sphere(mine, given, [True] * 4 + [False]), of_sphere(mine, given, [False] * 5)
@@ -115,15 +114,15 @@ def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too
     assert small[1] < 0 < large[1]
 
 
-@pytest.mark.parametrize("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
+@each("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
     hinge, mask = load("silhouette", "hinge"), [True] * 4 + [False]
     expected = of_sphere(load("renderer", "idr", steps=500), hinge, mask)
     assert of_sphere(load("renderer", renderer), hinge, mask) == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("loss", "values", "message"),
+@each(
+    "loss, values, message",
     [
         ("hinge", {"average": "some"}, "average must be one of all, violating, not 'some'"),
         ("hinge", {"epsilon": 0.0}, "epsilon must be positive, not 0.0"),
@@ -145,7 +144,7 @@ def test_a_right_hit_costs_nothing_whatever_the_renderers_own_threshold():
     assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3) == (5e-5, 1.0)
 
 
-@pytest.mark.parametrize("name", ["neus", "volsdf", "unisurf"])
+@each("name", ["neus", "volsdf", "unisurf"])
 def test_every_hit_on_the_background_shrinks_the_shape_whatever_its_least_value(name):
     """The least value that a volume renderer knows may be in front of the surface: at a hit it would cost nothing."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
@@ -177,7 +176,7 @@ class Detached:
         raise AssertionError("another loss was chosen")
 
 
-@pytest.mark.parametrize("loss", ["hinge", "cross_entropy"])
+@each("loss", ["hinge", "cross_entropy"])
 def test_a_renderer_whose_closest_values_lack_the_gradient_that_it_claims_is_told(loss):
     with pytest.raises(BrokenContract, match="its closest field values carry no gradient towards the field's param"):
         of_sphere(Detached(), load("silhouette", loss), [True] * 4 + [False])

@@ -21,6 +21,7 @@ NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "
 BAND = load("renderer", "relaxed_boundary")
 VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda one: type(one).__name__)
 BLURRED = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda one: type(one).__name__)
+HARDER = [(0.05, 0.1), (0.01, 0.01), (0.002, 0.1), (0.002, 0.01)]  # widths and bounds of VolSDF's error
 PLANES = [case for case in CASES if case.name.startswith("plane")]
 
 
@@ -50,22 +51,24 @@ def test_neus_is_unbiased_and_volsdf_is_not(case):
     assert off == pytest.approx({1.0: 0.36, 0.8: 0.06, 0.28: -4.06}[case.cosine], abs=0.02)
 
 
-@pytest.mark.parametrize("width", [0.05, 0.01, 0.002])
-@pytest.mark.parametrize("error_bound", [0.1, 0.01])
+@pytest.mark.parametrize(
+    ("width", "error_bound"),
+    [(0.05, 0.01), (0.01, 0.1), *(pytest.param(*one, marks=pytest.mark.slow) for one in HARDER)],
+)
 def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
-    """VolSDF, Theorem 1 and Algorithm 1, against 40,000 samples of the opacity along each ray."""
+    """VolSDF, Theorem 1 and Algorithm 1, against 20,000 samples of the opacity along each ray."""
     renderer = replace(VOLSDF, error=error_bound, rounds=8).with_blur(width)
-    rays = parallel(12).flat()
+    rays = parallel(8).flat()
     entry, leave, meets = sphere_span(rays)
     rays, entry, leave = rays[meets], entry[meets], leave[meets]
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
         sharp, places = 0, []
         for index, found, reached in renderer.bounded(field, rays, entry, leave):
-            dense = Samples.of(field, rays[index], evenly(entry[index], leave[index], 40_000))
+            dense = Samples.of(field, rays[index], evenly(entry[index], leave[index], 20_000))
             truth, opacity = (
                 1 - _passing(one.value, one.distance, reached)[:, :-1].cumsum(dim=1).exp() for one in (dense, found)
             )
-            place = torch.searchsorted(dense.distance, found.distance[:, 1:].contiguous()).clamp_max(39_999) - 1
+            place = torch.searchsorted(dense.distance, found.distance[:, 1:].contiguous()).clamp_max(19_999) - 1
             off = (opacity - truth.gather(1, place.clamp_min(0))).abs()
             assert off.numel() == 0 or off.max() <= error_bound
             sharp += int((reached == width).sum())
@@ -84,7 +87,7 @@ def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(re
         assert len(reached) == int(meets.sum()) and reached.double().mean() >= least
 
 
-def area_rates(renderer, radius: float, side: int = 400) -> tuple[float, float, float]:
+def area_rates(renderer, radius: float, side: int) -> tuple[float, float, float]:
     """The area that is seen of a sphere, its derivative towards the radius, and the noise of a ray's."""
     leaf = torch.tensor(radius, dtype=torch.float64, requires_grad=True)
     rays = parallel(side)
@@ -96,14 +99,17 @@ def area_rates(renderer, radius: float, side: int = 400) -> tuple[float, float, 
     return cell * opacity.sum().item(), cell * rate.item(), each.std().item()
 
 
-@pytest.mark.parametrize("blur", [0.1, 0.03, 0.01, 0.003])
-def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_width(blur):
+@pytest.mark.parametrize(
+    ("blur", "side"),
+    [(0.1, 200), (0.03, 200), *(pytest.param(blur, 400, marks=pytest.mark.slow) for blur in (0.01, 0.003))],
+)
+def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_width(blur, side):
     """A circle's area grows by its circumference; the mean over a band outside of it is that of a radius half a band
     larger (Wang et al. 2024, Sec. 4), and the noise grows as the band gets thinner."""
-    area, rate, noise = area_rates(BAND.with_blur(blur), 0.5)
+    area, rate, noise = area_rates(BAND.with_blur(blur), 0.5, side)
     assert area == pytest.approx(pi * 0.25, rel=0.01)
     assert rate == pytest.approx(2 * pi * (0.5 + blur / 2), rel=0.01)
-    assert noise > area_rates(BAND.with_blur(2 * blur), 0.5)[2]
+    assert noise > area_rates(BAND.with_blur(2 * blur), 0.5, side)[2]
 
 
 def test_without_a_band_the_silhouette_has_no_gradient():
@@ -119,7 +125,7 @@ def test_without_a_band_the_silhouette_has_no_gradient():
 )
 def test_opacity_carries_the_gradient_of_a_silhouette_that_density_outside_makes_larger(renderer, share, margin):
     """By how many blurs: light is lost along the whole of a ray that passes close by, but not by NeuS."""
-    area, rate, _ = area_rates(renderer.with_blur(0.01), 0.5, side=160)
+    area, rate, _ = area_rates(renderer.with_blur(0.01), 0.5, side=120)
     assert rate / (2 * pi * 0.5) == pytest.approx(share, abs=0.01)
     assert (area - pi * 0.25) / (pi * 0.01) == pytest.approx(margin, abs=0.02)
 
@@ -140,17 +146,17 @@ def test_what_is_seen_behind_gives_way_to_what_comes_into_view():
     assert opacity.item() == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("iteration", [0, 50, None])
+@pytest.mark.parametrize("iteration", [0, None])
 @pytest.mark.parametrize("renderer", [NEUS, VOLSDF], ids=lambda one: type(one).__name__)
 def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer, iteration):
     """Away from the outline the distance to a sphere falls as it grows by 1 / cosine, and all weights have a part."""
     now = renderer if iteration is None else at_iteration(renderer, iteration)
     leaf = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
-    rays = parallel(24, half=0.5).flat()
+    rays = parallel(14, half=0.5).flat()
     rendering = now.render(sphere(leaf), rays)
     cosine = (0.36 - rays.origins[:, :2].square().sum(-1)).clamp_min(0).sqrt() / 0.6
     seen = rendering.hit & (cosine > 0.5)
-    assert seen.sum() > 300
+    assert seen.sum() > 100
     (rate,) = torch.autograd.grad(rendering.distance[seen].sum(), leaf)
     assert rate.item() == pytest.approx(-(1 / cosine[seen]).sum().item(), rel=0.12)
 
@@ -201,7 +207,7 @@ def test_of_two_surfaces_within_the_band_the_first_counts():
 
 @BLURRED
 def test_a_narrower_blur_brings_the_image_closer_to_the_hits(renderer):
-    rays, errors = parallel(30), []
+    rays, errors = parallel(20), []
     truth = load("renderer", "idr").render(sphere(0.5), rays)
     for blur in (0.1, 0.02, 0.004):
         rendering = renderer.with_blur(blur).render(sphere(0.5), rays)
@@ -278,15 +284,16 @@ def test_a_volume_sums_any_values():
     torch.testing.assert_close(volume.summed(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
 
 
-@pytest.mark.parametrize(
-    ("renderer", "setting"),
-    [
-        (NEUS, "samples"), (NEUS, "sharpness"), (NEUS, "round_samples"),
-        (VOLSDF, "width"), (VOLSDF, "error"), (VOLSDF, "fine_samples"),
-        (UNISURF, "interval"), (UNISURF, "occupancy_width"), (BAND, "band"), (BAND, "steps"),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_that_cannot_be_are_refused(renderer, setting):
-    with pytest.raises(ValueError, match=setting):
-        replace(renderer, **{setting: 0})
+def test_settings_that_cannot_be_are_refused():
+    for renderer, settings in (
+        (NEUS, ("samples", "sharpness", "round_samples", "sphere_radius")),
+        (VOLSDF, ("width", "error", "fine_samples", "sphere_radius")),
+        (UNISURF, ("interval", "occupancy_width", "sphere_radius")),
+        (BAND, ("band", "steps", "least_slope", "mask_sharpness", "sphere_radius")),
+    ):
+        for setting in settings:
+            with pytest.raises(ValueError, match=setting):
+                replace(renderer, **{setting: 0})
+    for renderer in (NEUS, BAND):
+        with pytest.raises(ValueError, match="mask_weight must be at least 0, not -1"):
+            replace(renderer, mask_weight=-1)
