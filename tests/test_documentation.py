@@ -143,6 +143,8 @@ def test_every_target_of_make_is_there():
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     named = {name for file in FILES for name in re.findall(r"(?:^ {4}|`)make ([\w-]+)", text_of(file), re.MULTILINE)}
     assert {"demo", "test", "benchmark"} <= named <= targets
+    paths = re.findall(r"tests/[\w/.]+", (ROOT / ".ci" / "run").read_text())
+    assert len(paths) > 5 and [path for path in paths if not (ROOT / path).exists()] == []
 
 
 @pytest.mark.parametrize("place", range(2))
