@@ -15,10 +15,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.hints import nearest
 from bench.rows import LABEL, ROWS, register_resolvers
+from bench.tables import CONF as CONF
+from bench.tables import LOOK, choice, names, register_rows
 from bench.targets import LEAVE, find_class
 from datasets.dataset import SPLIT_STRIDE, Split
 
-CONF = Path(__file__).resolve().parent.parent / "conf"
 LEAST = {
     "seed": 0,
     "index": 0,
@@ -32,7 +33,7 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-RESERVED = ("_target_", LEAVE, "_prior_", "_field_", LABEL, ROWS)  # of a node; its other keys are arguments
+RESERVED = ("_target_", LEAVE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
 
 
 class Device(StrEnum):
@@ -118,9 +119,17 @@ class Config:
     verbose: bool = MISSING
 
 
-def register() -> None:
-    """Makes the schema known to Hydra, under the name that conf/config.yaml uses, and what its values may ask for."""
+def register(*folders: Path) -> None:
+    """Makes known to Hydra the schema that conf/config.yaml uses, the rows of tables, and what values may ask for.
+
+    Args:
+        folders: of the user's, whose tables have more rows.
+
+    Raises:
+        ValueError: for a table that cannot be read.
+    """
     ConfigStore.instance().store(name="schema", node=Config)
+    register_rows(folders)
     register_resolvers()
 
 
@@ -258,27 +267,23 @@ def _argument_names(cls: type) -> list[str] | None:
 
 
 def load(group: str, name: str, **arguments: Any) -> Any:
-    """The object of conf/GROUP/NAME.yaml, for use as a library: `load("renderer", "dist", steps=100)`.
+    """The object of a file or row of conf, for use as a library: `load("renderer", "dist", steps=100)`.
 
     Raises:
         ValueError: for an unknown group or name, an unknown key or a value of the wrong type.
     """
-    path = CONF / group / f"{name}.yaml"
-    if not path.is_file():
-        known = [file.stem for file in (CONF / group).glob("*.yaml")]
-        raise ValueError(f"unknown {group} {name!r}{nearest(name, known)}")
-    node = cast(DictConfig, OmegaConf.merge(_with_defaults(path), arguments))
+    if name not in names(group):
+        raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
+    node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
     node.pop(LEAVE, None)
     return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # who names a class in Python trusts it
 
 
-def _with_defaults(path: Path) -> DictConfig:
-    """What a YAML holds, over the files of its own group that its `defaults` name, in their order, as Hydra has it."""
-    node = cast(DictConfig, OmegaConf.load(path))
-    bases = [str(base) for base in node.pop("defaults", [])]
-    order = bases if SELF in bases else [SELF, *bases]
-    parts = [node if base == SELF else _with_defaults(path.with_name(f"{base}.yaml")) for base in order]
-    return cast(DictConfig, OmegaConf.merge(*parts))
+def _with_defaults(group: str, name: str) -> DictConfig:
+    """What a choice holds, over those of its own group that its `defaults` name, in their order, as Hydra has it."""
+    node = OmegaConf.create(choice(group, name))
+    bases = [str(base) for base in node.pop("defaults", [SELF])]
+    return cast(DictConfig, OmegaConf.merge(*(node if base == SELF else _with_defaults(group, base) for base in bases)))
 
 
 def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | list[str]) -> Any:

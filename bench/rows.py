@@ -1,11 +1,10 @@
 """The rows of experiments: which renderers and methods a sweep is over, and the settings that a method may draw.
 
-A file of the group `renderer` may have two keys that are no arguments: `_rows_` maps an experiment to the place of the
-renderer's row in its table, and `_label_` names the row. A file without `_rows_` has a row in every such experiment,
-after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`. The files are those of conf/renderer and of
-the user's `--config-dir`.
+A renderer, a file or a row of a table, may have keys that are no arguments: `_rows_` maps an experiment to the place of
+the renderer's row in its table, and `_label_` names the row. A renderer without `_rows_` has a row in every such
+experiment, after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`.
 
-A file of `conf/method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
+A choice of `method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
 that dimension, of the Sobol point whose number is `draw`. An experiment sweeps over `+method: ${methods:space}`.
 """
 
@@ -18,7 +17,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from bench.tables import LOOK, SPACE, TUNED, Node, read_rows, read_yaml
+
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
+MISSING = "???"
 DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
 SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
 
@@ -33,27 +35,24 @@ def register_resolvers() -> None:
 
 
 def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[str, Any]:
-    """A resolved `renderer` node without `_rows_`, and without a `_label_` inherited from a file that it builds on.
+    """A resolved `renderer` node without `_rows_`, its look, and a `_label_` inherited from what it builds on.
 
     Args:
         renderer: the node.
-        choice: the name of its file.
+        choice: the name of its file or row.
         runtime: `hydra.runtime`, which has the folders of configurations.
     """
-    path = _renderers(runtime).get(choice)
-    file = OmegaConf.create() if path is None else _loaded(path)
-    inherits = "defaults" in file and LABEL not in file
-    dropped = {ROWS, LABEL} if inherits else {ROWS}
+    own = _choices("renderer", runtime).get(choice, {})
+    dropped = {ROWS, LOOK, LABEL} if "defaults" in own and LABEL not in own else {ROWS, LOOK}
     return {key: value for key, value in renderer.items() if key not in dropped}
 
 
 def renderers_of(experiment: str, runtime: DictConfig) -> list[str]:
     """The renderers that have a row in an experiment, in the order of their places, then by name."""
     places = {}
-    for name, path in _renderers(runtime).items():
-        file = _loaded(path)
-        place = file.get(ROWS, {experiment: inf}).get(experiment)
-        if place is not None and not OmegaConf.is_missing(file, "_target_"):  # custom: its class is on the command line
+    for name, own in _choices("renderer", runtime).items():
+        place = own.get(ROWS, {experiment: inf}).get(experiment)
+        if place is not None and own.get("_target_") != MISSING:  # custom: its class is on the command line
             places[name] = place
     return sorted(places, key=lambda name: (places[name], name))
 
@@ -68,7 +67,7 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
 def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     """The methods with a search space, to be swept over: of the kind `space` the spaces.
 
-    Of the kind `tuned`, the settings that have been written to the folder of that name, each behind its method.
+    Of the kind `tuned`, the settings that have been written for them, each behind its method.
 
     Args:
         without: names of methods that are left out.
@@ -78,13 +77,13 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     """
     if kind not in ("space", "tuned"):
         raise ValueError(f"${{methods:KIND}} has the kinds space and tuned, not {kind!r}")
-    folders = [folder / "method" for folder in _folders(_root_.hydra.runtime)]
-    names = sorted({path.stem for folder in folders for path in (folder / "space").glob("*.yaml")})
-    if unknown := {*without} - {*names}:
+    spaces, tuned = (_choices(group, _root_.hydra.runtime) for group in (SPACE, TUNED))
+    if unknown := {*without} - {*spaces}:
         raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
-    names = [name for name in names if name not in without]
-    written = [name for name in names if any((folder / kind / f"{name}.yaml").is_file() for folder in folders)]
-    return ",".join(part for name in written for part in (*((name,) if kind == "tuned" else ()), f"{kind}/{name}"))
+    kept = [name for name in sorted(spaces) if name not in without]
+    if kind == "space":
+        return ",".join(f"space/{name}" for name in kept)
+    return ",".join(f"{name},tuned/{name}" for name in kept if name in tuned)
 
 
 def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
@@ -112,21 +111,15 @@ def sobol_points() -> list[list[float]]:
     return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS).tolist()
 
 
-def _renderers(runtime: DictConfig) -> dict[str, Path]:
-    """The files of the group `renderer` by name; of two with the same name, the one that Hydra takes."""
-    paths: dict[str, Path] = {}
-    for folder in _folders(runtime):
-        for path in sorted((folder / "renderer").glob("*.yaml")):
-            paths.setdefault(path.stem, path)
-    return paths
-
-
-def _loaded(path: Path) -> DictConfig:
-    """The content of a file, without the files that it builds on."""
-    node = OmegaConf.load(path)
-    if not isinstance(node, DictConfig):
-        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
-    return node
+def _choices(group: str, runtime: DictConfig) -> dict[str, Node]:
+    """What each file or row of a group holds by itself; of two with the same name, the one that Hydra takes."""
+    folders, found = [*_folders(runtime)], dict[str, Node]()
+    for folder in folders:
+        for path in sorted((folder / group).glob("*.yaml")):
+            found.setdefault(path.stem, read_yaml(path))
+    for folder in reversed(folders):
+        found = read_rows(folder)[group] | found
+    return found
 
 
 def _folders(runtime: DictConfig) -> Iterator[Path]:

@@ -1,9 +1,9 @@
 """The style of all pictures and figures: width, type size, and each preset's colour, marker and line."""
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from numbers import Real
 from typing import Any
 from zlib import crc32
@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter
+
+from bench.tables import look_of
 
 WIDTH = 7.0  # inches: two columns of a paper
 RC = {
@@ -54,99 +56,24 @@ class Look:
 
     colour: str
     marker: str
-    line: Any = "-"
+    line: str = "-"
 
 
-_DIST, _DVR, _IDR, _NAIVE = Look("#0072b2", "s"), Look("#d1495b", "^"), Look("#6a3d9a", "D"), Look("#111111", "o")
-_LIGHT_DIST, _NAIVE_OF_METHODS = Look("#56b4e9", "o", "--"), Look("#111111", "<", "-.")
-_PAPER_DIST, _PAPER_DIST_DEPTH = Look("#5b4a3f", "p"), Look("#b39c8a", "h", "--")
-_OFFICIAL_DIST = Look("#2f9e9e", "<", "-.")
-_MESH = Look("#8a8a8a", "d", "-.")
-_NEWTON, _NEUS, _NEUS_BUDGET = Look("#1b9e77", "h", (0, (1, 1))), Look("#e7298a", ">"), Look("#f59cc6", ">", "--")
-_VOLSDF, _UNISURF = Look("#e69f00", "P"), Look("#7a4a00", "X", "-.")
-_RELAXED_BOUNDARY, _RANGE_ANALYSIS = Look("#66a61e", "*"), Look("#2f6f8f", "8", "--")
-# By preset: a file of conf/renderer, or of conf/method where it has not its renderer's. For others see `look`.
-KNOWN = {
-    "naive": _NAIVE,
-    "naive_serial": _NAIVE,
-    "naive_practical": Look("#8a8a8a", "s", "--"),
-    "naive_practical_parallel": Look("#e69f00", "^"),
-    "naive_parallel": Look("#5b4a3f", "p", "--"),
-    "dist": _DIST,
-    "dist_paper": _PAPER_DIST,
-    "dist_dynamic": Look("#56b4e9", "v", "--"),
-    "dist_aggressive": Look("#d55e00", "D"),
-    "dist_coarse_to_fine": Look("#009e73", "P"),
-    "dist_coarse_to_fine_100": Look("#cc79a7", "X", "--"),
-    "dist_capped": Look("#f0a35e", "d", "--"),
-    "dist_step_back": Look("#8b2252", "v", "-."),
-    "dist_step_floor": Look("#b8860b", "<", "--"),
-    "dist_slope_bound": Look("#66a61e", ">", "-."),
-    "dist_keinert": Look("#a6761d", "8", (0, (3, 1, 1, 1))),
-    "dist_auto_relaxed": Look("#17becf", "H", ":"),
-    "dist_official_clamp": _OFFICIAL_DIST,
-    "dist_official": _OFFICIAL_DIST,
-    "dvr": _DVR,
-    "dvr_64": _DVR,
-    "dvr_64_early_stop": _DVR,
-    "dvr_official_slope": Look("#e7a1ab", "^", "--"),
-    "idr": _IDR,
-    "newton": _NEWTON,
-    "neus": _NEUS,
-    "neus_budget": _NEUS_BUDGET,
-    "volsdf": _VOLSDF,
-    "volsdf_budget": _VOLSDF,
-    "unisurf": _UNISURF,
-    "relaxed_boundary": _RELAXED_BOUNDARY,
-    "range_analysis": _RANGE_ANALYSIS,
-    "mesh_proxy": _MESH,
-    "deepsdf": Look("#009e73", "P", "-."),
-    "dist_depth": _LIGHT_DIST,
-    "dist_mask_paper": _PAPER_DIST,
-    "dist_depth_paper": _PAPER_DIST_DEPTH,
-    "dist_mask_official": _OFFICIAL_DIST,
-    "naive_mask": _NAIVE_OF_METHODS,
-    "mesh_mask": _MESH,
-    "multiview_dist": _LIGHT_DIST,
-    "multiview_restarts": _DIST,
-    "multiview_paper": _PAPER_DIST_DEPTH,
-    "multiview_naive": _NAIVE_OF_METHODS,
-    "multiview_mesh": _MESH,
-    "rgbd_newton": Look("#0b5e45", "H"),
-    "rgb_naive": _NAIVE_OF_METHODS,
-    "rgbd_dvr": Look("#8b1e3f", "v"),
-    "dvr_paper": Look("#e7a1ab", "^", "--"),
-    "dvr_paper_depth": Look("#b56576", "v", "--"),
-    "hull": Look("#8a8a8a", "s", "--"),
-    "poisson": Look("#e69f00", "d"),
-    "poisson_5": Look("#b36b00", "d", "--"),
-    "poisson_7": Look("#7a4a00", "d", "-."),
-    "stereo": Look("#66a61e", ">"),
-    "stereo_5": Look("#3f6d10", ">", "--"),
-    "pose_dist": _LIGHT_DIST,
-    "pose_dist_starts": _DIST,
-    "single_view_by_neus": _NEUS_BUDGET,
-    "pose_icp_point": Look("#8fbc5a", "v", "--"),
-    "pose_icp_plane": Look("#e69f00", "d", "--"),
-    "pose_icp_plane_starts": Look("#b36b00", "P", "-."),
-}
-OF_METHOD = re.compile(r"^(multiview|rgb|pose|single_view_by)_|_mask$")  # what a method's name adds to its renderer's
 _COLOURS = (
     *("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#b8860b", "#8b2252", "#2f6f8f", "#556b2f", "#c04000"),
 )
 _MARKERS = ("<", ">", "p", "h", "*", "d", "8")
-_LINES = ("-", "--", "-.", (0, (1, 1)))
+_LINES = ("-", "--", "-.", ":")
 
 
+@cache
 def look(preset: str) -> Look:
-    """The look of a row, which depends on its preset alone, so that it is the same in every figure and report."""
-    for name in (preset, OF_METHOD.sub("", preset)):
-        if name in KNOWN:
-            return KNOWN[name]
+    """The look of a row by its preset, the same in every figure: `_look_` of its renderer, its method, or drawn."""
     drawn = crc32(preset.encode("utf-8", "backslashreplace"))
-    picks = ((drawn >> shift) % len(choices) for shift, choices in ((0, _COLOURS), (8, _MARKERS), (16, _LINES)))
-    colour, marker, line = picks
-    return Look(_COLOURS[colour], _MARKERS[marker], _LINES[line])
+    choices = {"colour": (_COLOURS, 0), "marker": (_MARKERS, 8), "line": (_LINES, 16)}
+    picks = {key: names[(drawn >> shift) % len(names)] for key, (names, shift) in choices.items()}
+    known = look_of(preset)
+    return Look(**picks | ({"line": "-"} if known else {}) | known)
 
 
 def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:

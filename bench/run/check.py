@@ -14,9 +14,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import Isolation, build, built_once, check_top_level, register
+from bench.config import Isolation, build, built_once, check_top_level
 from bench.records.folder import Identity
 from bench.records.read import Plan, PlannedCell
+from bench.rows import register_resolvers
 from bench.run.process import BOOT, RunLimits, fork_server, raise_if_stopped, signals_delayed
 from bench.targets import OURS
 
@@ -139,7 +140,7 @@ def _answer(configs: list[Config], channel: Connection) -> None:
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)
-    register()
+    register_resolvers()
     with suppress(BrokenPipeError):
         for reason in _reasons(configs):
             channel.send(reason)

@@ -22,6 +22,7 @@ from bench.run.check import check_apart
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
+from bench.tables import names
 from bench.targets import check_targets
 from datasets.extras import install
 
@@ -43,7 +44,6 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
     Returns:
         the exit status: 0, or the status of a mistake that was told on standard error.
     """
-    register()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
     begun: list[DictConfig] = []
     raised: list[OSError | ValueError] = []
@@ -62,6 +62,7 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         sys.argv[1:] = options_first(sys.argv[1:])
+        register(*own_folders(sys.argv[1:]))
         _call(program)
         if raised:
             raise raised[0]
@@ -107,6 +108,12 @@ def options_first(arguments: list[str]) -> list[str]:
         if given and "=" not in word:
             options.append(rest.pop(0))
     return [*options, *others]
+
+
+def own_folders(arguments: list[str]) -> list[Path]:
+    """The folder of configurations that a command adds, which may have tables."""
+    folder = get_args_parser().parse_known_args(arguments)[0].config_dir
+    return [Path(folder)] if folder else []
 
 
 def unwritten(error: OSError) -> str:
@@ -165,7 +172,7 @@ def _explain(error: Exception) -> str:
     message = " ".join(str(error).split())
     if isinstance(error, ConfigCompositionException):
         if found := re.search(r"Could not override '([^']+)'", message):
-            if (CONF / found[1]).is_dir():
+            if names(found[1]):
                 return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
             return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
@@ -184,7 +191,7 @@ def _unreadable(override: str) -> str:
 
 
 def _choices(group: str) -> list[str]:
-    return [path.stem for path in (CONF / group).glob("[!_]*.yaml")]
+    return [name for name in names(group) if not name.startswith("_")]
 
 
 def _known_keys() -> list[str]:

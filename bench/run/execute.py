@@ -15,11 +15,12 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from bench.config import build, check_top_level, register
+from bench.config import build, check_top_level
 from bench.machine import environment
 from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
+from bench.rows import register_resolvers
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, RunInputs, set_up
 from bench.solve.problem import Unsupported
@@ -41,7 +42,7 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     signal.signal(signal.SIGTERM, _stop)
     _die_with(parent)
     _print_to(job.folder / "log.txt")
-    register()  # the configuration may have to be resolved here
+    register_resolvers()  # the configuration may have to be resolved here
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:

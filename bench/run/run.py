@@ -11,12 +11,13 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import Isolation, build, register
+from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, identify, release, reusable
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus, now, read_record
+from bench.rows import register_resolvers
 from bench.run.check import needed, refusals, warm_up
 from bench.run.command import unwritten
 from bench.run.plan import show_plan
@@ -60,7 +61,7 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
         Interrupted: after Ctrl-C or SIGTERM.
         ValueError: where a single run's configuration cannot be run; its folder is removed.
     """
-    register()  # again, since a launcher's worker has not read the command line
+    register_resolvers()  # again, since a launcher's worker has not read the command line
     _stay_in_place(config)
     single = OmegaConf.is_missing(HydraConfig.get().job, "num")
     if single and (config.plan or config.isolation == Isolation.process):  # a sweep's cells were checked before
