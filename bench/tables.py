@@ -66,11 +66,12 @@ def names(group: str) -> list[str]:
 
 
 def choice(group: str, name: str) -> Node:
-    """What a file or a row of conf holds, without what it builds on.
+    """What a file or a row of conf holds, without what it builds on; a method may be `tuned/NAME` or `space/NAME`.
 
     Raises:
         KeyError: where there is no such choice.
     """
+    group, _, name = f"{group}/{name}".rpartition("/")
     path = CONF / group / f"{name}.yaml"
     return read_yaml(path) if path.is_file() else read_rows(CONF).get(group, {})[name]
 
@@ -131,7 +132,7 @@ def _look(group: str, name: str) -> Node:
     own, found = choice(group, name), dict[str, Any]()
     for base in own.get("defaults", ()):
         if isinstance(base, str) and base != "_self_":
-            found |= _look(group, base)
+            found |= _look(group, base.removeprefix(f"/{group}/"))
         elif renderer := isinstance(base, dict) and base.get("override /renderer"):
             found |= _look("renderer", renderer)
     return found | own.get(LOOK, {})

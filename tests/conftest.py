@@ -129,20 +129,9 @@ def asked_once() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def compose_config() -> Callable:
     """Composes a configuration as the command line does, from overrides."""
-    from hydra import compose, initialize_config_dir
+    from tests.composing import composed
 
-    from bench.config import CONF, register
-
-    done = {}
-
-    def composed(*overrides: str):
-        if overrides not in done:
-            register()
-            with initialize_config_dir(str(CONF), version_base="1.3"):
-                done[overrides] = compose("config", overrides=list(overrides))
-        return deepcopy(done[overrides])
-
-    return composed
+    return lambda *overrides: deepcopy(composed(*overrides))
 
 
 @pytest.fixture

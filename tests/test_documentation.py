@@ -16,6 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 import bench
+from bench import tables
 from bench.config import CONF, build, check_names, register
 from bench.report import pages
 from bench.report.__main__ import main as report
@@ -273,6 +274,6 @@ SETTINGS_OF_SPEED = re.compile(r"(dist_alpha|dist_epsilon|dist_steps|dvr_fixed)_
 
 @pytest.mark.parametrize("group", ["renderer", "experiment"])
 def test_the_page_of_choices_names_every_file(group):
-    names = {path.stem for path in (ROOT / "conf" / group).glob("[!_]*.yaml")}
+    names = {name for name in tables.names(group) if not name.startswith("_")}
     said = set(re.findall(r"`([a-z0-9_]+)`", text_of("conf/README.md")))
     assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= said

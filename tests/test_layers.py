@@ -24,9 +24,9 @@ FORBIDDEN = {  # what the modules of a package may not import
 }
 # The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
 ROOMS = (
-    "hints", "rows", "targets", "config", "progress", "records", "machine", "trackers", "shape_prior", "setup",
-    "evaluate", "pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks", "run",
-    "report", "studies",
+    "hints", "tables", "rows", "targets", "config", "progress", "records", "machine", "trackers", "shape_prior",
+    "setup", "evaluate", "pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
+    "run", "report", "studies",
 )  # fmt: skip
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts

@@ -60,7 +60,7 @@ class Record:
     dataset: str
     seed: int | None
     config: dict[str, Any]
-    method: str = ""  # the chosen file of conf/method; empty where none was chosen
+    method: str = ""  # the chosen method; empty where none was chosen
     scene: str = ""
     started: str = field(default_factory=now)
     status: RunStatus | str = RunStatus.KILLED

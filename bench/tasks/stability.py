@@ -62,7 +62,7 @@ class Stability:
 
     def __post_init__(self) -> None:
         if self.stress is None:
-            raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stress")
+            raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stresses.yaml")
         check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
 
     def execute(self, run: RunContext) -> None:

@@ -33,7 +33,8 @@ from bench.tables import read_yaml
 
 SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS)}
 SHARED = "_one_loss"  # the row with the setting that all methods share
-HEAD = "# Settings of methods, chosen on validation shapes. `python -m bench.tune --into conf/tuned.yaml` writes it: do not edit.\n"
+HEAD = "# Settings of methods, chosen on validation shapes. Written by `python -m bench.tune`; do not edit.\n"
+WIDTH = 118  # of its lines
 CHOSEN = (
     "draw {draw} of {draws} of {space}: geometric mean of Chamfer x 1000 {over} at scale={scale} of {families}{loss}: "
     "{best}, of the median draw {middle}; runs of commit {commit}"
@@ -72,7 +73,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     new = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment) for m in found]
     rows = (read_yaml(path) if path.is_file() else {}) | {row: said | settings for row, said, settings in new}
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, HEAD + yaml.safe_dump(rows, sort_keys=False, width=118))
+    write_text(path, HEAD + yaml.safe_dump(rows, sort_keys=False, width=WIDTH))
     told = {row: ", ".join(f"{key} {number(value)}" for key, value in settings.items()) for row, _, settings in new}
     return left_out(experiment, found) + [f"{path}: {row}: {text}" for row, text in told.items()]
 
@@ -119,8 +120,8 @@ def main(arguments: list[str]) -> int:
     kind = "which sweep is read; of tuning_one_loss one row is written for all methods"
     parser.add_argument("--experiment", choices=SELECTIONS, default=TUNING.experiment, help=kind)
     parser.add_argument("--results", type=Path, default=Path("results"), metavar="FOLDER", help="results folder")
-    table = "the table: conf/tuned.yaml to use its rows as +method=tuned/NAME; without it, RESULTS/tuned.yaml"
-    parser.add_argument("--into", type=Path, metavar="FILE", help=table)
+    into = "the table: conf/tuned.yaml to use its rows as +method=tuned/NAME; without it, RESULTS/tuned.yaml"
+    parser.add_argument("--into", type=Path, metavar="FILE", help=into)
     options = parser.parse_args(arguments)
     try:
         print(

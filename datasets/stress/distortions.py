@@ -1,7 +1,8 @@
 """Distortions of a cube's distance, as by a network, quantisation or an error. All still claim to be distances.
 
-A distortion takes the cube, a severity in the units of conf/stress, and a random generator. Some move the surface: they
-give the moved one, solved in float64, so that a renderer is judged by the surface of the field that it was given.
+A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. Some move the
+surface: they give the moved one, solved in float64, so that a renderer is judged by the surface of the field that it
+was given.
 """
 
 from collections.abc import Callable

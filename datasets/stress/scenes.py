@@ -1,6 +1,6 @@
 """Scenes of growing severity, from easy to impossible, in the unit sphere; each makes an Exam at a severity.
 
-Severities are in the units of conf/stress. Random turns and places depend on the generator alone, so that every
+Severities are in the units of conf/stresses.yaml. Random turns and places depend on the generator alone, so that every
 renderer gets the same exams.
 """
 

@@ -1,23 +1,26 @@
 """Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
 
-import re
 from dataclasses import fields, replace
 from functools import cache
+from typing import Any
 
 import pytest
 import trimesh
 import yaml
-from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, build, check_names, load, register
+from bench.config import CONF, build, check_names, load
 from bench.hints import nearest
+from bench.pictures.style import look
+from bench.run.sweep import combinations
+from bench.tables import GROUPS, choice, names, read_yaml
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
 from renderers import DIST, DVR, Naive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
+from tests.composing import composed
 from tests.made_scans import write_scans
 
 IDR_ARGUMENTS = {
@@ -28,10 +31,7 @@ IDR_ARGUMENTS = {
     "mask_weight": 100.0,
     "sphere_radius": 1.0,
 }
-NESTED = sorted(("method", f"{path.parent.name}/{path.stem}") for path in CONF.glob("method/*/*.yaml"))
-YAMLS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml")) + NESTED
-GROUPS = [each for each in YAMLS if each[0] != "experiment" and each != ("task", "_photographs")]  # others build on it
-EXPERIMENTS = [name for group, name in YAMLS if group == "experiment" and not name.startswith("_")]
+EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
 SINGLE = {"fitted"}  # of one run, and without a table or figure of its own
 # The table or figure of an experiment, where it has another name: one that joins several experiments.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
@@ -40,14 +40,32 @@ COMPARING = {"table1": 22, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 1
 COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
-CHOSEN = {"renderer", "dataset", "stress", "method", "silhouette"}  # groups that experiments sweep over
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
-# What a choice needs on the command line.
-NEEDS = {
-    "custom": ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items())),
-    "stability": ("stress=wires",),
-    **{name: ("draw=0",) for name in ("_drawn", *(name for _, name in NESTED if name.startswith("space/")))},
-}
+CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))
+
+
+def visible(group: str) -> list[str]:
+    """The choices of a group that are no mere base of others."""
+    return [name for name in names(group) if not name.startswith("_")]
+
+
+def together() -> list[dict[str, str]]:
+    """Choices of all groups, so that each stands in a composition, which takes a tenth of a second."""
+    stresses, tasks = visible("stress"), [name for name in visible("task") if name != "stability"]
+    stresses.remove("none")
+    judged = [("stability", stress) for stress in stresses] + [(task, "none") for task in tasks]
+    columns = {group: visible(group) for group in names_of_groups() if group not in ("task", "stress")}
+    count = max(len(judged), *map(len, columns.values()))
+    rows = [{group: column[at % len(column)] for group, column in columns.items()} for at in range(count)]
+    return [row | dict(zip(("task", "stress"), judged[at % len(judged)], strict=True)) for at, row in enumerate(rows)]
+
+
+def names_of_groups() -> tuple[str, ...]:
+    return ("task", "renderer", "dataset", "silhouette", "stress", "supervision", "prior", "scale", "tracker")
+
+
+TOGETHER = together()
+METHODS = [*visible("method"), *(f"{kind}/{name}" for kind in ("space", "tuned") for name in visible(f"method/{kind}"))]
 
 
 @pytest.fixture(scope="session")
@@ -59,35 +77,12 @@ def paths(tmp_path_factory) -> dict[str, str]:
 
 
 @cache
-def composed_with_hydra(*overrides: str) -> DictConfig:
-    """The configuration with Hydra's own node, which says what an experiment sweeps over: only to be read."""
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides), return_hydra_config=True)
-
-
-def swept(name: str) -> dict[str, str]:
-    """What an experiment sweeps over at desk scale."""
-    params = composed_with_hydra(f"+experiment={name}").hydra.sweeper.get("params") or {}
-    return {key: str(values) for key, values in params.items()}
-
-
-def values_of(key: str, values: str) -> list[str]:
-    """The values of a swept key, in its own words, by a range or by a glob over its group."""
-    if found := re.fullmatch(r"range\((\d+),(\d+)\)", values):
-        return [str(value) for value in range(*map(int, found.groups()))]
-    if not values.startswith("glob(*"):
-        parsed = OverridesParser.create().parse_override(f"{key}={values}")
-        return list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [values]
-    return sorted(n for group, n in YAMLS if group == key.removeprefix("+") and f"exclude={n}" not in values)
-
-
-SWEEPS = [
-    (name, f"{key}={value}")
-    for name in EXPERIMENTS
-    for key, values in swept(name).items()
-    for value in values_of(key, values)
-]
+def cells(name: str) -> list[list[str]]:
+    """The first and the last cell of an experiment at desk scale, as overrides."""
+    params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
+    with initialize_config_dir(str(CONF), version_base="1.3"):  # a glob asks for the choices of its group
+        swept = combinations([f"{key}={values}" for key, values in params.items()])
+    return [swept[0], swept[-1]]
 
 
 def build_part(config: DictConfig, part: str):
@@ -95,20 +90,24 @@ def build_part(config: DictConfig, part: str):
 
 
 def test_no_yaml_lies_where_it_is_not_looked_for():
-    assert {path.relative_to(CONF) for path in CONF.rglob("*.yaml")} == {
-        path.relative_to(CONF)
-        for folder in (".", "*", "hydra/launcher", "method/space", "method/tuned")
-        for path in CONF.glob(f"{folder}/*.yaml")
-    }
-    assert [path.name for path in CONF.glob("*.yaml")] == ["config.yaml"]
-    chosen = {"task", "renderer", "dataset", "prior", "scale", "silhouette", "stress", "supervision", "tracker"}
-    assert {group for group, _ in YAMLS} == {*chosen, "experiment", "method"}
+    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", *GROUPS}
+    folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
+    files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
+    assert folders <= files | {*GROUPS.values(), "method/space"}
 
 
 def test_no_yaml_sets_the_mode_of_hydra():
-    assert composed_with_hydra().hydra.mode is None  # the fixture `asked_once` of the tests says so to Hydra
+    assert composed(hydra=True).hydra.mode is None  # the fixture `asked_once` of the tests says so to Hydra
     for path in CONF.rglob("*.yaml"):
-        assert OmegaConf.select(OmegaConf.load(path), "hydra.mode") is None, path
+        assert "mode" not in (read_yaml(path).get("hydra") or {}), path
+
+
+@pytest.mark.parametrize("table", GROUPS)
+def test_a_table_has_no_row_twice_and_no_text_that_should_be_a_number(table):
+    """Which plain YAML does not tell: of two rows it takes the last, and 1e-3 is a text to it."""
+    strict = OmegaConf.to_container(OmegaConf.load(CONF / f"{table}.yaml"), resolve=False)
+    assert strict == read_yaml(CONF / f"{table}.yaml")
+    assert not {path.stem for path in (CONF / GROUPS[table]).glob("*.yaml")} & {*strict}
 
 
 def test_the_default_configuration_builds(compose_config):
@@ -119,77 +118,84 @@ def test_the_default_configuration_builds(compose_config):
     build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
 
 
-# The cells of the stability experiment are of all stresses but `none`.
-@pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in GROUPS if ("stability", f"{g}={n}") not in SWEEPS])
-def test_every_choice_composes_and_builds(compose_config, paths, group, name):
-    extra = [f"dataset.path={paths[name]}"] if group == "dataset" and name in paths else NEEDS.get(name, [])
-    new = "+" if group == "method" else ""  # none is chosen by default
-    config = compose_config(f"{new}{group}={name}", *extra)
+def builds(config: DictConfig) -> None:
+    """Asserts that all of a configuration resolves, and that its parts are what their places ask for."""
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    for part in PARTS:  # a scale is read by the others
-        build_part(config, part)
+    made = {part: build_part(config, part) for part in PARTS}  # a scale is read by the others
+    assert all(isinstance(made[part], kind) for part, kind in KINDS.items())
     build(config.view, "view", target="datasets.views.ViewSampler")
-    if group in KINDS:
-        assert isinstance(build_part(config, group), KINDS[group])
 
 
+def test_every_choice_is_in_a_composition():
+    for group in names_of_groups():
+        assert {row[group] for row in TOGETHER} == {*visible(group)}
+    assert len(METHODS) > 80 and len({row["renderer"] for row in TOGETHER}) > 50
+
+
+@pytest.mark.parametrize("row", TOGETHER, ids=lambda row: " ".join(row.values()))
+def test_every_choice_composes_and_builds(compose_config, paths, row):
+    needed = [f"dataset.path={path}" for name, path in paths.items() if name == row["dataset"]]
+    needed += CUSTOM if row["renderer"] == "custom" else ()
+    config = compose_config(*(f"{group}={name}" for group, name in row.items()), *needed)
+    builds(config)
+    if row["stress"] != "none":
+        assert build_part(config, "task").stress.scene == choice("stress", row["stress"])["scene"]
+    renderer = build_part(config, "renderer")
+    if row["renderer"] != "custom":
+        alone = load("renderer", row["renderer"])
+        steps = {name: getattr(renderer, name) for name in ("sharpening",) if hasattr(renderer, name)}  # the task's
+        assert replace(alone, **steps) == renderer
+    assert load("silhouette", row["silhouette"]) == build_part(config, "silhouette")
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_composes_and_builds(compose_config, name):
+    builds(compose_config(f"+method={name}", *(["draw=0"] if name.startswith("space/") else [])))
+
+
+@pytest.mark.parametrize("place", [0, -1], ids=["first", "last"])
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes_and_builds(compose_config, paths, name):
-    asked = [f"dataset.path={paths[name]}"] if name in paths else []
-    for extra in (asked, ["scale=paper", "dataset=mesh", f"dataset.path={paths['mesh']}"]):
-        config = compose_config(f"+experiment={name}", *extra)
-        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        for part in PARTS:
-            build_part(config, part)
-        assert config.experiment == (None if name in SINGLE else JOINED.get(name, name))
+def test_the_first_and_last_cell_of_an_experiment_compose_and_build(compose_config, paths, name, place):
+    cell, asked = cells(name)[place], [f"dataset.path={paths[name]}"] if name in paths else []
+    if place and not any(text.startswith("dataset=") for text in cell):
+        asked = ["scale=paper", "dataset=mesh", f"dataset.path={paths['mesh']}"]
+    config = compose_config(*cell, f"+experiment={name}", *asked)
+    builds(config)
+    assert config.experiment == (None if name in SINGLE else JOINED.get(name, name))
+    for key, _, value in (text.removeprefix("+").partition("=") for text in cell):
+        if key in ("renderer", "method"):
+            brings_its_own(compose_config, cell, config, key, value)
+        elif key == "dataset":
+            assert config.dataset.name == value
+        elif key == "silhouette":
+            assert config.task.silhouette == choice("silhouette", value)
+        elif key != "stress":
+            found, asked = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
+            # Of a node, the rest of it stays.
+            assert asked.items() <= dict(found).items() if isinstance(asked, dict) else found == type(found)(value)
 
 
-@pytest.mark.parametrize(("name", "swept"), SWEEPS)
-def test_every_cell_of_an_experiment_composes_and_builds(compose_config, paths, name, swept):
-    rows = {key: value for experiment, cell in SWEEPS if experiment == name for key, _, value in [cell.partition("=")]}
-    method = [f"+method={rows['+method']}"] if "+method" in rows and not swept.startswith("+method") else []
-    draw = [f"draw={rows['draw']}"] if "draw" in rows else []
-    key, _, value = swept.removeprefix("+").partition("=")
-    chosen = [swept] if key in CHOSEN else []
-    asked = [f"dataset.path={paths[name]}"] if name in paths else []
-    config = compose_config(*method, *draw, *chosen, f"+experiment={name}", *asked)
-    if key not in CHOSEN:  # a value of a key that is there, which is cheaper to set than to compose
-        found = yaml.safe_load(value.replace(":", ": "))
-        OmegaConf.update(config, key, found, force_add=False)
-    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    for part in PARTS:
-        build_part(config, part)
-    assert config.experiment == JOINED.get(name, name)
-    if key == "dataset":
-        assert config.dataset.name == value
-    elif key == "stress":
-        assert build_part(config, "task").stress.scene == OmegaConf.load(CONF / f"stress/{value}.yaml").scene
-    elif key == "silhouette":
-        assert config.task.silhouette == OmegaConf.load(CONF / f"silhouette/{value}.yaml")
-    elif key in ("renderer", "method"):
-        scaled = {name: config.scale.reconstruction[name] for name in ("iterations", "dvr_doublings")}
-        sizes = [f"scale.reconstruction.{name}={value}" for name, value in scaled.items()]  # schedules follow these
-        if "fit" in config.task:  # of a stress
-            sizes += [f"task.optimiser.iterations={config.task.fit.iterations}"]
-        alone = compose_config(swept, *draw, *sizes)
-        assert config.label == alone.label
-        assert build_part(config, "renderer") == build_part(alone, "renderer")
-        if key == "method":
-            assert config.task._target_ == alone.task._target_
-            own = OmegaConf.load(CONF / f"method/{value}.yaml").get("view")
-            assert own is None or config.view.resolution == alone.view.resolution
-    else:
-        found = OmegaConf.select(config, key)
-        asked = yaml.safe_load(value.replace(":", ": "))
-        if isinstance(asked, dict):  # of a node; the rest of it stays
-            assert asked.items() <= dict(found).items()
-        else:
-            assert found == type(found)(value)
+def brings_its_own(compose_config, cell: list[str], config: DictConfig, key: str, value: str) -> None:
+    """Asserts that an experiment changes nothing that a renderer or a method sets."""
+    default = compose_config()
+    scaled = [f"scale.reconstruction.{name}" for name in ("iterations", "dvr_doublings")]  # schedules follow these
+    sizes = [name for name in scaled if OmegaConf.select(config, name) != OmegaConf.select(default, name)]
+    asked = [f"{name}={OmegaConf.select(config, name)}" for name in sizes]
+    asked += [f"scale={config.scale.name}"] if config.scale.name != "desk" else []
+    if "fit" in config.task:  # of a stress
+        asked += [f"task.optimiser.iterations={config.task.fit.iterations}"]
+    draw = [text for text in cell if text.startswith("draw=")]
+    alone = compose_config(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *asked)
+    assert config.label == alone.label
+    assert build_part(config, "renderer") == build_part(alone, "renderer")
+    if key == "method":
+        assert config.task._target_ == alone.task._target_
+        own = choice("method", value).get("view")
+        assert own is None or config.view.resolution == alone.view.resolution
 
 
-def test_every_sweep_is_of_more_than_one_cell_and_repeats_none():
-    assert {name for name, _ in SWEEPS} == {*EXPERIMENTS} - SINGLE
-    assert len(set(SWEEPS)) == len(SWEEPS)
+def test_every_sweep_is_of_more_than_one_cell():
+    assert {name for name in EXPERIMENTS if cells(name)[0] != cells(name)[1]} == {*EXPERIMENTS} - SINGLE
 
 
 PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2) and nothing of ours
@@ -224,7 +230,7 @@ def test_a_row_of_table_1_is_that_of_the_paper(compose_config, name):
 
 
 def test_table_1_begins_with_the_rows_of_the_paper():
-    assert [swept for name, swept in SWEEPS if name == "table1"][:7] == [f"renderer={name}" for name in TABLE1]
+    assert composed("+experiment=table1", hydra=True).hydra.sweeper.params.renderer.split(",")[:7] == [*TABLE1]
 
 
 def test_variants_of_our_own_are_what_they_are_called(compose_config):
@@ -253,35 +259,49 @@ def test_variants_of_our_own_are_what_they_are_called(compose_config):
     assert variant("dist_k_3") == ("DIST, K 3", replace(dist, n_gradient_samples=3))
 
 
-def own_yamls() -> dict[str, DictConfig]:
-    """What each renderer's own file holds, without what it builds on."""
-    files = {name: OmegaConf.load(CONF / f"renderer/{name}.yaml") for group, name in YAMLS if group == "renderer"}
-    return {name: file for name, file in files.items() if isinstance(file, DictConfig)}
-
-
 def test_every_renderer_has_a_label_of_its_own_and_says_where_it_has_a_row():
-    files = own_yamls()
-    del files["custom"]
-    labels = [file._label_ for file in files.values()]
+    own = [choice("renderer", name) for name in names("renderer") if name != "custom"]
+    labels = [node["_label_"] for node in own]
     assert len(set(labels)) == len(labels) >= 30
-    assert all("_rows_" in file for file in files.values())
-    places = [(experiment, place) for file in files.values() for experiment, place in file._rows_.items()]
+    places = [(experiment, place) for node in own for experiment, place in node["_rows_"].items()]
     assert len(set(places)) == len(places)
     assert {experiment for experiment, _ in places} == set(COMPARING)
 
 
 @pytest.mark.parametrize("name", COMPARING)
 def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_places(name):
-    files = own_yamls()
-    named = {file: node._rows_[name] for file, node in files.items() if name in node.get("_rows_", {})}
+    rows = {renderer: choice("renderer", renderer).get("_rows_", {}) for renderer in names("renderer")}
+    named = {renderer: places[name] for renderer, places in rows.items() if name in places}
     experiment = SHARED_ROWS.get(name, name)
-    params = composed_with_hydra(f"+experiment={experiment}").hydra.sweeper.params
-    assert params.renderer.split(",") == sorted(named, key=lambda file: named[file])
+    params = composed(f"+experiment={experiment}", hydra=True).hydra.sweeper.params
+    assert params.renderer.split(",") == sorted(named, key=lambda renderer: named[renderer])
     assert len(named) == COMPARING[name]
 
 
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour a class
+def test_rows_of_an_experiment_are_told_apart_and_a_renderer_keeps_its_colour(name):
+    params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
+    rows = str(params.get("+method") or params.get("renderer") or "").split(",")
+    alike = [row for row in rows if not row.startswith("tuned/")]  # drawn as their methods, hollow
+    assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)
+
+
+@pytest.mark.parametrize("name", [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))])
+def test_a_method_has_the_colour_of_its_renderer(name):
+    said = [base.get("override /renderer") for base in defaults_of(name) if isinstance(base, dict)]
+    renderers = [renderer for renderer in said if renderer]
+    assert not renderers or look(name).colour == look(renderers[-1]).colour
+
+
+def defaults_of(method: str) -> list[Any]:
+    """The `defaults` of a method, those of what it builds on before its own."""
+    own = choice("method", method).get("defaults", [])
+    bases = [base.removeprefix("/method/") for base in own if isinstance(base, str) and base != "_self_"]
+    return [each for base in bases for each in defaults_of(base)] + own
+
+
 def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():
-    params = composed_with_hydra("+experiment=speed_completion", "+method=dist_half").hydra.sweeper.params
+    params = composed("+experiment=speed_completion", "+method=dist_half", hydra=True).hydra.sweeper.params
     assert params.renderer == "dist"
 
 
@@ -335,12 +355,12 @@ def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_
     assert build_part(compose_config(*practical, "renderer.n_gradient_samples=2"), "renderer").n_gradient_samples == 2
 
 
-@pytest.mark.parametrize("name", [name for group, name in GROUPS if group == "renderer"])
+@pytest.mark.parametrize("name", ["dist", "dvr_64_early_stop", "neus_budget", "custom"])
 def test_a_renderer_loads_as_a_library_with_its_arguments_changed(compose_config, name):
     known = [field.name for field in fields(load("renderer", name))] if name != "custom" else ["steps"]
     number = next(one for one in ("steps", "n_ray_samples", "samples", "grid", "most_segments") if one in known)
     given = {"_target_": "renderers.IDR", **IDR_ARGUMENTS} if name == "custom" else {number: 7}
-    extra = NEEDS.get(name, [f"renderer.{number}=7"])
+    extra = CUSTOM if name == "custom" else [f"renderer.{number}=7"]
     found = load("renderer", name, **given)
     assert found == build_part(compose_config(f"renderer={name}", *extra), "renderer")
     assert getattr(found, number) == 7

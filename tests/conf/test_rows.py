@@ -16,6 +16,7 @@ from bench.records.read import read_records
 from bench.records.record import Record, row_name
 from bench.run import sweep
 from bench.run.command import command_line
+from bench.tables import names
 
 CLASS = (
     "class Mine:\n    def __init__(self, size):\n        self.size = size\n    def render(self, field, rays): ...\n"
@@ -23,10 +24,11 @@ CLASS = (
 )
 YAMLS = {
     "mine": "_target_: {package}.Mine\nsize: 3\n",
-    "mine_first": "defaults: [mine, _self_]\n_label_: Mine, first\n_rows_: {{table1: 0}}\nsize: 4\n",
+    "mine_first": "defaults: [mine, _self_]\n_label_: Mine, first\n_rows_: {{crossing: 0}}\nsize: 4\n",
     "mine_nowhere": "defaults: [mine, _self_]\n_rows_: {{}}\n",
     "mine_on_dist": "defaults: [dist, _self_]\nsteps: 7\n",
 }
+ROWS = "mine_on_keinert: {base: dist_keinert, _label_: 'Keinert, 1.1', _rows_: {crossing: 9}, alpha: 1.1}\n"
 
 
 @pytest.fixture
@@ -37,6 +39,7 @@ def package(tmp_path, monkeypatch) -> str:
     (tmp_path / "conf/renderer").mkdir(parents=True)
     for yaml, text in YAMLS.items():
         (tmp_path / f"conf/renderer/{yaml}.yaml").write_text(text.format(package=name))
+    (tmp_path / "conf/variants.yaml").write_text(ROWS)
     monkeypatch.syspath_prepend(tmp_path)
     return name
 
@@ -75,22 +78,14 @@ def rows(plan: sweep.Plan) -> list[str]:
     return list(dict.fromkeys(cell.renderer for cell in plan.cells))
 
 
-@pytest.mark.parametrize(
-    ("experiment", "ours"),
-    [("table1", 22), ("stability", 21), ("speed_completion", 30), ("speed_rendering", 30), ("crossing", 5)],
-)
-def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_renderers(
-    swept, tmp_path, package, experiment, ours
-):
-    few = {"stability": ["stress=thin_plate"], "table1": []}.get(experiment, ["dataset=sofa", "index=0"])
-    few += ["silhouette=hinge", "task.points=20"] if experiment == "crossing" else []
-    one_loss = ", DIST's mask loss" if experiment in ("stability", "speed_completion", "crossing") else ""
-    plan, _ = swept(f"+experiment={experiment}", *few, f"packages=[{package}]", folder=tmp_path / "conf")
-    first = ["mine_first"] if experiment == "table1" else []
-    found = rows(plan)
+def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderers(swept, tmp_path, package):
+    few = ["dataset=sofa", "index=0", "silhouette=hinge", "task.points=20"]
+    plan, _ = swept("+experiment=crossing", *few, f"packages=[{package}]", folder=tmp_path / "conf")
+    first, found, one_loss = ["mine_first"], rows(plan), ", DIST's mask loss"
     assert found[: len(first)] == first
     assert found[-2:] == ["mine", "mine_on_dist"]  # they say nothing of rows
-    assert len(found) == len(plan.cells) == len(first) + ours + 2
+    assert len(found) == len(plan.cells) == len(first) + 5 + 2 + 1
+    assert found[-3] == "mine_on_keinert"  # of its own table
     assert "custom" not in found and "mine_nowhere" not in found
     cells = {cell.renderer: cell for cell in plan.cells}
     assert row_name(cells["mine"].config, "mine") == "mine" + one_loss
@@ -100,17 +95,16 @@ def test_a_renderer_of_ones_own_has_a_row_in_every_experiment_that_compares_rend
     assert row_name(under_another, "dist") == "DIST, our default, IDR's mask loss"
     made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
     assert (type(made).__name__, made.size) == ("Mine", 3)
-    if experiment != "table1":
-        return
-    assert row_name(cells["mine_first"].config, "mine_first") == "Mine, first"
-    assert row_name(cells["dist_aggressive"].config, "dist_aggressive") == "+ aggressive"
+    assert row_name(cells["mine_first"].config, "mine_first") == "Mine, first" + one_loss
     assert cells["mine_first"].config["renderer"]["size"] == 4
+    assert cells["mine_on_keinert"].config["renderer"]["alpha"] == 1.1
+    assert row_name(cells["mine_on_keinert"].config, "mine_on_keinert") == "Keinert, 1.1" + one_loss
+    assert not any({"_rows_", "_look_"} & {*cell.config["renderer"]} for cell in plan.cells)
 
 
 def test_places_are_no_part_of_a_run(swept, tmp_path, package):
     fig4, own = ("+experiment=fig4", f"packages=[{package}]"), tmp_path / "conf/renderer/mine.yaml"
     plan, _ = swept(*fig4, folder=tmp_path / "conf")
-    assert not any("_rows_" in cell.config["renderer"] for cell in plan.cells)
     before = {cell.renderer: cell.id for cell in plan.cells}
     own.write_text(f"{own.read_text()}_rows_: {{fig4: 3.5}}\n")
     plan, _ = swept(*fig4, folder=tmp_path / "conf")
@@ -180,8 +174,42 @@ SPACE = "label: Mine\ntask:\n  silhouette_weight: ${drawn:0,1.0,100.0}\n"
 SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
 
 
+OWN_ROWS = {
+    "methods": "mine_row: {renderer: dist, label: Mine, space: {renderer.alpha: '${drawn:3,1.0,2.0}'}}\n",
+    "tuned": "mine_row: {base: /method/mine_row, label: 'Mine, tuned', renderer.alpha: 1.25}\n",
+}
+
+
+def test_methods_of_ones_own_may_be_rows_of_tables(swept, tmp_path):
+    (tmp_path / "own").mkdir()
+    for table, text in OWN_ROWS.items():
+        (tmp_path / f"own/{table}.yaml").write_text(text)
+    few = ("index=0", "dataset=sofa", "task.points=20")
+    plan, _ = swept("+experiment=tuned", *few, folder=tmp_path / "own")
+    tuned = {cell.method: cell.config["renderer"]["alpha"] for cell in plan.cells if "mine_row" in cell.method}
+    assert tuned == {"mine_row": 1.5, "tuned/mine_row": 1.25}
+    plan, _ = swept("+method=space/mine_row", "draw=3", folder=tmp_path / "own")
+    assert plan.cells[0].config["label"] == "Mine" and 1 < plan.cells[0].config["renderer"]["alpha"] < 2
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("mine: 3\n", r"variants\.yaml: mine must be a row, \{key: value\}, not 3"),
+        ("- mine\n", r"variants\.yaml must hold keys and values"),
+        ("mine: {a: 1\n", r"variants\.yaml cannot be read: while parsing"),
+    ],
+)
+def test_a_table_that_is_none_is_named(swept, tmp_path, capsys, text, told):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own/variants.yaml").write_text(text)
+    with pytest.raises(IndexError):  # there is no plan
+        swept("seed=0,1", folder=tmp_path / "own")
+    assert re.search(told, capsys.readouterr().err)
+
+
 def own_methods(folder: Path) -> None:
-    """Two methods with search spaces, of which one has been tuned."""
+    """Two methods with search spaces, of which one has been tuned, as files."""
     files = {"": "label: Mine\n", "space": SPACE, "tuned": "label: Mine, tuned\n"}
     for name, of in (("mine_mask", files), ("mine_untuned", {"": files[""], "space": SPACE})):
         for part, text in of.items():
@@ -193,7 +221,7 @@ def own_methods(folder: Path) -> None:
 def test_the_tuning_has_all_spaces_but_slow_ones_and_the_methods_that_were_tuned(swept, tmp_path):
     own_methods(tmp_path / "own")
     plan, _ = swept("+experiment=tuning", "draw=0", "split=test", folder=tmp_path / "own")
-    spaces = {path.stem for path in (CONF / "method/space").glob("*.yaml")}
+    spaces = {*names("method/space")}
     own = {"mine_mask", "mine_untuned"}
     assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in (spaces - SLOW) | own}
     plan, _ = swept("+experiment=tuned", "task.points=20", folder=tmp_path / "own")

@@ -6,27 +6,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from bench.config import CONF, build
+from bench.config import CONF, load
 from bench.records.files import digest
+from bench.tables import read_rows
 from datasets.dataset import SPLIT_STRIDE, Split, seed_of
 from datasets.families import BUILDERS, FAMILIES, HALF_GRID, Family, bounded
 from renderers.field import Kind, autograd_gradients
 from tests.looped import each
 
-NAMES = sorted(
-    path.stem for path in (CONF / "dataset").glob("*.yaml") if OmegaConf.load(path)._target_.endswith("Family")
-)
+NAMES = sorted(name for name in read_rows(CONF)["dataset"] if not name.startswith("_"))
 
 
-FAMILY = [replace(build(OmegaConf.load(CONF / "dataset" / f"{name}.yaml"), "dataset"), resolution=48) for name in NAMES]
+FAMILY = [replace(load("dataset", name), resolution=48) for name in NAMES]
 by_family = each("family", FAMILY)
 
 
 @pytest.fixture
 def sofa() -> Family:
-    return build(OmegaConf.load(CONF / "dataset" / "sofa.yaml"), "dataset")
+    return load("dataset", "sofa")
 
 
 def inside(family: Family, parameters: dict[str, float], points: torch.Tensor) -> torch.Tensor:
@@ -134,7 +132,7 @@ def test_a_steep_shear_makes_a_formula_a_level_set_until_it_is_divided(family):
 
 
 def test_the_shipped_formula_of_a_car_with_much_rake_is_a_bound():
-    car = build(OmegaConf.load(CONF / "dataset" / "car.yaml"), "dataset")
+    car = load("dataset", "car")
     raked = replace(car, ranges=car.ranges | {"rake": [0.69, 0.7]}, resolution=48)
     field = raked.formula(Split.TEST, 0)
     points = torch.empty(50_000, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
@@ -193,8 +191,7 @@ def test_shapes_that_leave_the_unit_sphere_are_refused(sofa):
 
 
 def test_a_range_may_be_given_in_whole_numbers():
-    node = OmegaConf.merge(OmegaConf.load(CONF / "dataset" / "sofa.yaml"), {"ranges": {"width": [1, 2]}})
-    assert build(node, "dataset").ranges["width"] == [1.0, 2.0]
+    assert load("dataset", "sofa", ranges={"width": [1, 2]}).ranges["width"] == [1.0, 2.0]
 
 
 def test_a_shape_that_fills_the_cube_is_refused(sofa):

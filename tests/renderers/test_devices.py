@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from bench.config import CONF, load
+from bench.config import load
+from bench.tables import choice, names
 from renderers.adaptive_samples import follow
 from renderers.camera import Camera
 from renderers.field import Field, Moved, steepest
@@ -16,8 +16,7 @@ from renderers.rendering import Observed, at_iteration
 from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
 
 CPU = torch.device("cpu")
-FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "renderer").glob("*.yaml"))}
-NAMES = [name for name, file in FILES.items() if "defaults" not in file and name != "custom"]
+NAMES = [name for name in names("renderer") if "defaults" not in choice("renderer", name) and name != "custom"]
 NAMES += ["naive_practical", "dist_slope_bound", "dist_dynamic", "dvr_early_stop"]  # variants with code of their own
 SILHOUETTES = (Own(), Hinge(5e-5, True, "violating"), CrossEntropy(50.0, 100.0), Occupancy(0.02, 3.0, 1.0, DEPTH))
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from bench.config import CONF, build
+from bench.config import build
+from bench.tables import choice, names
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
@@ -25,11 +25,10 @@ from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 PARTS = ("distance", "status", "points", "residual", "closest")
 
 
-FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "renderer").glob("*.yaml"))}
-VARIANTS = [name for name, file in FILES.items() if "defaults" in file]
+VARIANTS = [name for name in names("renderer") if "defaults" in choice("renderer", name)]
 
 
-@pytest.fixture(scope="module", params=[name for name in FILES if name not in VARIANTS])
+@pytest.fixture(scope="module", params=[name for name in names("renderer") if name not in VARIANTS])
 def renderer(request, compose_config) -> Renderer:
     changed = {
         "custom": [f"renderer._target_={request.config.getoption('--renderer')}"],

@@ -6,7 +6,8 @@ from typing import ClassVar
 import pytest
 import torch
 
-from bench.config import CONF, load
+from bench.config import load
+from bench.tables import names
 from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
@@ -81,7 +82,7 @@ def test_no_rays_cost_nothing(average):
     assert loss(ALL[:0], average=average, closest=CLOSEST[:0]).item() == 0
 
 
-LOSSES = sorted(path.stem for path in (CONF / "silhouette").glob("*.yaml"))
+LOSSES = names("silhouette")
 # Along z past a sphere of radius .5: through the middle, just inside of the edge, just outside, far outside, no sphere.
 HEIGHTS = torch.tensor([0.0, 0.495, 0.505, 0.9, 1.2], dtype=torch.float64)
 

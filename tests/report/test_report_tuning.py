@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
+import yaml
 
 from bench.records.read import read_records
 from bench.report.data import statistics
@@ -13,7 +13,8 @@ from bench.report.data.experiments import choose
 from bench.report.data.subjects.tuning import TUNING, tunings
 from bench.report.pages.completion import tuned as tuned_page
 from bench.report.pages.completion import tuning
-from bench.tune.__main__ import main, write
+from bench.tables import CONF, read_rows, read_yaml
+from bench.tune.__main__ import HEAD, WIDTH, main, write
 from tests.report.test_report_paper import told, write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
@@ -109,9 +110,9 @@ def test_runs_that_have_not_ended_are_missing_and_not_failed(tmp_path, capsys):
     (method,) = tunings(read(tmp_path))
     assert method.draws == [0, 2, 3] and method.draws[method.best] == 3
     assert "1 planned runs have not ended" in told(tuning.make(read(tmp_path)))
-    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 1
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned.yaml")]) == 1
     assert "1 runs of the tuning have not ended" in capsys.readouterr().err
-    assert not (tmp_path / "tuned").exists()
+    assert not (tmp_path / "tuned.yaml").exists()
 
 
 def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path):
@@ -131,47 +132,57 @@ def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path
     assert compared == f"{second.label} over {first.label}: {ten} times the error from one draw, {ten} of 2."
 
 
-def test_the_best_is_written_as_a_method_over_its_default(tmp_path, capsys):
+def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
     drawn(tmp_path)
-    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned")]) == 0
-    path = tmp_path / "tuned" / "dist_mask.yaml"
-    assert f"{path}: " in capsys.readouterr().out
-    text = path.read_text()
-    assert text.startswith("# @package _global_\n# Draw 1 of 4 of method/space/dist_mask: geometric mean")
-    assert "6 validation runs\n# at scale=desk of sofa: 1.00, of the median draw 2.45" in text
-    node = OmegaConf.load(path)
-    assert node.defaults == ["/method/dist_mask", "_self_"]
-    assert (node.label, node.task.optimiser.learning_rate, node.renderer.steps) == ("DIST with mask, tuned", 0.01, 11)
-    assert set(node) == {"defaults", "label", "task", "renderer"}
+    path = tmp_path / "own/tuned.yaml"
+    path.parent.mkdir()
+    path.write_text("mine_mask: {label: Mine}\ndist_mask: {label: of before}\n")
+    assert main(["--results", str(tmp_path), "--into", str(path)]) == 0
+    assert f"{path}: dist_mask: " in capsys.readouterr().out
+    rows = read_yaml(path)
+    assert rows["mine_mask"] == {"label": "Mine"}
+    row = rows["dist_mask"]
+    assert "draw 1 of 4 of space/dist_mask: geometric mean" in row["chosen"]
+    assert "6 validation runs at scale=desk of sofa: 1.00, of the median draw 2.45" in row["chosen"]
+    node = read_rows(path.parent)["method/tuned"]["dist_mask"]
+    assert node.pop("defaults") == ["/method/dist_mask", "_self_"]
+    assert (node["label"], node["task"]["optimiser"]["learning_rate"]) == ("DIST with mask, tuned", 0.01)
+    assert node["renderer"]["steps"] == 11 and set(node) == {"label", "task", "renderer"}
 
 
-def test_under_one_loss_the_draw_that_is_best_over_all_methods_is_written_as_one_file(tmp_path, capsys):
+def test_the_shipped_settings_are_as_the_command_writes_them():
+    text = (CONF / "tuned.yaml").read_text()
+    assert text == HEAD + yaml.safe_dump(yaml.safe_load(text), sort_keys=False, width=WIDTH)
+
+
+@pytest.mark.parametrize("place", ["tuned", "conf/method"])
+def test_a_folder_is_no_table(tmp_path, capsys, place):
+    drawn(tmp_path)
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / place)]) == 1
+    assert f"{place} is no table of settings: type --into conf/tuned.yaml" in capsys.readouterr().err
+
+
+def test_under_one_loss_the_draw_that_is_best_over_all_methods_is_written_as_one_row(tmp_path, capsys):
     hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
     under = {"experiment": "tuning_one_loss", "silhouette": hinge}
     drawn(tmp_path, errors={"validation": VALIDATION}, **under)
     drawn(tmp_path, method="idr_mask", errors={"validation": (4.0, 9.0, 3.0, 1.5)}, **under)  # best is 1 or 3 alone
-    assert main(["--results", str(tmp_path), "--into", str(tmp_path / "one")]) == 1
+    assert main(["--results", str(tmp_path)]) == 1
     capsys.readouterr()
-    named = ["--experiment", "tuning_one_loss"]
-    assert main([*named, "--results", str(tmp_path), "--into", str(tmp_path / "one")]) == 0
-    assert [path.name for path in (tmp_path / "one").iterdir()] == ["_one_loss.yaml"]
-    text = (tmp_path / "one/_one_loss.yaml").read_text()
-    assert (
-        "# Draw 3 of 4 of method/_drawn" in text and "on 6 validation runs\n# of each of dist_mask, idr_mask," in text
-    )
-    assert "of sofa, all under DIST's mask loss: 1.73, of the median draw 3.00" in text
-    assert OmegaConf.to_container(OmegaConf.load(tmp_path / "one/_one_loss.yaml")) == {
-        "task": {"optimiser": {"learning_rate": 0.02}},
-        "renderer": {"steps": 13},
-    }
+    assert main(["--experiment", "tuning_one_loss", "--results", str(tmp_path)]) == 0
+    ((name, row),) = read_yaml(tmp_path / "tuned.yaml").items()
+    said = row.pop("chosen")
+    assert said.startswith("draw 3 of 4 of _drawn") and "on 6 validation runs of each of dist_mask, idr_mask," in said
+    assert "of sofa, all under DIST's mask loss: 1.73, of the median draw 3.00" in said
+    assert (name, row) == ("_one_loss", {"task.optimiser.learning_rate": 0.02, "renderer.steps": 13})
 
 
 def test_under_one_loss_a_failed_run_counts_before_errors(tmp_path):
     errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}}
     drawn(tmp_path, **errors)
     drawn(tmp_path, method="idr_mask", failed={("validation", 1, 2)}, **errors)
-    write(tmp_path, tmp_path, name="tuning_one_loss")
-    assert OmegaConf.load(tmp_path / "_one_loss.yaml").task.optimiser.learning_rate == 0.02
+    write(tmp_path, tmp_path / "tuned.yaml", name="tuning_one_loss")
+    assert read_yaml(tmp_path / "tuned.yaml")["_one_loss"]["task.optimiser.learning_rate"] == 0.02
 
 
 def test_one_setting_is_refused_where_methods_drew_settings_of_their_own(tmp_path):
@@ -182,7 +193,7 @@ def test_one_setting_is_refused_where_methods_drew_settings_of_their_own(tmp_pat
         if "space/idr_mask" in (text := path.read_text()):
             path.write_text(text.replace('"steps"', '"samples"'))
     with pytest.raises(ValueError, match="sweep over methods without a search space"):
-        write(tmp_path, tmp_path, name="tuning_one_loss")
+        write(tmp_path, tmp_path / "tuned.yaml", name="tuning_one_loss")
 
 
 def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):
@@ -194,7 +205,7 @@ def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_n
     assert main(["--results", str(tmp_path)]) == 0
     assert "lacks them: draws 0, 2" in capsys.readouterr().out
     for name in ("dist_mask", "idr_mask"):
-        assert OmegaConf.load(tmp_path / "tuned" / f"{name}.yaml").renderer.steps == 11
+        assert read_yaml(tmp_path / "tuned.yaml")[name]["renderer.steps"] == 11
 
 
 def test_one_draw_is_no_choice(tmp_path, capsys):
@@ -202,7 +213,7 @@ def test_one_draw_is_no_choice(tmp_path, capsys):
     drawn(tmp_path, method="idr_mask")
     assert main(["--results", str(tmp_path)]) == 1
     assert "draw 1 alone has a run on every shape" in capsys.readouterr().err
-    assert not (tmp_path / "tuned").exists()
+    assert not (tmp_path / "tuned.yaml").exists()
 
 
 def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):
@@ -210,7 +221,7 @@ def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):
     assert main(["--results", str(tmp_path)]) == 1
     assert "type python -m bench -m +experiment=tuning" in capsys.readouterr().err
     with pytest.raises(ValueError, match="has no runs of the tuning"):
-        write(tmp_path, tmp_path)
+        write(tmp_path, tmp_path / "tuned.yaml")
 
 
 @pytest.mark.parametrize(

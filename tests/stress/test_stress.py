@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from bench.config import CONF, build, load
+from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.solve.optimise import History
@@ -17,6 +17,7 @@ from bench.stress.fit import FITS, FitTrial, _failure, judge_fit
 from bench.stress.gradient import judge_gradient
 from bench.stress.rendering import judge_rendering, truth
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
+from bench.tables import choice, names
 from datasets.stress import SCENES
 from datasets.stress.solids import box, half_space, rod, sphere_solid
 from renderers import reference
@@ -29,11 +30,11 @@ CPU = torch.device("cpu")
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
 LIMITS = Limits(1e8, 8)
 FIT = FitSettings(24, 60, 0.03, "depth", 10.0, Own(), 10.0, 0.1)
-NAMES = sorted(path.stem for path in (CONF / "stress").glob("*.yaml") if path.stem != "none")
+NAMES = [name for name in names("stress") if name != "none"]
 
 
 def stress_named(name: str) -> Stress:
-    return build(OmegaConf.load(CONF / f"stress/{name}.yaml"), "task.stress", target="bench.stress.axes.Stress")
+    return build(OmegaConf.create(choice("stress", name)), "task.stress", target="bench.stress.axes.Stress")
 
 
 def conditions(resolution: int = 32) -> Conditions:

@@ -12,7 +12,7 @@ from bench.records.names import in_order, settings_of, told_apart
 from bench.records.record import NEUTRAL_KEYS, row_name
 from bench.report.data.records import OURS, Record, grouped, setting
 
-CUSTOM = "custom"  # the file of conf/renderer that stands for a user's class
+CUSTOM = "custom"  # the choice of renderer that stands for a user's class
 MOST = 3  # settings in a name
 # Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
 SHOWN = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw"}

@@ -23,7 +23,7 @@ class Row:
     """The row of a table to which a run belongs: a preset, which decides colours and published numbers, and a name.
 
     Args:
-        preset: the file of conf/method, or else of conf/renderer.
+        preset: the chosen method, or else the renderer.
         name: the run's label, or else the renderer's label, or else the renderer's file; with its loss of the mask,
             where an experiment's rows differ in that.
     """

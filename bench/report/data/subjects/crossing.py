@@ -24,7 +24,7 @@ OWN = {  # the loss of each renderer's paper; the naive one and newton have that
     "renderers.Newton": "Hinge",
 }
 LOSSES = (
-    "Losses have the numbers of conf/silhouette: DIST's weight 1, IDR's 100 and sharpness 50, as printed, and DVR's 3, "
+    "Losses have the numbers of conf/losses: DIST's weight 1, IDR's 100 and sharpness 50, as printed, and DVR's 3, "
     "chosen on validation shapes; `+experiment=tuning` gives every method its own. DVR's loss puts the points of "
     "L_occupancy (Eq. 15) at random depths, where its paper has the given depth (`occupied_at`).",
 )

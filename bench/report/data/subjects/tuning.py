@@ -27,7 +27,7 @@ from bench.report.data.records import (
 
 TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"), splits=True)
 ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone
-SPACE = "space/"  # the folder of conf/method with the search spaces
+SPACE = "space/"  # before the names of methods whose settings are drawn
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
 OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
@@ -41,7 +41,7 @@ class Tuning:
     """The draws of one method.
 
     Args:
-        method: the file of conf/method whose settings were drawn.
+        method: the method whose settings were drawn.
         label: its name for readers.
         draws: the numbers of the draws.
         settings: the drawn settings of each draw, by dotted key.

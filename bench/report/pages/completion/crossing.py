@@ -34,7 +34,7 @@ PLACE = 32
 PLACE_FRONT = 35
 READS = (CROSSING,)
 NOTES = (
-    "Every renderer has every loss, with the numbers of conf/silhouette, the same weight of the task and the same "
+    "Every renderer has every loss, with the numbers of conf/losses, the same weight of the task and the same "
     "settings otherwise. Under its own paper's loss: {own}.",
     "In the figure small points are shapes and large ones their medians; renderers stand from left to right in the "
     "order of the legend.",

@@ -33,7 +33,7 @@ NOTES = (
     "Under this loss a renderer is its hits, their distances and the least value along each ray. Opacities take part "
     "by hits and distances alone, and bands not at all: Relaxed boundary is IDR with more steps, and what these "
     "two differ by is close to the noise of the fits, which the intervals, over shapes, do not contain.",
-    "Rates and weights, one setting for all rows: conf/method/_one_loss.yaml, the draw that is best over some of the "
+    "Rates and weights, one setting for all rows: _one_loss of conf/tuned.yaml, the draw that is best over some of the "
     "methods on validation shapes (`python -m bench.tune`); its first lines say from which runs. What "
     "belongs to a renderer, such as steps, samples and sharpness, stands at its default, but for DVR (64 samples, an "
     "early stop), the mesh (48³) and the relaxed boundary (100 steps).",

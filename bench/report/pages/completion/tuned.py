@@ -23,7 +23,7 @@ PAPERS = ("_paper", "_official")  # ends of the names of presets with a paper's 
 NOTES = (
     "The ratio is that of geometric means over shapes, of each shape's geometric mean over all numbers of points, to "
     "those of the same method at its defaults; behind it the number of shapes on which the row is better, ties half.",
-    "Tuned rows: conf/method/tuned, chosen on validation shapes by `python -m bench.tune`; their first lines say from "
+    "Tuned rows: conf/tuned.yaml, chosen on validation shapes by `python -m bench.tune`; `chosen` says from "
     "which runs. At desk these are of sofas and planes from 20 points: other families and numbers of points are not "
     "what the rows were tuned for.",
     "In the figure cost is the median number of a run's field values; hollow points are methods at their defaults, "

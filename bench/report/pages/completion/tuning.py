@@ -33,7 +33,7 @@ PLACE_SETTINGS = 37
 READS = (TUNING,)
 PLOTTED = "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken."
 NOTES = (
-    "Every method has the same number of Sobol draws from its own search space (conf/method/space), even in the "
+    "Every method has the same number of Sobol draws from its own search space (conf/methods.yaml), even in the "
     "logarithm of each setting, and is judged on the same shapes; the draw with the smallest geometric mean of errors "
     "on the validation shapes is taken. The expectation is over all choices of so many of the draws.",
     f"{CHAMFER} A run that did not end ok has the largest finite error of any draw of any method on its shape; of two "
