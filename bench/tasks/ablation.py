@@ -80,7 +80,7 @@ class Ablation:
         limits: on each rendering and each step.
         smallest: fewest pixels per side that are tried.
         wrong: difference of depth, in scene units, above which a pixel is wrong.
-        beside: names of other renderers, files of conf/renderer, that are timed in turn with the run's own.
+        beside: names of other renderers that are timed in turn with the run's own.
         rounds: of these, in each of which every renderer takes one step and renders once.
         size: of the image, in pixels per side; None: as `view` has it.
         threads: of the CPU; None: those of the run.
