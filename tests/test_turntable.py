@@ -132,12 +132,12 @@ def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
     assert moved.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
 
 
-@pytest.mark.parametrize("up", UPRIGHT)
-def test_up_turns_an_axis_upwards(up):
-    way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
-    turned = stand(ball(0.2, at=tuple(0.5 * way)), up)
-    assert turned.vertices.mean(axis=0) == pytest.approx([0, 0.5, 0], abs=1e-6)
-    assert turned.volume > 0  # not mirrored
+def test_up_turns_an_axis_upwards():
+    for up in UPRIGHT:
+        way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
+        turned = stand(ball(0.2, at=tuple(0.5 * way)), up)
+        assert turned.vertices.mean(axis=0) == pytest.approx([0, 0.5, 0], abs=1e-6), up
+        assert turned.volume > 0  # not mirrored
 
 
 def test_up_may_be_negative_on_the_command_line(tmp_path, capsys):
@@ -180,28 +180,27 @@ def test_parts_of_a_scene_are_joined_and_those_without_colours_are_grey(tmp_path
 NO_FACES = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["bare"], "bare has no mesh.ply: name a run folder that has one, or a mesh file"),
-        (["killed"], "killed has no mesh.ply: the run has no mesh (killed: out of time); name another run"),
-        (["nothing.ply"], "found nothing at"),
-        (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
-        (["broken.ply"], "broken.ply': cannot be read"),
-        (["cut.ply"], "cut.ply': cannot be read"),
-        (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
-        (["points.ply"], "points.ply': must have faces, found none; export it"),
-        (["line.ply"], "line.ply': must have an area, found 0; export it again"),
-        (["dust.ply"], "must be large enough to be seen, found 3.46e-06 across; scale it to 1"),
-        (["ball.ply", "--into", "new/a.mp4"], "must end in .webp or .gif, found 'new/a.mp4'; type --into new/a.webp"),
-        (["ball.ply", "--frames", "1"], "--frames must be 2 to 720, found 1; 36 is a good number"),
-        (["ball.ply", "--size", "8"], "--size must be 16 to 1024 pixels, found 8"),
-        (["ball.ply", "--elevation", "90"], "--elevation must be -89 to 89 degrees, found 90"),
-        (["ball.ply", "--show", "colours,shape"], "--show must be some of colours,normals,depth, each once, found"),
-        (["ball.ply", "--show", "depth,depth"], "each once, found 'depth,depth'"),
-    ],
+ERRORS = (
+    (["bare"], "bare has no mesh.ply: name a run folder that has one, or a mesh file"),
+    (["killed"], "killed has no mesh.ply: the run has no mesh (killed: out of time); name another run"),
+    (["nothing.ply"], "found nothing at"),
+    (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
+    (["broken.ply"], "broken.ply': cannot be read"),
+    (["cut.ply"], "cut.ply': cannot be read"),
+    (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
+    (["points.ply"], "points.ply': must have faces, found none; export it"),
+    (["line.ply"], "line.ply': must have an area, found 0; export it again"),
+    (["dust.ply"], "must be large enough to be seen, found 3.46e-06 across; scale it to 1"),
+    (["ball.ply", "--into", "new/a.mp4"], "must end in .webp or .gif, found 'new/a.mp4'; type --into new/a.webp"),
+    (["ball.ply", "--frames", "1"], "--frames must be 2 to 720, found 1; 36 is a good number"),
+    (["ball.ply", "--size", "8"], "--size must be 16 to 1024 pixels, found 8"),
+    (["ball.ply", "--elevation", "90"], "--elevation must be -89 to 89 degrees, found 90"),
+    (["ball.ply", "--show", "colours,shape"], "--show must be some of colours,normals,depth, each once, found"),
+    (["ball.ply", "--show", "depth,depth"], "each once, found 'depth,depth'"),
 )
-def test_errors_are_one_line_and_nothing_is_written(tmp_path, capsys, monkeypatch, arguments, message):
+
+
+def test_errors_are_one_line_and_nothing_is_written(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ball().save("ball.ply")
     ball(1e-6).save("dust.ply")
@@ -213,8 +212,9 @@ def test_errors_are_one_line_and_nothing_is_written(tmp_path, capsys, monkeypatc
     Path("killed").mkdir()
     Record(id="a", task="t", renderer="r", dataset="d", seed=0, config={}, reason="out\nof time").write(Path("killed"))
     before = sorted(tmp_path.rglob("*"))
-    assert main([*arguments, "--frames", "2"] if "--frames" not in arguments else arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and message in err
-    assert err.startswith("error: ") and err.count("\n") == 1
+    for arguments, message in ERRORS:
+        assert main([*arguments, "--frames", "2"] if "--frames" not in arguments else arguments) == 2, message
+        out, err = capsys.readouterr()
+        assert out == "" and message in err
+        assert err.startswith("error: ") and err.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
