@@ -134,11 +134,7 @@ def ended(growth: Growth) -> dict[str, Any]:
     evidence = growth.fitted.evidence
     error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
     return {
-        "field": evidence.candidate,
-        "field_free": evidence.size.free,
-        "field_stored": evidence.size.stored,
-        "field_bytes": evidence.size.bytes,
-        "field_error": evidence.mean,
+        **evidence.field(),
         **error,
         "field_footprint": growth.footprint,
         "field_overhead": growth.overhead,

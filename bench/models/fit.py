@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench.models.candidates import OnePart
-from bench.models.choice import Evidence
 from bench.models.held_out import HeldOutError
-from bench.models.model import Candidate, Model, Seen
+from bench.models.model import Candidate, Evidence, Model, Seen
 from bench.models.observations import Observations, generator
 from bench.models.warm_start import WarmStart, scattered
 from bench.records.record import RunStatus

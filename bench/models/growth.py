@@ -1,12 +1,13 @@
 """Early growth: tries candidates from the smallest on, and keeps one where the held-out error falls significantly."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from math import ceil
+from typing import TypeVar
 
-from bench.models.choice import Evidence
 from bench.models.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.models.held_out import HeldOutError
-from bench.models.model import Candidate
+from bench.models.model import Candidate, Evidence
 from bench.setup.fields import GrowthSettings
 from renderers.field import Field
 from renderers.rendering import final_notes
@@ -18,6 +19,46 @@ START, WARM, FIT = 30.0, 1.0, 11.0  # of a start, and of an iteration of a warm 
 FLOP = 2e-8
 OVERHEAD = 12_000  # FLOPs per value beyond the field's own
 PER_RAY, PER_POINT, PER_WARM_POINT = 6.6, 6, 2  # field values, with their backward passes counted as values
+
+T = TypeVar("T")
+
+
+@dataclass
+class Trials:
+    """The trials of candidates, in order: all of them, and those of the ones that were kept, the last one best."""
+
+    tried: list[Evidence] = field(default_factory=list)
+    kept: list[Evidence] = field(default_factory=list)
+    without_gain: int = 0  # successive trials since the last one that was kept
+
+
+def climb(
+    candidates: Iterable[T], trial: Callable[[T, Trials], Evidence | None], *, patience: int, footprint: float = 0.0
+) -> Trials:
+    """Tries candidates from the smallest on, and keeps each that is better than the last one kept.
+
+    Better is a held-out error that is lower by more than the standard error of the difference over the same groups of rays
+    or pixels. That is the noise of what is held out alone: another start may end with another error.
+
+    Args:
+        candidates: the smallest first.
+        trial: the result of a candidate's trial, given those before; None skips the candidate.
+        patience: successive candidates that may be tried without gain.
+        footprint: error under which no larger one is tried.
+    """
+    trials = Trials()
+    for candidate in candidates:
+        if trials.kept and (trials.kept[-1].mean <= footprint or trials.without_gain == patience):
+            break
+        evidence = trial(candidate, trials)
+        if evidence is None:
+            continue
+        trials.tried.append(evidence)
+        trials.without_gain += 1
+        if not trials.kept or _is_better(evidence, trials.kept[-1]):
+            trials.kept.append(evidence)
+            trials.without_gain = 0
+    return trials
 
 
 @dataclass
@@ -67,44 +108,44 @@ class Growth:
 
 
 def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) -> Growth:
-    """Tries candidates from the smallest on, keeps those that are better, and fits the last one kept completely.
+    """Tries candidates from the smallest on, each beginning from the last one kept, and fits that one completely.
 
-    A candidate is better where its held-out error is below that of the last one kept by more than the standard error
-    of the difference, over the same rays. Growth ends where the error is below the footprint or patience ends;
-    candidates whose trial would exceed the budget are skipped.
+    Growth ends where the error is below the footprint or patience ends; candidates whose trial would exceed the budget
+    are skipped.
 
     Args:
         fitter: fits the candidates.
         candidates: the smallest first.
         settings: of trials, patience and budget.
     """
-    whole = fitter.settings.iterations
-    trial = min(max(ceil(settings.trial * whole), MIN_TRIAL), ceil(whole / 4))
+    whole, footprint = fitter.settings.iterations, fitter.observations.footprint
+    short = min(max(ceil(settings.trial * whole), MIN_TRIAL), ceil(whole / 4))
     _load()
-    now, end = fitter.begin(candidates[0], None), "there is no larger candidate"
-    first, initial_error = now.model.frozen(), now.initial_error
-    fitter.fit(now, trial, checkpoints=False)
-    tried, fields, without_gain, others = [now.evidence], {now.candidate.name: now.model.frozen()}, 0, 0.0
-    for larger in candidates[1:]:
-        if now.evidence.mean <= fitter.observations.footprint or without_gain == settings.patience:
-            break
-        kept, gone = (cost(candidate, whole, fitter) * (settings.budget - 1) for candidate in (now.candidate, larger))
-        if others + cost(larger, trial, fitter) > kept or others + cost(now.candidate, trial, fitter) > gone:
-            end = "larger ones would exceed models.growth.budget"
-            continue
-        fitted = fitter.begin(larger, now.model, evaluate=False)
-        fitter.fit(fitted, trial, checkpoints=False)
-        tried.append(fitted.evidence)
-        better = _is_better(fitted.evidence, now.evidence)
-        others += cost(now.candidate if better else larger, trial, fitter)
-        without_gain = 0 if better else without_gain + 1
-        if better:
-            now = fitted
-            fields[larger.name] = now.model.frozen()
-    end = f"{without_gain} larger ones were no better" if without_gain == settings.patience else end
-    fitter.fit(now, whole - trial, checkpoints=False)
-    fields[now.candidate.name] = now.model.frozen()
-    return Growth(now, first, initial_error, tried, fields, fitter.observations.footprint, end)
+    smallest, end = fitter.begin(candidates[0], None), "there is no larger candidate"
+    first, initial_error = smallest.model.frozen(), smallest.initial_error
+    fits = {candidates[0].name: smallest}
+
+    def trial(candidate: Candidate, trials: Trials) -> Evidence | None:
+        nonlocal end
+        if trials.kept:
+            now = fits[trials.kept[-1].candidate]
+            others = sum(cost(fits[one.candidate].candidate, short, fitter) for one in trials.tried)
+            others -= cost(now.candidate, short, fitter)
+            kept, gone = (cost(one, whole, fitter) * (settings.budget - 1) for one in (now.candidate, candidate))
+            if others + cost(candidate, short, fitter) > kept or others + cost(now.candidate, short, fitter) > gone:
+                end = "larger ones would exceed models.growth.budget"
+                return None
+            fits[candidate.name] = fitter.begin(candidate, now.model, evaluate=False)
+        fitter.fit(fits[candidate.name], short, checkpoints=False)
+        return fits[candidate.name].evidence
+
+    trials = climb(candidates, trial, patience=settings.patience, footprint=footprint)
+    last = fits[trials.kept[-1].candidate]
+    if trials.without_gain == settings.patience:
+        end = f"{trials.without_gain} larger ones were no better"
+    fitter.fit(last, whole - short, checkpoints=False)
+    fields = {one.candidate: fits[one.candidate].model.frozen() for one in trials.kept}
+    return Growth(last, first, initial_error, trials.tried, fields, footprint, end)
 
 
 def cost(candidate: Candidate, iterations: int, fitter: Fitter) -> float:

@@ -1,13 +1,16 @@
-"""A field with its parameters, and the contract of a candidate."""
+"""A field with its parameters, the contract of a candidate, and the result of a fit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.models.held_out import HeldOutError
+from bench.records.record import RunStatus
 from bench.setup.fields import SIZE_WORDS
 from renderers.field import Counts, Field, Meter
 
@@ -136,3 +139,44 @@ class Candidate(Protocol):
     def starts(self, seen: Seen) -> list[Model]:
         """Models to start from; the one with the least loss after a short warm start is fitted."""
         ...
+
+
+@dataclass
+class Evidence:
+    """The result of a candidate's fit, and its cost.
+
+    Args:
+        candidate: its name.
+        size: its free and its stored numbers.
+        flops_per_query: floating-point operations per value.
+        error: on held-out rays; None where the fit failed.
+        status, reason: how the fit ended.
+        seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
+        wall: seconds in all, with starts and checkpoints.
+        iterations: of the fit, without its warm start.
+        checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
+    """
+
+    candidate: str
+    size: Size
+    flops_per_query: int = 0
+    error: HeldOutError | None = None
+    status: RunStatus = RunStatus.OK
+    reason: str = ""
+    seconds: float = 0.0
+    evaluations: int = 0
+    gradients: int = 0
+    flops: int = 0
+    wall: float = 0.0
+    iterations: int = 0
+    checkpoints: list[dict[str, float]] = field(default_factory=list)
+
+    @property
+    def mean(self) -> float:
+        """The mean error on held-out rays; infinite where the fit failed."""
+        return inf if self.error is None else self.error.mean
+
+    def field(self) -> dict[str, str | int | float]:
+        """The field and its error, as metrics of the run that ended on it."""
+        size = {f"field_{measure}": self.size.by(measure) for measure in ("free", "stored", "bytes")}
+        return {"field": self.candidate, **size, "field_error": self.mean}

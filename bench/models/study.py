@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from bench.models.choice import Choice, Evidence, choose, is_as_good
 from bench.models.fit import Fitted, Fitter
 from bench.models.held_out import HeldOutError
-from bench.models.model import Candidate
+from bench.models.model import Candidate, Evidence
 from bench.models.views import Views
 from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
@@ -37,6 +36,17 @@ class CheckSettings:
         check_at_least("task.checks.seeds", self.seeds, 1, "20 resolve 95 %")
         check_at_least("task.checks.drawn", self.drawn, 2, "8 give a standard error")
         check_at_least("task.checks.views", self.views, self.drawn, f"{3 * self.drawn} give different draws")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The recommended candidate, the best one, and which rules the recommended one fulfils."""
+
+    chosen: Evidence
+    best: Evidence
+    measure: str  # of size, by which it is the smallest
+    within: bool  # its error is within one standard error of the best one's
+    enough: bool  # its error is under the footprint
 
 
 @dataclass
@@ -137,3 +147,30 @@ def shares(
         held += as_good or chosen.some(drawn).mean <= footprint
     found = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": held / settings.seeds}
     return {"held_out_seeds": settings.seeds, **found}
+
+
+def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
+    """The smallest candidate within one standard error of the best (Breiman et al. 1984), or under the footprint.
+
+    Args:
+        evidence: of all candidates.
+        footprint: half a pixel (DIST, Eq. 10), in scene units.
+        measure: of size, see `models.size`.
+
+    Raises:
+        ValueError: where all fits failed.
+    """
+    known = [candidate for candidate in evidence if candidate.error is not None]
+    if not known:
+        raise ValueError(
+            f"all fits failed; the last: {evidence[-1].reason}; try other models.candidates or another renderer"
+        )
+    best = min(known, key=lambda candidate: candidate.mean)
+    fit = [candidate for candidate in known if is_as_good(candidate.error, best.error) or candidate.mean <= footprint]
+    chosen = min(fit, key=lambda candidate: (candidate.size.by(measure), candidate.mean))
+    return Choice(chosen, best, measure, is_as_good(chosen.error, best.error), chosen.mean <= footprint)
+
+
+def is_as_good(error: HeldOutError, best: HeldOutError) -> bool:
+    """Whether an error is within one standard error of the best."""
+    return error.mean <= best.mean + best.standard_error

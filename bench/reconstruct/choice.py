@@ -1,4 +1,4 @@
-"""The field that a reconstruction takes with `field=auto`: the smallest that no larger one improves on."""
+"""The fields with colours that a shape can be learnt as, and the one that a reconstruction takes with `field=auto`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,17 +9,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.models.model import Size
+from bench.models.growth import Trials, climb
+from bench.models.held_out import HeldOutError
+from bench.models.model import Evidence, Size
 from bench.models.observations import TILES, tiles
 from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
 from bench.records.record import RunStatus
+from bench.setup.auto import AUTO
+from bench.setup.fields import PRIOR, parsed
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import Objective, OptimiserSettings
 from datasets.shot import Shot
-from renderers.checks import check_at_least, check_share
+from renderers.checks import BadInput, check_at_least, check_positive, check_share
+from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 
+FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
+REACH = 1.05  # half the side of a grid's cube: the unit sphere and a margin
 ASIDE = 8  # of so many given photographs one is set aside for the trials
 DEFINITIONS = {
     "field": "the field that field=auto ended on",
@@ -30,6 +37,48 @@ DEFINITIONS = {
     "fields_tried": "candidates that were tried",
     "seconds.trials": "the loops of the trials of field=auto; their evaluations are not among those of the loop",
 }
+
+
+Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid
+"""Modules whose `field` is a Coloured at their current parameters."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What fields with colours are made of, beside their size.
+
+    Args:
+        octaves: of the positional encoding of a distance network.
+        directional: whether colours of a distance network depend on the view direction.
+        radius: of the sphere that all begin as, in scene units.
+    """
+
+    octaves: int
+    directional: bool
+    radius: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.appearance.octaves", self.octaves, 0, "5 follow details of a pixel at 128 x 128")
+        check_positive("task.appearance.radius", self.radius, "0.5 lies within most objects")
+
+    def make(self, name: str) -> Learnt:
+        """The field of that name at its start.
+
+        Raises:
+            BadInput: for a name that has no colours.
+        """
+        if name in (PRIOR, AUTO):
+            raise BadInput(f"field={name} has no colours: {FORMS}")
+        kind, sizes = parsed(name)
+        if kind == "network":
+            layers, width = sizes
+            shape = {"layers": layers, "width": width, "octaves": self.octaves}
+            return ColouredDistance(**shape, radius=self.radius, directional=self.directional)
+        if kind == "occupancy":
+            return ColouredOccupancy(width=sizes[0], radius=self.radius)
+        if kind == "grid":
+            return ColouredGrid(samples=sizes[0], radius=self.radius, reach=REACH)
+        raise BadInput(f"field={name} has no colours: {FORMS}")
 
 
 @runtime_checkable
@@ -49,7 +98,7 @@ class AutoField:
     """How `field=auto` tries candidates, each from the start, for a share of a whole run.
 
     Args:
-        candidates: their names, each once, in any order; see `bench.reconstruct.models.Appearance.make`.
+        candidates: their names, each once, in any order; see `Appearance.make`.
         trial: share of the iterations.
         patience: successive larger candidates that may be tried without improvement.
     """
@@ -68,11 +117,9 @@ class AutoField:
     def choose(
         self, make: Make, sizes: dict[str, int], subject: Subject, settings: OptimiserSettings, run: RunContext
     ) -> "Choice":
-        """Tries candidates from the smallest on, and keeps one that lowers the error by more than its noise.
+        """Tries candidates from the smallest on, and keeps the one that `bench.models.growth.climb` ends on.
 
-        Errors are of photographs that are given, but not to the trials. The noise is the standard error of the
-        difference over the same tiles of these. It is that of the photographs alone: another start, as of another
-        seed, may end a trial with another error.
+        Errors are of photographs that are given, but not to the trials; groups are tiles of these.
 
         Args:
             make: the problem of a candidate and photographs.
@@ -84,61 +131,39 @@ class AutoField:
         aside, rest = subject.given[::ASIDE], [shot for place, shot in enumerate(subject.given) if place % ASIDE]
         part = replace(subject, given=tuple(rest))
         brief = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
-        tried: list[Trial] = []
-        best, worse = 0, 0
-        for name in sorted(self.candidates, key=lambda name: sizes[name]):
-            if worse == self.patience:
-                break
+
+        def trial(name: str, trials: Trials) -> Evidence:
             torch.manual_seed(run.inputs.seed)  # each begins as it would alone
-            tried.append(_tried(name, sizes[name], make(name, part), aside, brief, run))
-            better = len(tried) > 1 and tried[-1].better_than(tried[best])
-            best, worse = (len(tried) - 1, 0) if better else (best, worse + (len(tried) > 1))
-        return Choice(tuple(tried), best, len(aside))
+            return _tried(name, sizes[name], make(name, part), aside, brief, run)
 
-
-@dataclass(frozen=True)
-class Trial:
-    """A candidate after its trial: the mean error of each tile, its size, and what the loop cost."""
-
-    name: str
-    errors: Float[np.ndarray, " tiles"]
-    free: int
-    seconds: float
-    values: int
-
-    def better_than(self, other: "Trial") -> bool:
-        """Whether its error is lower by more than the standard error of the difference."""
-        if not np.isfinite(self.errors).all() or not np.isfinite(other.errors).all():
-            return bool(np.isfinite(self.errors).all())
-        apart = other.errors - self.errors
-        return bool(apart.mean() > apart.std(ddof=1) / np.sqrt(len(apart)))
+        ordered = sorted(self.candidates, key=lambda name: sizes[name])
+        return Choice(climb(ordered, trial, patience=self.patience), len(aside))
 
 
 @dataclass(frozen=True)
 class Choice:
-    """All trials, the place of the one that is kept, and the number of photographs that were set aside for them."""
+    """All trials, and the number of photographs that were set aside for them."""
 
-    trials: tuple[Trial, ...]
-    place: int
+    trials: Trials
     aside: int
 
     @property
-    def kept(self) -> Trial:
+    def kept(self) -> Evidence:
         """The trial of the field that is taken."""
-        return self.trials[self.place]
+        return self.trials.kept[-1]
 
     @property
     def seconds(self) -> float:
         """Of the loops of all trials."""
-        return sum(trial.seconds for trial in self.trials)
+        return sum(trial.seconds for trial in self.trials.tried)
 
     @property
     def note(self) -> str:
         """The result, in words."""
-        errors = ", ".join(f"{trial.name} {trial.errors.mean():.3g}" for trial in self.trials)
-        values = sum(trial.values for trial in self.trials)
-        found = f"field=auto: {self.kept.name}, {self.kept.free:,} numbers"
-        if not np.isfinite(self.kept.errors).all():
+        errors = ", ".join(f"{trial.candidate} {trial.mean:.3g}" for trial in self.trials.tried)
+        values = sum(trial.evaluations for trial in self.trials.tried)
+        found = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
+        if self.kept.error is None:
             found += ", though no trial ended well: lower task.optimiser.learning_rate"
         aside = f"{self.aside} photograph{'s' if self.aside > 1 else ''} set aside"
         spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
@@ -146,28 +171,31 @@ class Choice:
 
     def metrics(self, loop: float) -> dict[str, Any]:
         """The metrics of `DEFINITIONS`, for a run whose loop took so many seconds."""
-        size, error = Size(self.kept.free, self.kept.free), float(self.kept.errors.mean())
-        sizes = {"field_free": size.free, "field_stored": size.stored, "field_bytes": size.bytes}
-        overhead = {"field_overhead": 1 + self.seconds / max(loop, 1e-9), "fields_tried": len(self.trials)}
-        return {"field": self.kept.name, **sizes, "field_error": error, **overhead}
+        overhead = {"field_overhead": 1 + self.seconds / max(loop, 1e-9), "fields_tried": len(self.trials.tried)}
+        return self.kept.field() | overhead
 
 
 def _tried(
     name: str, free: int, problem: Learning, aside: Sequence[Shot], brief: OptimiserSettings, run: RunContext
-) -> Trial:
-    """A candidate's trial; one whose loss fails has infinite errors."""
+) -> Evidence:
+    """A candidate's trial; one whose loss fails has no error."""
     history = History()
 
     def on_step(line: dict[str, Any]) -> None:
         run.progress(f"trying {name}", line["iteration"] + 1, brief.iterations, line["total"])
 
     optimise(problem, brief, run.inputs.device, history=history, on_step=on_step)
-    costs = free, history.seconds["forward"] + history.seconds["backward"], history.counts.value
-    groups = torch.cat(
-        [tiles(shot.camera.height, shot.camera.width) + place * TILES**2 for place, shot in enumerate(aside)]
-    )
-    if history.status is not RunStatus.OK:
-        return Trial(name, np.full(len(aside) * TILES**2, np.inf), *costs)
-    errors = problem.colour_errors(Stack.of(aside, None, run.inputs.device).pixels).cpu()
-    sums = torch.bincount(groups, errors.double()) / torch.bincount(groups)
-    return Trial(name, sums.numpy(), *costs)
+    seconds, values = history.seconds["forward"] + history.seconds["backward"], history.counts.value
+    found = Evidence(name, Size(free, free), seconds=seconds, evaluations=values, status=history.status)
+    if history.status is RunStatus.OK:
+        found.error = tiled(problem.colour_errors(Stack.of(aside, None, run.inputs.device).pixels).cpu(), aside)
+    return found
+
+
+def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:
+    """The mean over tiles of the mean error of their pixels, which are those of all photographs in a row."""
+    places = [tiles(shot.camera.height, shot.camera.width) + k * TILES**2 for k, shot in enumerate(shots)]
+    groups = torch.cat(places)
+    means = (torch.bincount(groups, errors.double()) / torch.bincount(groups)).numpy()
+    one = np.ones_like(means)
+    return HeldOutError(np.stack([means, one, 0 * one, one], axis=1), 1.0)

@@ -12,9 +12,9 @@ from torch import Tensor
 from bench.evaluate.colours import colours_at
 from bench.evaluate.evaluate import Evaluation, surface_of
 from bench.pictures.filmstrip import Shown
+from bench.reconstruct.choice import Learnt
 from bench.reconstruct.judge import field_scores, judge, mesh_views, surface_scores
 from bench.reconstruct.losses import Losses
-from bench.reconstruct.models import Learnt
 from bench.reconstruct.pictures import draw_reconstruction
 from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject

@@ -5,13 +5,12 @@ from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
 from bench.models.candidates import PAPERS, by_size
-from bench.models.choice import Choice, Evidence
 from bench.models.field import SIZES
 from bench.models.fit import Fitter
 from bench.models.growth import Growth, grow
-from bench.models.model import Size
+from bench.models.model import Evidence, Size
 from bench.models.observations import RayObservations
-from bench.models.study import CheckSettings, Study
+from bench.models.study import CheckSettings, Choice, Study
 from bench.models.views import Views
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates

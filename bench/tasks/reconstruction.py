@@ -5,10 +5,9 @@ from typing import ClassVar
 
 import torch
 
-from bench.reconstruct.choice import DEFINITIONS, AutoField
+from bench.reconstruct.choice import DEFINITIONS, Appearance, AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
-from bench.reconstruct.models import Appearance
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.problem import ReconstructionProblem
 from bench.reconstruct.subject import (
@@ -97,7 +96,7 @@ class Reconstruction:
             sizes = {name: sum(one.numel() for one in model.parameters()) for name, model in models.items()}
             choice = self.auto.choose(lambda n, part: self.problem(n, part, run), sizes, subject, self.optimiser, run)
         run.record.notes.append(choice.note)
-        solve(lambda: self.problem(choice.kept.name, subject, run), self.optimiser, run, definitions)
+        solve(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
         seconds = run.record.seconds
         run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
         seconds["trials"] = choice.seconds

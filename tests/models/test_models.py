@@ -12,12 +12,12 @@ from omegaconf import OmegaConf
 from bench.config import load
 from bench.models import candidates as formulas
 from bench.models.candidates import PAPERS, REACH, candidate
-from bench.models.choice import Evidence, choose
 from bench.models.fit import SCREENING, Fitter, _slope_error
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOut, HeldOutError
-from bench.models.model import Model, Seen, Size
+from bench.models.model import Evidence, Model, Seen, Size
 from bench.models.observations import FREE, Holdout, hold_out, together
+from bench.models.study import choose
 from bench.models.views import Views
 from bench.records.record import RunStatus
 from bench.setup.auto import AutoSettings, epsilon, rays_share

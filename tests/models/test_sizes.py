@@ -3,8 +3,8 @@
 import pytest
 
 from bench.models.candidates import by_size, candidate
-from bench.models.choice import choose
 from bench.models.model import Size
+from bench.models.study import choose
 from bench.pictures.size_chart import AXES
 from bench.report.data.subjects.parsimony import SIZES
 from bench.setup.fields import SIZE_WORDS, ModelSettings

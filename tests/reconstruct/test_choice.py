@@ -1,14 +1,16 @@
 """What `field=auto` ends on, with candidates whose errors are set by hand."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from bench.models.growth import _is_better
+from bench.models.model import Evidence, Size
 from bench.models.observations import TILES
-from bench.reconstruct.choice import ASIDE, AutoField, Choice, Trial
+from bench.reconstruct.choice import ASIDE, AutoField, Choice, tiled
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.subject import Subject
 from bench.solve.problem import OptimiserSettings
@@ -64,8 +66,8 @@ def ended_on(known: dict[str, Known], folder, *, patience: int = 2, given: int =
 def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
     known = {"large": Known(30, 0.1), "small": Known(3, 0.3), "middle": Known(10, 0.1)}
     choice, seen = ended_on(known, tmp_path)
-    assert [trial.name for trial in choice.trials] == ["small", "middle", "large"]
-    assert choice.kept.name == "middle"
+    assert [trial.candidate for trial in choice.trials.tried] == ["small", "middle", "large"]
+    assert choice.kept.candidate == "middle"
     assert len(seen) == 3
     for part in seen:  # photographs 0 and 8 are set aside, those that are held out are not there
         assert [one.name for one in part.given] == ["1", "2", "3", "4", "5", "6", "7"]
@@ -84,37 +86,44 @@ def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
 
 def test_it_looks_past_those_that_are_no_better_until_patience_ends(tmp_path):
     known = {"a": Known(1, 0.3), "b": Known(2, 0.4), "c": Known(3, 0.4), "d": Known(4, 0.1)}
-    assert ended_on(known, tmp_path, patience=3)[0].kept.name == "d"
+    assert ended_on(known, tmp_path, patience=3)[0].kept.candidate == "d"
     choice, _ = ended_on(known, tmp_path, patience=2)
-    assert choice.kept.name == "a"
-    assert [trial.name for trial in choice.trials] == ["a", "b", "c"]
+    assert choice.kept.candidate == "a"
+    assert [trial.candidate for trial in choice.trials.tried] == ["a", "b", "c"]
 
 
 def test_one_that_fails_is_worse_than_any(tmp_path):
     known = {"a": Known(1, 0.3, failing=True), "b": Known(2, 0.9), "c": Known(3, 0.1, failing=True)}
     choice, _ = ended_on(known, tmp_path)
-    assert choice.kept.name == "b"
+    assert choice.kept.candidate == "b"
     assert "no trial ended well" not in choice.note
     none, _ = ended_on({"a": Known(1, 0.3, failing=True)}, tmp_path)
     assert "no trial ended well: lower task.optimiser.learning_rate" in none.note
-    assert np.isinf(choice.trials[0].errors).all()
+    assert choice.trials.tried[0].error is None and np.isinf(choice.trials.tried[0].mean)
+
+
+def of_tiles(errors: np.ndarray) -> Evidence:
+    """A trial on one photograph whose tiles, of 4 x 4 pixels, have these errors; pixels of a tile differ."""
+    pixels = np.kron(errors.reshape(TILES, TILES), np.ones((4, 4))) + np.tile([[0.05, -0.05]], (16, 8))
+    return Evidence("one", Size(1, 1), error=tiled(torch.from_numpy(pixels.flatten()), [shot("0")]))
 
 
 def test_the_noise_is_that_of_tiles_not_of_pixels():
-    tiles = np.repeat([0.1, 0.5], 8)  # the same in every pixel of a tile
-    one = Trial("one", tiles, 1, 0.0, 0)
-    assert replace(one, errors=tiles - 0.01).better_than(one)  # by as much everywhere
+    tiles = np.repeat([0.1, 0.5], 8)
+    one = of_tiles(tiles)
+    assert one.mean == pytest.approx(0.3)
+    assert _is_better(of_tiles(tiles - 0.01), one)  # by as much everywhere
     apart = np.tile([0.3, -0.25], 8)
-    assert not replace(one, errors=tiles - apart).better_than(one)  # .025 on average, with a standard error of .07
+    assert not _is_better(of_tiles(tiles - apart), one)  # .025 on average, with a standard error of .07
     for share, better in ((0.9, False), (1.1, True)):
         gain = share * apart.std(ddof=1) / 4 - apart.mean()
-        assert replace(one, errors=tiles - apart - gain).better_than(one) is better
-    assert replace(one, errors=tiles - apart - 0.1).better_than(one)
+        assert _is_better(of_tiles(tiles - apart - gain), one) is better
+    assert _is_better(of_tiles(tiles - apart - 0.1), one)
 
 
 def test_tiles_cover_photographs_of_any_size(tmp_path):
     known = {"a": Known(1, 0.3)}
-    assert ended_on(known, tmp_path)[0].kept.errors.shape == (2 * TILES**2,)
+    assert ended_on(known, tmp_path)[0].kept.error.sums.shape == (2 * TILES**2, 4)
     assert len(Stack.of([shot("0")], None, torch.device("cpu")).pixels.at_one) == 256
     assert ASIDE == 8
 

@@ -10,11 +10,10 @@ import torch
 
 from bench.evaluate.evaluate import Evaluation
 from bench.models.candidates import PAPERS, candidate
-from bench.models.choice import Evidence
 from bench.models.field import verdict
 from bench.models.growth import grow
 from bench.models.held_out import HeldOutError
-from bench.models.model import Size
+from bench.models.model import Evidence, Size
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus, read_record
 from bench.run.execute import execute

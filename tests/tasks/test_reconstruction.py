@@ -10,10 +10,9 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.reconstruct.choice import AutoField
+from bench.reconstruct.choice import Appearance, AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
-from bench.reconstruct.models import Appearance
 from bench.reconstruct.subject import Depths
 from bench.reconstruct.symptoms import WEIGHT
 from bench.setup.fields import FieldChoice
