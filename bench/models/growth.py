@@ -37,8 +37,8 @@ def climb(
 ) -> Trials:
     """Tries candidates from the smallest on, and keeps each that is better than the last one kept.
 
-    Better is a held-out error that is lower by more than the standard error of the difference over the same groups of rays
-    or pixels. That is the noise of what is held out alone: another start may end with another error.
+    Better is a held-out error that is lower by more than the standard error of the difference over the same groups of
+    rays or pixels. That is the noise of what is held out alone: another start may end with another error.
 
     Args:
         candidates: the smallest first.
