@@ -1,6 +1,6 @@
 """DIST: fast differentiable sphere tracing of a network (Liu et al., CVPR 2020)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import torch
@@ -100,18 +100,8 @@ class DIST:
         return steepest(field, like=rays.origins, radius=self.sphere_radius, samples=self.slope_samples)
 
     def _trace(self, field: Field, rays: Rays) -> Front:
-        stepping = Stepping(
-            self.epsilon,
-            self.alpha,
-            self.extra_step_cap,
-            self.step_clamp,
-            active_only=self.active_only,
-            careful_split=self.careful_split,
-            step_back=self.step_back,
-            least_step=self.least_step,
-            relaxation=self.relaxation,
-            slope=self._slope(field, rays),
-        )
+        given = {setting.name: getattr(self, setting.name) for setting in fields(Stepping) if setting.name != "slope"}
+        stepping = Stepping(**given, slope=self._slope(field, rays))
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
                 field, rays, stepping, steps=self.steps, radius=self.sphere_radius, samples=self.n_gradient_samples

@@ -71,18 +71,13 @@ class Naive:
         if not self.serial or flat.shape.numel() == 0:
             parts = [render(field, flat)]
         else:
-            parts = [
-                render(field, flat[index])
-                for index in torch.arange(len(flat.origins), device=flat.origins.device).split(1)
-            ]
-        distance = torch.cat([part.distance for part in parts]).view(rays.shape)
-        return Rendering(
-            distance=distance,
-            status=torch.cat([part.status for part in parts]).view(rays.shape),
-            points=rays.at(distance),
-            residual=torch.cat([part.residual for part in parts]).view(rays.shape),
-            closest=torch.cat([part.closest for part in parts]).view(rays.shape),
+            each = torch.arange(len(flat.origins), device=flat.origins.device).split(1)
+            parts = [render(field, flat[index]) for index in each]
+        distance, status, residual, closest = (
+            torch.cat([getattr(part, name) for part in parts]).view(rays.shape)
+            for name in ("distance", "status", "residual", "closest")
         )
+        return Rendering(distance, status, rays.at(distance), residual, closest)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]

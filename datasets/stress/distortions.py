@@ -105,11 +105,6 @@ def saturated(cube: Solid, severity: float, draw: np.random.Generator) -> Distor
 
 
 DISTORTIONS: dict[str, Distortion] = {
-    "scaled": scaled,
-    "ripples": ripples,
-    "perturbed": perturbed,
-    "coarse_floats": coarse_floats,
-    "quantised": quantised,
-    "truncated": truncated,
-    "saturated": saturated,
+    distortion.__name__: distortion
+    for distortion in (scaled, ripples, perturbed, coarse_floats, quantised, truncated, saturated)
 }

@@ -26,7 +26,8 @@ Disturb = Callable[[Observation, float, np.random.Generator], Observation]
 
 def depth_noise(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
     """Normal noise of a standard deviation, in scene units, on each depth."""
-    return replace(given, depth=given.depth + severity * _normal(given, draw))
+    noise = torch.from_numpy(draw.normal(size=given.depth.shape)).float()
+    return replace(given, depth=given.depth + severity * noise)
 
 
 def depth_outliers(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
@@ -65,19 +66,9 @@ def wrong_pose(given: Observation, severity: float, draw: np.random.Generator) -
 DISTURBANCES: dict[str, Disturb] = {
     function.__name__: function
     for function in (
-        depth_noise,
-        depth_outliers,
-        depth_steps,
-        missing_depth,
-        mask_errors,
-        wrong_focal_length,
-        wrong_pose,
+        depth_noise, depth_outliers, depth_steps, missing_depth, mask_errors, wrong_focal_length, wrong_pose,
     )
-}
-
-
-def _normal(given: Observation, draw: np.random.Generator) -> Float[Tensor, "height width"]:
-    return torch.from_numpy(draw.normal(size=given.depth.shape)).float()
+}  # fmt: skip
 
 
 def _drawn(given: Observation, share: float, draw: np.random.Generator) -> Bool[Tensor, "height width"]:
