@@ -2,7 +2,7 @@
 PYTHON ?=
 BIN := .venv/bin
 
-.PHONY: demo test test-slow test-types test-browser benchmark mutants lint setup clean
+.PHONY: demo results test test-slow test-types test-browser benchmark mutants lint setup clean
 
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
@@ -29,6 +29,9 @@ mutants: .venv/ready-dev ## installs mutmut, then changes the code in one place 
 	@.ci/setup mutants
 	$(BIN)/mutmut run $(if $(ONLY),'$(ONLY)')
 	$(BIN)/mutmut results
+
+results: .venv/ready ## for maintainers: writes what is shipped, results/paper and results/README.md, from results/local
+	$(BIN)/python -m bench.report ship=results
 
 lint: .venv/ready-dev ## ruff (lint and format) and pyright
 	$(BIN)/ruff check .

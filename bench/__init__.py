@@ -1,6 +1,6 @@
 """The benchmark: tasks, the runner, records and reports.
 
-From Python, `bench.load("results")` gives all runs as a pandas table, and `bench.run(task="completion")` makes one.
+From Python, `bench.load()` gives all runs as a pandas table, and `bench.run(task="completion")` makes one.
 """
 
 import os

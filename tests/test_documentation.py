@@ -16,15 +16,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 import bench
+import bench.studies
 from bench import tables
 from bench.config import CONF, build, check_names, register
-from bench.report import pages
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.run import library
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
-from tests.readme import wrongs
 from tests.run.driving import command as typed
 
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
@@ -176,33 +175,23 @@ def test_the_task_of_contributing_counts_what_it_says(own_task):
     assert list(runs.status) == ["ok"] * 2 and (runs.hits > 100).all()
 
 
-def test_the_page_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
+def test_the_study_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
     (tmp_path / "coverage.py").write_text(code_of("CONTRIBUTING.md", "python")[2])
-    monkeypatch.setattr(paper, "PAGES", tmp_path)
-    monkeypatch.setattr(pages, "__path__", [str(tmp_path), *pages.__path__])
-    paper.page_names.cache_clear()
+    monkeypatch.setattr(paper, "STUDIES", tmp_path)
+    monkeypatch.setattr(bench.studies, "__path__", [str(tmp_path)])
+    paper.studies.cache_clear()
     own = list((own_task / "sweeps").glob("*/table.*"))  # written when the sweep ended: it had no page then
-    assert len(own) == 3
+    assert len(own) == 4
     for path in own:
         path.unlink()
     try:
         report([f"results_dir={own_task}"])
-        (page,) = paper.find_paper(own_task)
-    finally:  # after the last use of the pages of this test
-        paper.page_names.cache_clear()
-        sys.modules.pop("bench.report.pages.coverage", None)
-    assert page["header"][0] == "Run" and len(page["rows"]) == 2
+        (page,) = (found.shown for found in paper.find_paper(own_task) if not found.shipped)
+    finally:  # after the last use of the studies of this test
+        paper.studies.cache_clear()
+        sys.modules.pop("bench.studies.coverage", None)
+    assert page.columns[0] == "Run" and len(page.rows) == 2 and page.question
     assert not list((own_task / "sweeps").glob("*/table.csv"))  # a page shows it
-
-
-def test_a_readme_that_is_long_or_full_of_numbers_is_told():
-    fine = (
-        "# Of 9\n\nA line. " * 60 + "\n| a | 1 |\n\n    seed=0,1,2\n\n```python\nx = 1\n```\n[word](page7.md#3) `n=1`\n"
-    )
-    assert wrongs(fine[:900]) == []
-    assert [said.split(",")[0] for said in wrongs(fine)] == ["129 lines", "61 numbers"]
-    assert wrongs("word " * 25 + "end. `a b` " + "word " * 24)[0].startswith("a sentence of 26 words")
-    assert len(wrongs("word " * 25 + "end. `a b` " + "word " * 24)) == 1
 
 
 def test_comments_and_other_words_are_no_part_of_a_command():

@@ -11,6 +11,7 @@ from typing import Any
 from bench.records.files import decoded, is_plain_name, leads_out, link_out, to_json, write_text
 from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, started
 
+RESULTS = "results/local"  # the results folder unless another is given, as conf/config.yaml has it
 PLAN = "plan.json"
 FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks")  # of a results folder
 TEXTS = ("id", "task", "renderer", "dataset", "method")  # of a planned cell

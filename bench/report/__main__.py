@@ -4,23 +4,23 @@ import sys
 from pathlib import Path
 
 from bench.records.format import size
-from bench.records.read import read_records
+from bench.records.read import RESULTS, read_records
 from bench.report.data.frame import NO_PARQUET, write_frame
-from bench.report.write.answer import write_answers
 from bench.report.write.html import MOST_MESHES, write_index
 from bench.report.write.one_file import write_one_file
 from bench.report.write.paper import write_paper, write_readme
 from bench.report.write.sweeps import write_sweeps
 
-USAGE = """usage: python -m bench.report [results_dir=PATH] [meshes=all] [one_file=true]
-  results_dir   the folder with the runs; `results` unless given
+USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [one_file=true] [ship=PATH]
+  results_dir   the folder with the runs; `{RESULTS}` unless given
   meshes        of how many runs, the newest first, the mesh turns on the page; 500 unless given, or all
-  one_file      true: also writes report.html, the page in one file to send, with small pictures and without meshes"""
-KEYS = ("results_dir", "meshes", "one_file")
+  one_file      true: also writes report.html, the page in one file to send, with small pictures and without meshes
+  ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
+KEYS = ("results_dir", "meshes", "one_file", "ship")
 
 
 def main(arguments: list[str]) -> None:
-    """Writes `runs.csv`, all pages, the tables of sweeps, `README.md` and `index.html`.
+    """Writes `runs.csv`, all pages, the tables of sweeps and `index.html`.
 
     Exits with a message where an argument is wrong.
     """
@@ -29,18 +29,20 @@ def main(arguments: list[str]) -> None:
         return
     try:
         given = parsed(arguments)
-        results_dir = Path(given.get("results_dir", "results"))
+        results_dir = Path(given.get("results_dir", RESULTS))
         meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
         one_file = _one_file(given.get("one_file", "false"))
         records, unread = read_records(results_dir)
+        if ship := given.get("ship"):
+            print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
+            return
         frames = write_frame(records, results_dir)
         if len(frames) == 1:
             print(f"note: {NO_PARQUET}", file=sys.stderr)
         for path in (*frames, *write_paper(records, results_dir), *write_sweeps(records, results_dir)):
             print(path)
-        for problem in [*(f"not read: {problem}" for problem in unread), *write_answers(results_dir)]:
-            print(problem, file=sys.stderr)
-        write_readme(results_dir)
+        for problem in unread:
+            print(f"not read: {problem}", file=sys.stderr)
         if one_file:
             sent = write_one_file(results_dir)
             print(f"{sent} ({size(sent.stat().st_size)})")

@@ -16,7 +16,7 @@ import yaml
 
 from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
-from bench.records.read import read_records
+from bench.records.read import RESULTS, read_records
 from bench.report.data.experiments import Experiment, choose, shared_loss
 from bench.report.data.records import Record
 from bench.report.data.subjects.tuning import (
@@ -119,7 +119,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__.split("\n\n")[1])
     kind = "which sweep is read; of tuning_one_loss one row is written for all methods"
     parser.add_argument("--experiment", choices=SELECTIONS, default=TUNING.experiment, help=kind)
-    parser.add_argument("--results", type=Path, default=Path("results"), metavar="FOLDER", help="results folder")
+    parser.add_argument("--results", type=Path, default=Path(RESULTS), metavar="FOLDER", help="results folder")
     into = "the table: conf/tuned.yaml to use its rows as +method=tuned/NAME; without it, RESULTS/tuned.yaml"
     parser.add_argument("--into", type=Path, metavar="FILE", help=into)
     options = parser.parse_args(arguments)

@@ -1,21 +1,21 @@
-"""Questions and verdicts: each page's from the committed results, and that they are of the numbers in its CSV."""
+"""Questions and verdicts: those that are shipped, and that they are of the numbers in the CSV."""
 
-import json
-import shutil
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from bench.report.pages.completion import crossing_gaps, scans, table2
+from bench.records.read import read_records
 from bench.report.pages.rendering import fig7, table1
 from bench.report.pages.speed import speed
 from bench.report.pages.stability import stability
-from bench.report.site.papers import papers, read_shown
-from bench.report.write.answer import Ranked, answered, chart_panel, excluding, ranked, series, write_answers
-from bench.report.write.paper import SMOKE, page_names
+from bench.report.write.answer import Ranked, excluding, ranked
+from bench.report.write.caption import SMOKE
+from bench.report.write.chart import panel_data, series
+from bench.report.write.paper import write_paper
+from bench.report.write.result import Shown, read_shown
+from tests.report.test_report_paper import costs, write_run
 
 PAPER = Path(__file__).parents[2] / "results" / "paper"
 WITHOUT = {
@@ -29,20 +29,17 @@ WITHOUT = {
 CHARTS = {"stability_curves"}  # pages whose answer is a chart alone
 
 
-@pytest.mark.parametrize("name", sorted(set(page_names()) - WITHOUT))
-def test_every_committed_table_has_a_question_and_a_verdict_with_a_number(name):
-    module, function = page_names()[name]
-    answer = getattr(import_module(f"bench.report.pages.{module}"), function.replace("make", "answer"))
-    if not (PAPER / f"{name}.csv").is_file():
-        pytest.skip(f"results/paper has no {name}.csv")
-    found = answered(answer, PAPER / name)
-    if name in CHARTS:
-        assert found.chart
+@pytest.mark.parametrize("name", sorted(path.stem for path in PAPER.glob("*.json")))
+def test_every_shipped_page_has_a_question_and_a_verdict_with_a_number(name):
+    shown = read_shown(PAPER / f"{name}.json")
+    assert shown.title.endswith(".") and shown.caption and (shown.rows or shown.drawn)
+    assert all(len(row) == len(shown.columns) for row in shown.rows)
+    if name in WITHOUT or (name in CHARTS and shown.chart):
         return
-    assert found.question.endswith("?") and found.verdict.endswith(".")
-    marked = found.verdict.split("*")[1::2]
-    assert marked and all(any(c.isdigit() for c in part) for part in marked) and found.verdict.count("*") % 2 == 0
-    assert "nan" not in found.verdict and len(found.verdict) < 400
+    assert shown.question.endswith("?") and shown.verdict.endswith(".")
+    marked = shown.verdict.split("*")[1::2]
+    assert marked and all(any(c.isdigit() for c in part) for part in marked) and shown.verdict.count("*") % 2 == 0
+    assert "nan" not in shown.verdict and len(shown.verdict) < 400
 
 
 def runs(*lines: tuple) -> pd.DataFrame:
@@ -79,42 +76,9 @@ def committed(name: str) -> pd.DataFrame:
 def test_verdicts_are_of_the_numbers_of_the_csv():
     costs = pd.DataFrame({"row": list("abc"), "status": ["ok", "ok", "timeout"], "step_s": [4.0, 2.0, 1.0]})
     assert table1.answer(costs, []).verdict.startswith("A step takes *2.00 s* with b and 4.00 s with a; 1 of 3 rows")
-    ends = {"own_low": 1.5, "own_high": 2.5, "renderer": 0.5, "loss": 4.0}
-    gaps = pd.DataFrame(
-        [{"compared": "b over a", "family": f, "own": x, **ends} for f, x in (("all families", 2.0), ("car", 9.0))]
-    )
-    verdict = crossing_gaps.answer(gaps, []).verdict
-    assert verdict == "b over a: *2.00* [1.50, 2.50] times the error; of it the renderer 0.500, the loss 4.00."
     shares = {"epsilon": [0.1, 0.01, 0.001], "status": ["ok", "ok", "nan"], "lost_share": [0.0, 0.01, 0.0]}
     verdict = fig7.answer(pd.DataFrame(shares | {"false_share": [0.2, 0.01, 0.0]}), []).verdict
     assert "epsilon = 0.01: *2 %*" in verdict and "at 0.1 they are 20 %" in verdict
-
-
-def won(row: str, other: str, probability: float) -> dict:
-    return {"family": "all families", "row": row, "other": other, "probability": probability, "shapes": 8}
-
-
-def test_a_method_that_does_not_beat_all_others_is_not_said_to():
-    beats = [won("a", "b", 0.7), won("a", "c", 0.6), won("b", "a", 0.3), won("b", "c", 0.9), won("c", "a", 0.4)]
-    verdict = table2.answer_wins(pd.DataFrame([*beats, won("c", "b", 0.1)]), []).verdict
-    assert verdict.startswith("a has the lower error than every other on most pairs; at least *60 %*, against c")
-    circle = [won("a", "b", 0.6), won("a", "c", 0.4), won("b", "a", 0.4), won("c", "a", 0.6)]
-    circle += [won("b", "c", 0.7), won("c", "b", 0.3)]
-    assert table2.answer_wins(pd.DataFrame(circle), []).verdict.startswith(
-        "No method has the lower error than every other"
-    )
-
-
-def scanned(*lines: tuple) -> pd.DataFrame:
-    return pd.DataFrame(lines, columns=["row", "index", "depths", "status", "depth_mae"]).assign(seed=0)
-
-
-def test_ratios_of_scans_are_over_those_that_both_have_and_a_failure_is_infinite():
-    pairs = [("a", n, depths, "ok", x) for n in (0, 1) for depths, x in (("measured", 2.0), ("exact", 1.0))]
-    pairs += [("b", 0, "measured", "ok", 1.0), ("b", 0, "exact", "ok", 1.0), ("b", 1, "measured", "ok", 9.0)]
-    assert "*1.00* (b) to *2.00* (a)" in scans.answer(scanned(*pairs), []).verdict
-    failed = [("a", 0, "measured", "nan", 2.0), *pairs[1:]]
-    assert "*1.00* (b) to *∞* (a)" in scans.answer(scanned(*failed), []).verdict
 
 
 def test_the_atlas_has_a_cell_for_each_run_and_the_front_a_point_for_each_setting():
@@ -131,42 +95,20 @@ def test_the_atlas_has_a_cell_for_each_run_and_the_front_a_point_for_each_settin
 
 
 def test_an_axis_is_logarithmic_where_its_values_are_positive_and_spread():
-    made = chart_panel("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
+    made = panel_data("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
     assert made["x"] == {"title": "x", "log": True} and made["y"] == {"title": "y", "log": False}
     assert made["series"][0]["colour"] == "#0072b2"
 
 
-def test_a_csv_that_cannot_be_read_is_named_and_has_no_verdict(tmp_path):
-    paper = tmp_path / "paper"
-    paper.mkdir()
-    (paper / "table1.csv").write_text("a,b\n1,2\n")
-    (paper / "table1.json").write_text('{"verdict": "an older one"}')
-    (paper / "fig7.csv").write_text("")
-    problems = write_answers(tmp_path)
-    assert [problem.split()[0] for problem in problems] == ["paper/table1.csv", "paper/fig7.csv"]
-    assert not (paper / "table1.json").exists()
-
-
 def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
-    paper = tmp_path / "paper"
-    paper.mkdir()
-    shutil.copy(PAPER / "table1.csv", paper)
-    (paper / "table1.md").write_text(f"**Costs.** {SMOKE} What is plotted.\n")
-    assert write_answers(tmp_path) == []
-    assert papers(tmp_path)[0][0]["verdict"] == SMOKE
-    assert read_shown(paper / "table1.json")["verdict"].startswith("A step takes")
+    for label in ("quick", "slow"):
+        write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
+    write_paper(read_records(tmp_path)[0], tmp_path)
+    shown = read_shown(tmp_path / "paper" / "table1.json")
+    assert shown.verdict == SMOKE and shown.question.endswith("?") and shown.experiments == ["table1"]
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])
 def test_an_odd_file_beside_a_table_adds_nothing(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
-    assert read_shown(tmp_path / "a.json") == {}
-
-
-def test_the_same_csv_gives_the_same_file(tmp_path):
-    (tmp_path / "paper").mkdir()
-    shutil.copy(PAPER / "fig7.csv", tmp_path / "paper")
-    write_answers(tmp_path)
-    first = (tmp_path / "paper" / "fig7.json").read_bytes()
-    write_answers(tmp_path)
-    assert (tmp_path / "paper" / "fig7.json").read_bytes() == first and json.loads(first)["question"]
+    assert read_shown(tmp_path / "a.json") == Shown()

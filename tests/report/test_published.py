@@ -2,9 +2,9 @@
 
 import pytest
 
-from bench.report.pages.completion import table2
 from bench.report.pages.rendering import table1
 from bench.report.pages.views import table3
+from bench.studies import table2
 
 # DIST, Table 1: steps, queries, time.
 TABLE1 = """

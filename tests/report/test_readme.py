@@ -3,9 +3,11 @@
 import html
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from bench.report.write.paper import write_readme
+from bench.report.write.result import Shown
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "results" / "paper"
@@ -26,9 +28,15 @@ def test_the_results_page_follows_its_tables(tmp_path):
     folder = tmp_path / "paper"
     folder.mkdir()
     assert write_readme(tmp_path) is None
-    (folder / "mine.md").write_text("**Mine.** Of one run.\n\n| a | b |\n| --- | ---: |\n| x | 1.5 |\n\n- A note\n")
+    mine = Shown(title="Mine.", question="Whose?", verdict="Of *1* run.", caption="Of one run.", columns=["a", "b"])
+    (folder / "mine.json").write_text(replace(mine, rows=[["x", "1.5"]], notes=["A note"]).to_json())
     text = write_readme(tmp_path).read_text()
-    assert "- [Mine](#mine)" in text and "Of one run." in text and ["x", "1.5"] in rows(text)
+    assert (
+        "- [Whose?](#mine)" in text
+        and "Whose? **Of 1 run.**" in text
+        and "Of one run." in text
+        and ["x", "1.5"] in rows(text)
+    )
     assert re.search(r"<details><summary>Notes</summary>\n\n- A note\n\n</details>", text)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
-from bench.report.data.subjects.completions import EVERY
-from bench.report.data.subjects.crossing import CROSSING, Crossed
-from bench.report.pages.completion import crossing, crossing_gaps
-from tests.report.test_report_paper import told, write_run
+from bench.report.compare import EVERY, Comparison
+from bench.report.data.runs import choose
+from bench.studies import crossing
+from bench.studies.crossing import READS, Crossed
+from tests.report.test_report_paper import write_run
 
 RENDERERS = {"dist": ("renderers.DIST", "DIST"), "idr": ("renderers.IDR", "IDR")}
 LOSSES = {"Hinge": "DIST's mask loss", "CrossEntropy": "IDR's mask loss"}
@@ -43,7 +43,7 @@ def crossed(results, *, both=BOTH, families=("sofa", "plane"), shapes=8, failed=
                         "index": index,
                     },
                 )
-    return choose(read_records(results)[0], CROSSING, results)
+    return choose(read_records(results)[0], READS[0], results)
 
 
 def line(result, **wanted):
@@ -56,19 +56,19 @@ def line(result, **wanted):
 
 
 def test_all_runs_are_one_experiment_with_a_cell_per_setting(tmp_path):
-    found = Crossed(crossed(tmp_path, shapes=2))
-    runs, rows = found.runs, found.rows
-    assert (runs.families, runs.points) == (["sofa", "plane"], ["100", "20"])
+    found = Crossed(crossed(tmp_path, shapes=2), Comparison())
+    rows = found.settings
+    assert (found.families, found.conditions) == (["sofa", "plane"], ["100", "20"])
     assert (found.renderers, found.losses) == (["dist", "idr"], ["Hinge", "CrossEntropy"])
     assert found.own == {"dist": "Hinge", "idr": "CrossEntropy"}
-    assert runs.median("sofa", rows["idr", "CrossEntropy"], "100") == pytest.approx(1.5 * 3 * 1.5)
-    assert runs.median("table", rows["idr", "Hinge"], "100") is None
-    values = runs.over_points(EVERY, rows["idr", "Hinge"])
-    assert len(values) == 4 and values[("sofa", 0), 0, 0] == pytest.approx(1.5 * math.sqrt(2))
+    assert found.median("sofa", rows["idr", "CrossEntropy"], "100") == pytest.approx(1.5 * 3 * 1.5)
+    assert found.median("table", rows["idr", "Hinge"], "100") is None
+    values = found.means(EVERY, rows["idr", "Hinge"])
+    assert len(values) == 4 and values[("sofa", "0"), 0, 0] == pytest.approx(1.5 * math.sqrt(2))
 
 
 def test_a_gap_under_own_losses_is_the_renderers_times_the_losses(tmp_path):
-    result = crossing_gaps.make(crossed(tmp_path))
+    result = crossing.make_gaps(crossed(tmp_path))
     gap = line(result, family=EVERY)
     assert gap["compared"] == "IDR over DIST" and gap["shapes"] == 16
     assert gap["own"] == pytest.approx(4.5)  # the methods' gap
@@ -76,36 +76,35 @@ def test_a_gap_under_own_losses_is_the_renderers_times_the_losses(tmp_path):
     assert gap["Hinge"] == pytest.approx(1.5) and gap["CrossEntropy"] == pytest.approx(1.5)
     assert gap["own_better"] == 0
     assert gap["own_low"] == pytest.approx(4.5) and gap["own_high"] == pytest.approx(4.5)  # the same on every shape
-    said = "under its own loss: 4.50 [4.50, 4.50] times the error; of it the renderer 1.50 [1.50, 1.50], the loss 3.00"
-    assert said in told(result)
-    one_loss = (
-        "Under one loss, the interval excludes 1 for 2 of 2 ratios over all families: IDR over DIST under DIST's mask"
+    assert result.verdict == (
+        "IDR over DIST: *4.50* [4.50, 4.50] times the error; of it the renderer 1.50 [1.50, 1.50], the loss 3.00 "
+        "[3.00, 3.00]. The interval excludes 1 for *2 of 2* ratios under one loss: IDR over DIST under DIST's mask "
+        "loss 1.50 [1.50, 1.50]; IDR over DIST under IDR's mask loss 1.50 [1.50, 1.50]."
     )
-    assert one_loss in told(result)
 
 
 def test_the_two_parts_make_the_gap_also_where_they_interact(tmp_path):
-    gap = line(crossing_gaps.make(crossed(tmp_path, both=1 / 9)), family="sofa")
+    gap = line(crossing.make_gaps(crossed(tmp_path, both=1 / 9)), family="sofa")
     assert gap["own"] == pytest.approx(0.5)
     assert gap["renderer"] == pytest.approx(0.5) and gap["loss"] == pytest.approx(1)  # 1.5 and 1/6; 3 and 1/3
 
 
 def test_a_failure_has_the_largest_error_of_any_setting_on_its_shape(tmp_path):
     experiment = crossed(tmp_path, families=("sofa",), failed={("sofa", 3, "idr", "Hinge")})
-    gap = line(crossing_gaps.make(experiment), family="sofa")
+    gap = line(crossing.make_gaps(experiment), family="sofa")
     assert gap["Hinge"] == pytest.approx((1.5**7 * 4.5) ** (1 / 8)) and gap["shapes"] == 8
     table = crossing.make(experiment).table
     row = table[(table["Renderer"] == "IDR") & (table["Loss of the mask"] == LOSSES["Hinge"])]
     assert row["Failed"].item() == "2 of 16"
     both = crossed(tmp_path / "both", families=("sofa",), failed={("sofa", 3, "idr", x) for x in LOSSES})
-    gap = line(crossing_gaps.make(both), family="sofa")  # where both fail neither draws the ratio towards 1
+    gap = line(crossing.make_gaps(both), family="sofa")  # where both fail neither draws the ratio towards 1
     assert gap["CrossEntropy"] == pytest.approx((1.5**7 * 1) ** (1 / 8))
 
 
 def test_a_shape_on_which_every_setting_fails_is_left_out(tmp_path):
     everywhere = {("sofa", 3, renderer, loss) for renderer in RENDERERS for loss in LOSSES}
     experiment = crossed(tmp_path, families=("sofa",), failed=everywhere)
-    assert line(crossing_gaps.make(experiment), family="sofa")["shapes"] == 7
+    assert line(crossing.make_gaps(experiment), family="sofa")["shapes"] == 7
     data = crossing.make_front(experiment).data
     assert np.isfinite(data[["error", "low", "high"]].to_numpy(float)).all()
 
@@ -113,14 +112,7 @@ def test_a_shape_on_which_every_setting_fails_is_left_out(tmp_path):
 def test_a_renderer_without_a_run_that_ended_ok_is_not_on_the_front(tmp_path):
     everywhere = {("sofa", index, "dist", loss) for index in range(8) for loss in LOSSES}
     table = crossing.make_front(crossed(tmp_path, families=("sofa",), failed=everywhere)).table
-    assert set(table["Renderer"]) == {"IDR"} and set(table["On the front"]) == {"yes"}
-
-
-def test_losses_are_compared_with_each_renderer(tmp_path):
-    found = line(crossing_gaps.make_losses(crossed(tmp_path, both=2.0)), family="plane")
-    assert found["compared"] == "IDR's mask loss over DIST's mask loss"
-    assert (found["DIST"], found["IDR"]) == (pytest.approx(3), pytest.approx(6))
-    assert (found["DIST_better"], found["shapes"]) == (0, 8)
+    assert set(table["Renderer"]) == {"IDR"} and set(table["Best for its cost"]) == {"yes"}
 
 
 def test_a_renderer_without_a_known_loss_has_no_own_gap(tmp_path):
@@ -128,7 +120,7 @@ def test_a_renderer_without_a_known_loss_has_no_own_gap(tmp_path):
     for record in experiment.records:
         if record["renderer"] == "idr":
             record["config"]["renderer"]["_target_"] = "mine.Renderer"
-    gap = line(crossing_gaps.make(experiment), family="sofa")
+    gap = line(crossing.make_gaps(experiment), family="sofa")
     assert gap["Hinge"] == pytest.approx(1.5)
     assert not {"own", "renderer", "loss"} & {*gap.dropna().index}
 

@@ -124,8 +124,6 @@ def test_old_records_and_other_experiments_are_ignored(tmp_path):
     (folder / "record.json").write_text(json.dumps(record))
     assert chosen(tmp_path, "table1") is None
     write_run(tmp_path, "fig4", NAIVE)
-    write_run(tmp_path, "table1", DYNAMIC, task="completion")  # not what table1 is made of
-    assert chosen(tmp_path, "table1") is None
     assert chosen(tmp_path, "fig4").names() == [NAIVE]
 
 
@@ -256,14 +254,14 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     assert r"50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
     assert r"\textless{}script\textgreater{}" in row
     assert row.replace(r"\&", "").count("&") == 12 and row.count(r"\\") == 1  # the 13 cells of one row
-    found = next(paper for paper in find_paper(tmp_path) if paper["name"] == "table1")
-    assert found["rows"][0][0] == hostile and len(found["rows"][0]) == len(found["header"]) == 13
+    shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
+    assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
     assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
 
 
 def test_latex_is_one_plain_booktabs_table(tmp_path):
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs(depth_error_max="inf"))
-    text = tables.latex(table1.make(chosen(tmp_path, "table1")), "table1")
+    text = tables.latex(table1.make(chosen(tmp_path, "table1")).shown(), "table1")
     for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\begin{tabular}", r"\end{table*}"):
         assert text.count(rule) == 1
     assert r"$\infty$" in text and r"64$\times$64" in text

@@ -283,4 +283,4 @@ def test_the_report_writes_both_even_where_all_runs_failed(tmp_path):
 
 
 def test_latex_has_the_sign_of_a_standard_error(four):
-    assert r"10.0 $\pm$ 1.00" in latex(made_of(four, parsimony.make), "parsimony")
+    assert r"10.0 $\pm$ 1.00" in latex(made_of(four, parsimony.make).shown(), "parsimony")

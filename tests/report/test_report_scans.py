@@ -3,8 +3,8 @@
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
-from bench.report.pages.completion import scans
+from bench.report.data.runs import choose
+from bench.studies import scans
 from tests.report.test_report_paper import write_run
 
 DRAGON, BUNNY = "scans/dragon", "scans/bunny"

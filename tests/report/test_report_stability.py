@@ -5,8 +5,9 @@ import json
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose, named_by_rows, shared_loss
 from bench.report.data.records import row_of
+from bench.report.data.runs import choose, shared_loss
+from bench.report.data.runs import named_rows as named_by_rows
 from bench.report.data.subjects.atlas import STABILITY, atlas
 from bench.report.pages.stability import stability, stability_curves
 from bench.report.write.paper import write_paper
@@ -113,7 +114,7 @@ def test_a_loss_that_all_rows_share_is_in_the_caption_and_not_in_their_names(tmp
     result = made(tmp_path, stability.make)
     assert list(result.table.columns) == ["Axis", "Unit", "DIST", "DVR"]
     assert "every row with DIST's mask loss." in result.caption
-    assert [record["name"] for record in result.experiment.named()] == ["DIST", "DVR"]
+    assert [record["name"] for record in result.runs.named()] == ["DIST", "DVR"]
 
 
 def test_losses_that_differ_are_in_the_names_of_rows():

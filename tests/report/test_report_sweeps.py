@@ -126,7 +126,7 @@ def test_a_sweep_of_an_experiment_with_a_page_needs_no_table(tmp_path):
             one.config["experiment"] = experiment
         swept(tmp_path, cells, experiment)
     write_sweeps(read_records(tmp_path)[0], tmp_path)
-    assert [found["name"] for found in find_sweeps(tmp_path)] == ["of_mine"]
+    assert [found.name for found in find_sweeps(tmp_path)] == ["of_mine"]
 
 
 def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
@@ -139,13 +139,13 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert str(folder / "table.csv") in capsys.readouterr().out
     assert not (tmp_path / "paper").exists()
     (found,) = find_sweeps(tmp_path)
-    assert (found["name"], found["title"]) == ("completion-1", "Sweep completion-1.")
-    assert found["header"][:2] == ["Run", "Chamfer (x1000)"] and found["rows"][0][:2] == ["DIST", "1.00 (n = 1)"]
-    assert found["files"] == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
+    assert (found.name, found.shown.title) == ("completion-1", "Sweep completion-1.")
+    assert found.shown.columns[:2] == ["Run", "Chamfer (x1000)"] and found.shown.rows[0][:2] == ["DIST", "1.00 (n = 1)"]
+    assert found.files == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
     within = re.search(r"WITHIN = /(.*)/;", (ASSETS / "base" / "dom.js").read_text())
-    assert within and all(re.fullmatch(within[1], link) for link in found["files"].values())  # the page links to them
+    assert within and all(re.fullmatch(within[1], link) for link in found.files.values())  # the page links to them
     assert r"\label{tab:completion-1}" in (folder / "table.tex").read_text()
-    assert "swept over renderer (dist, dvr)." in found["caption"] and "All 2 runs ended ok." in found["caption"]
+    assert "swept over renderer (dist, dvr)." in found.shown.caption and "All 2 runs ended ok." in found.shown.caption
 
 
 def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):

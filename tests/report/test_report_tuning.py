@@ -11,7 +11,6 @@ from bench.records.read import read_records
 from bench.report.data import statistics
 from bench.report.data.experiments import choose
 from bench.report.data.subjects.tuning import TUNING, tunings
-from bench.report.pages.completion import tuned as tuned_page
 from bench.report.pages.completion import tuning
 from bench.tables import CONF, read_rows, read_yaml
 from bench.tune.__main__ import HEAD, WIDTH, main, write
@@ -222,41 +221,3 @@ def test_without_runs_the_command_says_which_are_needed(tmp_path, capsys):
     assert "type python -m bench -m +experiment=tuning" in capsys.readouterr().err
     with pytest.raises(ValueError, match="has no runs of the tuning"):
         write(tmp_path, tmp_path / "tuned.yaml")
-
-
-@pytest.mark.parametrize(
-    ("preset", "default"),
-    [
-        ("tuned/idr_mask", "idr_mask"),
-        ("dist_mask_paper", "dist_mask"),
-        ("dist_mask_official", "dist_mask"),
-        ("dist_mask", "dist_mask"),
-    ],
-)
-def test_rows_are_compared_with_their_method_as_it_stands(preset, default):
-    assert tuned_page.default_of(preset) == default
-
-
-def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
-    for preset, label, factor in (("dist_mask", "DIST", 2.0), ("tuned/dist_mask", "DIST, tuned", 1.0)):
-        for index in range(6):
-            for points in ("100", "20"):
-                write_run(
-                    tmp_path,
-                    "tuned",
-                    label,
-                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": preset},
-                    metrics={"chamfer_l2": factor * (1 + index) / 1000},
-                    settings={
-                        "task": {"points": points, "_target_": "completion"},
-                        "dataset": {"name": "sofa"},
-                        "index": index,
-                    },
-                )
-    result = tuned_page.make(choose(read_records(tmp_path)[0], tuned_page.READS[0], tmp_path))
-    table = result.table.set_index("Method")
-    said = "The interval excludes 1 for 1 of 1 ratios of tuned settings to the defaults: DIST, tuned on sofa, 0.500"
-    assert said in told(result)
-    assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
-    assert table.loc["DIST", "Ratio to the default"] == ""
-    assert table.loc["DIST", "100 pts"] == "7.00"

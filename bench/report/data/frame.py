@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from bench.records.names import flat
-from bench.records.read import read_records
+from bench.records.read import RESULTS, read_records
 from bench.records.record import row_name, started
 from bench.report.data.records import index
 from datasets.extras import install
@@ -40,10 +40,10 @@ PARQUET = "results.parquet"
 NO_PARQUET = f"{PARQUET} was not written, as it needs pyarrow: {install('parquet')}"
 
 
-def load(results: str | os.PathLike[str] = "results") -> pd.DataFrame:
+def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
     """All runs of a results folder as a table, a row per run, failed and planned ones included, newest first.
 
-    >>> runs = load("results")
+    >>> runs = load("results/local")
     >>> runs[["name", "status", "seed"]]
          name status  seed
     0  Newton     ok     0

@@ -9,7 +9,6 @@ from typing import Any
 from bench.records import metrics
 from bench.records.names import differences
 from bench.records.read import read_plans
-from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
     Record,
     RunKey,
@@ -22,6 +21,7 @@ from bench.report.data.records import (
     run_key,
     value_evaluations,
 )
+from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
 
 OK = "ok"
@@ -39,7 +39,7 @@ class SweepRuns:
 
     name: str
     swept: dict[str, list[str]]
-    runs: Experiment
+    runs: Runs
 
     def rows(self) -> dict[str, list[Record]]:
         """The records of each row, in the order of the plan."""
@@ -91,10 +91,9 @@ def runs_of(plan: dict[str, Any], known: dict[str, Record], results_dir: Path) -
     swept = {key: values for key, values in swept.items() if len(values) > 1}
     found = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
     named = [run | {"row": name} for run, name in zip(runs, found.names, strict=True)]
-    tasks = tuple(dict.fromkeys(run["task"] for run in runs))
     experiment = plan["cells"][0]["config"].get("experiment") or ""
-    selection = Selection(experiment, tasks, varies=tuple(swept), setup=("scenes", "pixels", "machine"))
-    return SweepRuns(plan["name"], swept, Experiment(selection, results_dir, named))
+    selection = Selection(experiment, setup=("scenes", "pixels", "machine"))
+    return SweepRuns(plan["name"], swept, Runs(selection, results_dir, named))
 
 
 def _asked(overrides: list[str]) -> dict[str, str]:

@@ -1,26 +1,19 @@
 """The question that a table or figure answers, its verdict in a sentence and its chart, from its CSV alone."""
 
-import json
 import math
 import re
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from importlib import import_module
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
 
-import numpy as np
 import pandas as pd
 
-from bench.pictures import style
-from bench.records.files import plain, write_text
 from bench.records.format import number
 from bench.report.data.statistics import median
-from bench.report.write.paper import FOLDER, page_names, read_page
+from bench.report.write.chart import panel_data as chart_panel
+from bench.report.write.chart import series
 
-# What a CSV that is not of this version, or not of this program, makes a page's `answer` raise.
-UNREADABLE = (OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)
+__all__ = ["Answer", "chart_panel", "presets_of", "ranked", "series"]
 
 
 @dataclass(frozen=True)
@@ -38,39 +31,6 @@ class Answer:
     verdict: str = ""
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
-
-
-def write_answers(results_dir: Path) -> list[str]:
-    """Writes `paper/NAME.json` beside the CSV of each page that has an `answer`.
-
-    A page's `answer`, with the suffix of its `make`, takes the CSV as a frame and the page's notes.
-
-    Returns:
-        A line for each CSV that cannot be read.
-    """
-    problems = []
-    for name, (module, function) in page_names().items():
-        base = results_dir / FOLDER / name
-        answer = getattr(import_module(f"bench.report.pages.{module}"), function.replace("make", "answer"), None)
-        if answer is None or not base.with_suffix(".csv").is_file():
-            continue
-        try:
-            found = answered(answer, base)
-        except UNREADABLE as error:
-            problems.append(f"{FOLDER}/{name}.csv gives no verdict ({type(error).__name__}: {error})")
-            base.with_suffix(".json").unlink(missing_ok=True)
-            continue
-        kept = {key: value for key, value in asdict(found).items() if value}
-        write_text(base.with_suffix(".json"), json.dumps(plain(kept), separators=(",", ":")) + "\n")
-    return problems
-
-
-def answered(answer: Callable[[pd.DataFrame, list[str]], Answer], base: Path) -> Answer:
-    """What a page answers, from its files."""
-    data = pd.read_csv(base.with_suffix(".csv"), low_memory=False)
-    found = answer(data, read_page(base)["notes"])
-    json.dumps(asdict(found), default=str)  # a chart that cannot be written is found here
-    return found
 
 
 @dataclass(frozen=True)
@@ -128,23 +88,6 @@ def excluding(data: pd.DataFrame, names: list[str]) -> tuple[int, int]:
     return sum(not low <= 1 <= high for low, high in known), len(known)
 
 
-def chart_panel(title: str, x: str, y: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    """A panel of a chart; an axis is logarithmic where its values are positive and span more than a factor of 3."""
-    axes = {}
-    for letter, name in (("x", x), ("y", y)):
-        values = [v for each in series for v in each[letter] if isinstance(v, int | float) and math.isfinite(v)]
-        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
-        axes[letter] = {"title": name, "log": log}
-    return {"title": title, **axes, "series": series, **more}
-
-
-def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any]:
-    """A series of a chart with the colour and marker that its preset has in every figure."""
-    look = style.look(preset)
-    marks = {"colour": look.colour, "symbol": look.marker} | more
-    return {"name": name, "x": _rounded(x), "y": _rounded(y), **marks}
-
-
 def presets_of(data: pd.DataFrame, names: str = "row") -> dict[str, str]:
     """The preset of each row of a CSV, which decides its look; an older CSV has the renderer, or the name alone."""
     found = {str(name): str(name) for name in data[names]}
@@ -152,10 +95,6 @@ def presets_of(data: pd.DataFrame, names: str = "row") -> dict[str, str]:
         known = data[data[column].notna()]
         found |= dict(zip(known[names].astype(str), known[column].astype(str), strict=True))
     return found
-
-
-def _rounded(values: Any) -> list[float]:
-    return [float(f"{value:.5g}") for value in np.asarray(values, float)]
 
 
 def runs_of(row: str) -> str:

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from operator import itemgetter
 from typing import Any
 
-from bench.report.data.experiments import Experiment, shared_loss
 from bench.report.data.records import Record, setting, solid, view
+from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
-from bench.report.write.paper import SMOKE
 
+SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
 MOST_FAILURES = 4  # most failed runs that a caption lists one by one
 OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
@@ -19,25 +19,29 @@ FEWEST_COUNTED = 4  # rows that are named one by one in a warning; more are coun
 FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
 
-def caption(experiment: Experiment, plotted: str, *, n: str = "", interval: str = "") -> str:
+def caption(runs: Runs, plotted: str, *, n: str = "", interval: str = "") -> str:
     """The caption of a page, in four sentences, behind a warning where its runs are of scale=smoke.
 
     Args:
-        experiment: the experiment that the page shows.
+        runs: what the page shows.
         plotted: what is plotted, as a sentence; `OVER` in it becomes that over which runs vary.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval, likewise; empty for none.
     """
-    sample = (n or _sample(experiment)) + (f"; {said(experiment, interval)}" if interval else "") + "."
-    setup = _setup(experiment)
-    tried = any(setting(record["config"], "scale", "name") == "smoke" for record in experiment.records)
-    first = [SMOKE if tried else "", said(experiment, plotted)]
-    return " ".join(filter(None, [*first, f"n = {sample}", _outcome(experiment), f"{setup}." if setup else ""]))
+    sample = (n or _sample(runs)) + (f"; {said(runs, interval)}" if interval else "") + "."
+    setup = _setup(runs)
+    first = [SMOKE if tried(runs) else "", said(runs, plotted)]
+    return " ".join(filter(None, [*first, f"n = {sample}", _outcome(runs), f"{setup}." if setup else ""]))
 
 
-def said(experiment: Experiment, text: str) -> str:
+def tried(runs: Runs) -> bool:
+    """Whether there is a run of scale=smoke."""
+    return any(setting(record["config"], "scale", "name") == "smoke" for record in runs.records)
+
+
+def said(runs: Runs, text: str) -> str:
     """The text with that over which the runs of an experiment vary in place of `OVER`, such as shapes and seeds."""
-    shapes, views, seeds = _levels(experiment)
+    shapes, views, seeds = _levels(runs)
     levels = [name for name, varies in (("views", views > 1), ("seeds", seeds > 1)) if varies]
     words = " and ".join(["shapes", *levels] if shapes > 1 else levels)
     return text.replace(OVER, words if shapes > 1 else f"{words} of one shape" if words else "one shape")
@@ -64,50 +68,50 @@ def undefined(values: Iterable[float]) -> str:
     return "One shape and one seed are one draw: from it no probability and no rank is given (–)." if none else ""
 
 
-def warnings(experiment: Experiment) -> list[str]:
-    """Notes on times that cannot be compared or are doubtful, and on runs that are not shown."""
-    return [note for note in (_compared(experiment), _loaded(experiment), _omitted(experiment)) if note]
+def warnings(runs: Runs) -> list[str]:
+    """Notes on settings that differ, on times that do not compare or are doubtful, and on runs that are not shown."""
+    return [note for note in (_mixed(runs), _compared(runs), _loaded(runs), _omitted(runs)) if note]
 
 
-def _sample(experiment: Experiment) -> str:
+def _sample(runs: Runs) -> str:
     """The numbers of runs, shapes, views where these are several, and seeds."""
-    shapes, views, seeds = _levels(experiment)
+    shapes, views, seeds = _levels(runs)
     parts = [_plural("shape", shapes), *([_plural("view", views)] if views > 1 else []), _plural("seed", seeds)]
-    return f"{_plural('run', len(experiment.records))} ({', '.join(parts)})"
+    return f"{_plural('run', len(runs.records))} ({', '.join(parts)})"
 
 
-def _levels(experiment: Experiment) -> tuple[int, int, int]:
+def _levels(runs: Runs) -> tuple[int, int, int]:
     """The numbers of shapes, of views of a shape, and of seeds."""
-    records = experiment.records
+    records = runs.records
     shapes = {(solid(record), record["config"].get("split")) for record in records}
     return len(shapes), *(len({part(record) for record in records}) for part in (view, itemgetter("seed")))
 
 
-def _setup(experiment: Experiment) -> str:
+def _setup(runs: Runs) -> str:
     """The parts of the setup that are known: scenes, the resolution, prior and loss that all runs have, the machine."""
-    scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in experiment.records))
-    shown = [scene for scene in scenes if scene] or [experiment.records[0]["dataset"]]
-    sizes = {setting(record["config"], "view", "resolution") for record in experiment.records}
+    scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in runs.records))
+    shown = [scene for scene in scenes if scene] or [runs.records[0]["dataset"]]
+    sizes = {setting(record["config"], "view", "resolution") for record in runs.records}
     resolution = sizes.pop() if len(sizes) == 1 else None
-    config = experiment.requested()
+    config = runs.requested()
     network = setting(config, "prior", "network") or setting(config, "scale", "network") or {}
     layers, width = setting(network, "layers"), setting(network, "width")
-    machines = [_machine(*machine) for machine in experiment.machines()]
+    machines = [_machine(*machine) for machine in runs.machines()]
     parts = {
         "scenes": f"{'Scene' if len(shown) == 1 else f'{len(shown)} scenes:'} {_listed(shown)}",
         "pixels": f"{resolution}×{resolution} pixels" if resolution else "",
         "network": f"decoder of {layers} layers of {width}" if layers and width else "",
         "machine": f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines),
     }
-    loss = shared_loss(experiment.records)
-    known = [parts[name] for name in experiment.selection.setup if parts[name]]
+    loss = shared_loss(runs.records)
+    known = [parts[name] for name in runs.selection.setup if parts[name]]
     return "; ".join(known + ([f"every row with {loss}"] if loss else []))
 
 
-def _outcome(experiment: Experiment) -> str:
+def _outcome(runs: Runs) -> str:
     """The number of runs that did not end ok: each with its reason or, where they are many, counted by status."""
-    failed = [record for record in experiment.named() if record["status"] != "ok"]
-    total = len(experiment.records)
+    failed = [record for record in runs.named() if record["status"] != "ok"]
+    total = len(runs.records)
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
     if len(failed) <= MOST_FAILURES:
@@ -119,28 +123,33 @@ def _outcome(experiment: Experiment) -> str:
     return f"{subject} did not end ok: {listed}."
 
 
-def _omitted(experiment: Experiment) -> str:
-    """The number of records of this experiment that are not shown, and the reason; empty where all are shown."""
-    count = experiment.left_out
-    reason = "of this experiment with another scene, setting or machine"
-    return f"Not shown: {_plural('run', count)} {reason}." if count else ""
+def _omitted(runs: Runs) -> str:
+    """The number of runs of this experiment that are not shown, and the reason; empty where all are shown."""
+    reason = "of this experiment at another scale or on another scene, or replaced by newer ones"
+    return f"Not shown: {_plural('run', runs.left_out)} {reason}." if runs.left_out else ""
 
 
-def _compared(experiment: Experiment) -> str:
+def _mixed(runs: Runs) -> str:
+    """A warning where runs differ in settings that rows should share; empty where they do not."""
+    found = runs.mixed()
+    return f"Runs differ in {_listed(found)}: rows with other values do not compare." if found else ""
+
+
+def _compared(runs: Runs) -> str:
     """A warning where the rows' times were measured on different machines or with different numbers of threads."""
-    machines = experiment.machines()
+    machines = runs.machines()
     if len(machines) < 2:
         return ""
     each = [f"{_machine(*machine) or 'unnamed machine'} ({_listed(rows)})" for machine, rows in machines.items()]
     return f"Times of rows from different machines or numbers of threads do not compare: {'; '.join(each)}."
 
 
-def _loaded(experiment: Experiment) -> str:
+def _loaded(runs: Runs) -> str:
     """A warning where other work on the machine, or a missing synchronisation, makes times doubtful."""
     doubtful = ("loaded machine", "missing synchronisation")
-    names = [r["name"] for r in experiment.named() if any(note.startswith(doubtful) for note in r["notes"])]
-    few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(experiment.records)} runs"
-    rows = "all rows" if len(names) == len(experiment.records) > 1 else few
+    names = [r["name"] for r in runs.named() if any(note.startswith(doubtful) for note in r["notes"])]
+    few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(runs.records)} runs"
+    rows = "all rows" if len(names) == len(runs.records) > 1 else few
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
 
 

@@ -130,6 +130,27 @@ def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: floa
         taken.append(boxes[place])
 
 
+def panel_data(title: str, x: str, y: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """A panel of the page's chart; an axis is logarithmic where its values are positive and span a factor above 3."""
+    axes = {}
+    for letter, name in (("x", x), ("y", y)):
+        values = [v for each in series for v in each[letter] if isinstance(v, int | float) and math.isfinite(v)]
+        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
+        axes[letter] = {"title": name, "log": log}
+    return {"title": title, **axes, "series": series, **more}
+
+
+def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any]:
+    """A series of the page's chart with the colour and marker that its preset has in every figure."""
+    look = style.look(preset)
+    found = {"name": name, "x": _rounded(x), "y": _rounded(y), "colour": look.colour, "symbol": look.marker}
+    return found | more
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.5g}") for value in np.asarray(values, float)]
+
+
 def _within(box: Bbox, outer: Bbox) -> bool:
     return bool(outer.x0 <= box.x0 and box.x1 <= outer.x1 and outer.y0 <= box.y0 and box.y1 <= outer.y1)
 

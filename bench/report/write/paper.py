@@ -1,92 +1,124 @@
-"""Writes the tables and figures of all experiments and their README; reads these and sweeps' tables for index.html."""
+"""Writes the tables and figures of all studies and their README; finds those of a results folder for index.html."""
 
-import html
 import os
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 from urllib.parse import quote
 
 from bench.records.files import leads_out, write_text
 from bench.records.read import PLAN
+from bench.report.data.runs import Runs, Selection, choose
+from bench.report.write.caption import SMOKE
+from bench.report.write.legacy import legacy
+from bench.report.write.result import Result, Shown, markdown, read_shown, write
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
-SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
-PAGES = Path(__file__).parents[1] / "pages"
-PLACE = re.compile(r"^PLACE(_[A-Z_]+)? = (\d+)$", re.MULTILINE)
+ROOT = Path(__file__).resolve().parents[3]
+SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
+STUDIES = ROOT / "bench" / "studies"
 
 HEAD = """# Results
 
-Written by `python -m bench.report` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in
-scene units), Markdown and LaTeX, each figure as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of
+Written by `make results` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in scene
+units), JSON, Markdown and LaTeX, each figure as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of
 the experiment that a page names; the README of `conf` lists the experiments and how long they take.
 
 """
 
 
-@cache
-def page_names() -> dict[str, tuple[str, str]]:
-    """The names of all pages in their order, each with the module and the function that make it.
+@dataclass(frozen=True)
+class Study:
+    """A file of `bench/studies`: the runs that it reads, and its pages, each made of them by a function.
 
-    A file of `PAGES`, in any of its rooms, makes the page of its name with `make`; its place among all pages is the
-    number `PLACE`. Further pages of the file have a suffix: `PLACE_COST` and `make_cost` are those of FILE_cost. The
-    files are read as text, not imported: they load matplotlib, which is not needed to find their output.
-
-    Raises:
-        ValueError: where a file has no such number.
+    A file has `PLACE`, its place among all, `READS`, a `Selection` for each argument of its functions, and `PAGES`,
+    these functions by the names of their pages.
     """
-    places: list[tuple[int, str, str, str]] = []
-    for path in PAGES.rglob("[!_]*.py"):
-        module = ".".join(path.relative_to(PAGES).with_suffix("").parts)
-        own = [(suffix.lower(), int(place)) for suffix, place in PLACE.findall(path.read_text(encoding="utf-8"))]
-        if not own:
-            raise ValueError(f"{path.name} must have a line such as PLACE = 10, its place among the pages; found none")
-        places += [(place, path.stem + suffix, module, f"make{suffix}") for suffix, place in own]
-    return {name: (module, function) for _, name, module, function in sorted(places)}
+
+    place: int
+    reads: tuple[Selection, ...]
+    pages: dict[str, Callable[..., Result]]
+
+    def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
+        """The result of each page; none where there is no run of it."""
+        chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
+        if not any(runs is not None for runs in chosen):
+            return {}
+        return {name: make(*chosen) for name, make in self.pages.items()}
 
 
-def write_paper(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
-    """Writes the files of every page that has runs to `results_dir/paper`; gives the path of each page's CSV."""
-    from bench.report.data.experiments import choose  # only here: matplotlib and scipy are not needed to find files
-    from bench.report.write.result import write
+@cache
+def studies() -> tuple[Study, ...]:
+    """All files of `bench/studies`, in the order of their places."""
+    files = [import_module(f"bench.studies.{file.name}") for file in iter_modules([str(STUDIES)])]
+    known = [Study(f.PLACE, f.READS, f.PAGES) for f in files]
+    known += [Study(*of_before) for of_before in legacy()]
+    return tuple(sorted(known, key=lambda study: study.place))
 
+
+def write_paper(records: list[dict[str, Any]], results_dir: Path, into: Path | None = None) -> list[Path]:
+    """Writes the files of every page that has runs to the folder `paper`; gives the path of each page's CSV.
+
+    Args:
+        into: the folder that gets `paper`; by default the results folder. Where it is another, it is what is shipped:
+            pages of runs of scale=smoke are left out.
+    """
     written = []
-    for name, (module, function) in page_names().items():
-        page = import_module(f"bench.report.pages.{module}")
-        chosen = [choose(records, selection, results_dir) for selection in page.READS]
-        if any(experiment is not None for experiment in chosen):
-            written.append(write(getattr(page, function)(*chosen), results_dir / FOLDER / name)[0])
+    for study in studies():
+        experiments = [selection.experiment for selection in study.reads]
+        for place, (name, result) in enumerate(study.results(records, results_dir).items()):
+            shown = result.shown(100 * study.place + place, experiments)
+            if into is None or not shown.caption.startswith(SMOKE):
+                written.append(write(result, shown, (into or results_dir) / FOLDER / name)[0])
     return written
 
 
-def find_paper(results_dir: Path) -> list[dict[str, Any]]:
-    """The contents of `results_dir/paper` for `index.html`: known pages first, then all others by name.
+@dataclass(frozen=True)
+class Found:
+    """A table or figure of a results folder: its name, what it says, its picture and its files by their kind.
 
-    Each has a name, title, caption, notes, the table's header and rows, and links to the picture and the files.
+    Paths of files are seen from the results folder, percent-encoded; `shipped` ones have none.
     """
+
+    name: str
+    shown: Shown
+    picture: str | None
+    files: dict[str, str]
+    base: Path
+    shipped: bool = False
+
+
+def find_paper(results_dir: Path) -> list[Found]:
+    """The tables and figures of `results_dir/paper` in their order, then shipped ones of other names."""
+    own = _in(results_dir)
+    names = {one.name for one in own}
+    shipped = [one for one in _in(SHIPPED) if one.name not in names] if results_dir.resolve() != SHIPPED else []
+    return own + [Found(one.name, one.shown, None, {}, one.base, shipped=True) for one in shipped]
+
+
+def _in(results_dir: Path) -> list[Found]:
+    """The tables and figures of a results folder in their order; those that no study made stand last."""
     folder = results_dir / FOLDER
-    kinds = (*SUFFIXES, ".png")
-    seen = {
-        path.stem
-        for path in folder.glob("*")
-        if path.suffix in kinds and path.is_file() and not leads_out(path, results_dir)
-    }
-    names = [*(name for name in page_names() if name in seen), *sorted(seen - {*page_names()})]
-    return [found(folder, name, (FOLDER,)) for name in names if not name.startswith(".")]
+    kinds = (*SUFFIXES, ".png", ".json")
+    seen = {path.stem for path in folder.glob("[!.]*") if path.suffix in kinds and path.is_file()}
+    found = [found_at(folder, name, (FOLDER,)) for name in seen]
+    known = [one for one in found if one.files or one.picture or one.shown.title]
+    return sorted(known, key=lambda one: (one.shown.place or 10**6, one.name))
 
 
-def find_sweeps(results_dir: Path) -> list[dict[str, Any]]:
-    """The tables of sweeps for `index.html`, the sweep that was asked for last first.
-
-    Each has what `find_paper` gives: a name, title, caption, notes, the table's header and rows, links to the files.
-    """
-    tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.md")
+def find_sweeps(results_dir: Path) -> list[Found]:
+    """The tables of sweeps, the sweep that was asked for last first, each by the name of its sweep."""
+    tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.json")
     folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
-    return [found(folder, TABLE, (SWEEPS, folder.name)) | {"name": folder.name} for folder in folders]
+    found = [(folder.name, found_at(folder, TABLE, (SWEEPS, folder.name))) for folder in folders]
+    return [Found(name, one.shown, one.picture, one.files, one.base) for name, one in found]
 
 
 def write_readme(results_dir: Path) -> Path | None:
@@ -94,12 +126,12 @@ def write_readme(results_dir: Path) -> Path | None:
 
     Gives its path; None where `results_dir/paper` has no table or figure.
     """
-    pages = [page for page in find_paper(results_dir) if page["title"]]
+    pages = [page for page in _in(results_dir) if page.shown.title]
     if not pages:
         return None
-    contents = [f"- [{page['title'].rstrip('.')}](#{page['name']})" for page in pages]
-    parts = [_section(results_dir / FOLDER / f"{page['name']}.md", page["name"]) for page in pages]
+    contents = [f"- [{page.shown.question or page.shown.title.rstrip('.')}](#{page.name})" for page in pages]
     path = results_dir / "README.md"
+    parts = [_section(page) for page in pages]
     write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
     return path
 
@@ -110,42 +142,15 @@ def _asked(folder: Path) -> float:
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
-def found(folder: Path, name: str, place: tuple[str, ...]) -> dict[str, Any]:
-    """The contents of the table or figure of that name, whose folder is at a place in the results folder."""
-    files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png")}
+def found_at(folder: Path, name: str, place: tuple[str, ...]) -> Found:
+    """The table or figure of that name, whose folder is at a place in the results folder; links out are left out."""
     root = folder.parents[len(place) - 1]
+    files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
     within = {suffix: path for suffix, path in files.items() if path.is_file() and not leads_out(path, root)}
     links = {suffix: link(*place, path.name) for suffix, path in within.items()}
-    picture = links.get(".png")
-    links.pop(".png", None)
-    named = {suffix[1:].upper(): link for suffix, link in links.items()}
-    return {"name": name, "picture": picture, "files": named, **read_page(folder / name)}
-
-
-def read_page(base: Path) -> dict[str, Any]:
-    """The title, caption, table and notes of `base.md`; empty ones where there is no such file."""
-    path = base.with_name(base.name + ".md")
-    sound = path.is_file() and not leads_out(path, base.parents[1])
-    return _parsed(path.read_text(encoding="utf-8", errors="replace") if sound else "")
-
-
-def _parsed(markdown: str) -> dict[str, Any]:
-    """The parts of a text that `result.markdown` wrote."""
-    parts: dict[str, Any] = {"title": "", "caption": "", "header": [], "rows": [], "notes": []}
-    for block in markdown.strip().split("\n\n"):
-        if block.startswith("|"):
-            header, *rows = [_cells(line) for line in block.splitlines()]
-            parts |= {"header": header, "rows": rows[1:]}
-        elif block.startswith("- "):
-            parts["notes"] = [html.unescape(line.removeprefix("- ")) for line in block.splitlines()]
-        elif not block.startswith("!["):
-            title, caption = re.fullmatch(r"(?:\*\*(.*?)\*\*)?\s*(.*)", block, re.DOTALL).groups()
-            parts |= {"title": html.unescape(title or ""), "caption": html.unescape(caption)}
-    return parts
-
-
-def _cells(line: str) -> list[str]:
-    return [html.unescape(cell.strip()) for cell in line.strip().strip("|").split("|")]
+    named = {suffix[1:].upper(): links[suffix] for suffix in SUFFIXES if suffix in links}
+    shown = read_shown(within[".json"]) if ".json" in within else Shown()
+    return Found(name, shown, links.get(".png"), named, folder / name)
 
 
 def link(*parts: str) -> str:
@@ -153,12 +158,10 @@ def link(*parts: str) -> str:
     return "/".join(quote(os.fsencode(part), safe="") for part in parts)
 
 
-def _section(path: Path, name: str) -> str:
+def _section(page: Found) -> str:
     """A page's Markdown under a heading, with its experiment, folded notes and links relative to the folder above."""
-    text = path.read_text(encoding="utf-8", errors="replace").replace(f"]({name}.png)", f"]({FOLDER}/{name}.png)")
-    module, _ = page_names().get(name, ("", ""))
-    selections = import_module(f"bench.report.pages.{module}").READS if module else ()
-    read = ", ".join(f"`{one}`" for one in dict.fromkeys(each.experiment for each in selections))
+    text = markdown(page.shown, page.name).replace(f"]({page.name}.png)", f"]({FOLDER}/{page.name}.png)")
     text = re.sub(r"((?:^- .*\n)+)", r"<details><summary>Notes</summary>\n\n\1\n</details>\n", text, flags=re.MULTILINE)
-    title, rest = re.fullmatch(r"\*\*(.*?)\*\*\s*(.*)", text, re.DOTALL).groups()
-    return f'## <a id="{name}"></a>{title}\n\n' + (f"Experiment: {read}.\n\n" if read else "") + rest
+    read = ", ".join(f"`{one}`" for one in page.shown.experiments)
+    heading = f'## <a id="{page.name}"></a>{page.shown.title.rstrip(".")}\n\n'
+    return heading + (f"Experiment: {read}.\n\n" if read else "") + text

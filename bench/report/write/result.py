@@ -1,17 +1,20 @@
-"""The result of a page, and its output as CSV, Markdown, LaTeX, PNG and PDF."""
+"""The result of a study, and its output as CSV, JSON, Markdown, LaTeX, PNG and PDF."""
 
 import html
+import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
-from bench.report.data.experiments import Experiment
+from bench.records.files import plain
+from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
 
@@ -47,54 +50,125 @@ _SPARED = "_"  # within words, where it has no meaning in Markdown
 
 @dataclass(frozen=True)
 class Result:
-    """A table, a figure or both, made from the records of an experiment.
+    """A table, a figure or both, with the question that it answers.
 
     Args:
-        experiment: the experiment that it shows.
+        runs: what it is made of.
         title: its title, as a sentence.
         plotted: what is plotted, as a sentence.
+        data: the raw numbers, including those that the figure plots.
+        question: as a reader would ask it; empty for a page of pictures.
+        verdict: the answer, one sentence with its numbers between asterisks; empty where the runs do not give it.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
         estimates: those that are shown with it, if there are shapes enough; empty for intervals that always are there.
         remarks: notes of its own; empty ones are left out.
-        data: the raw numbers, including those that the figure plots.
         table: the numbers as text for readers.
         figure: the figure.
+        chart: panels of series for the page, as `chart_panel` makes them.
+        atlas: a grid of cells for the page, as the study `stability` makes it.
     """
 
-    experiment: Experiment
+    runs: Runs
     title: str
     plotted: str
     data: pd.DataFrame
+    question: str = ""
+    verdict: str = ""
     n: str = ""
     interval: str = ""
     estimates: Iterable[Interval] = ()
     remarks: Iterable[str] = ()
     table: pd.DataFrame | None = None
     figure: Figure | None = None
+    chart: dict[str, Any] | None = None
+    atlas: dict[str, Any] | None = None
 
     @cached_property
     def caption(self) -> str:
         """What is plotted, n, the interval, what failed, and the machine."""
         interval = caption.kind(self.interval, self.estimates, drawn=self.figure is not None)
-        return caption.caption(self.experiment, self.plotted, n=self.n, interval=interval)
+        return caption.caption(self.runs, self.plotted, n=self.n, interval=interval)
 
     @cached_property
     def notes(self) -> list[str]:
         """Warnings, then the notes of its own."""
-        own = [caption.said(self.experiment, remark) for remark in self.remarks if remark]
-        return [*caption.warnings(self.experiment), *own]
+        own = [caption.said(self.runs, remark) for remark in self.remarks if remark]
+        return [*caption.warnings(self.runs), *own]
+
+    def shown(self, place: int = 0, experiments: Iterable[str] = ()) -> "Shown":
+        """All that is read of it, as text; `place` is its place among all pages, `experiments` are what it reads."""
+        table = pd.DataFrame() if self.table is None else self.table.astype(str)
+        return Shown(
+            place=place,
+            experiments=[*experiments],
+            title=self.title,
+            question=self.question,
+            verdict=caption.SMOKE if self.verdict and caption.tried(self.runs) else self.verdict,
+            caption=self.caption,
+            columns=list(map(str, table.columns)),
+            rows=table.to_numpy().tolist(),
+            notes=self.notes,
+            drawn=self.figure is not None,
+            chart=self.chart,
+            atlas=self.atlas,
+        )
 
 
-def write(result: Result, base: Path, *, name: str = "") -> list[Path]:
-    """Writes `base.csv` and `.md`, and where there is content `.tex`, `.png`, `.pdf`; gives the paths.
+@dataclass(frozen=True)
+class Shown:
+    """What a page says: the content of `NAME.json`, of which Markdown, LaTeX and the HTML page are made."""
+
+    place: int = 0
+    experiments: list[str] = field(default_factory=list)
+    title: str = ""
+    question: str = ""
+    verdict: str = ""
+    caption: str = ""
+    columns: list[str] = field(default_factory=list)
+    rows: list[list[str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    drawn: bool = False
+    chart: dict[str, Any] | None = None
+    atlas: dict[str, Any] | None = None
+
+    def to_json(self) -> str:
+        """Its content, a line per part; infinite numbers of a chart become null."""
+        parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
+        lines = [f"{json.dumps(key)}: {json.dumps(plain(value), ensure_ascii=False)}" for key, value in parts.items()]
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def read_shown(path: Path) -> Shown:
+    """The content of `NAME.json`; what is missing or of another type is as in an empty page."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    except (OSError, ValueError, RecursionError):
+        found = {}
+    known = found if isinstance(found, dict) else {}
+    sound = {f.name: known[f.name] for f in fields(Shown) if f.name in known and _is_sound(f.name, known[f.name])}
+    return Shown(**sound)
+
+
+def _is_sound(name: str, value: Any) -> bool:
+    if name in ("chart", "atlas"):
+        return isinstance(value, dict)
+    if name == "rows":
+        return isinstance(value, list) and all(_is_sound("columns", row) for row in value)
+    if name in ("columns", "notes", "experiments"):
+        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return isinstance(value, {"place": int, "drawn": bool}.get(name, str))
+
+
+def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[Path]:
+    """Writes `base.csv`, `.json`, `.md`, and where there is content `.tex`, `.png`, `.pdf`; gives the paths.
 
     LaTeX has the label `tab:NAME`, by default that of the files.
     """
     base.parent.mkdir(parents=True, exist_ok=True)
-    texts = {".csv": result.data.to_csv(index=False), ".md": markdown(result, base.name)}
-    if result.table is not None:
-        texts[".tex"] = latex(result, name or base.name)
+    texts = {".csv": result.data.to_csv(index=False), ".json": shown.to_json(), ".md": markdown(shown, base.name)}
+    if shown.columns:
+        texts[".tex"] = latex(shown, name or base.name)
     for suffix, text in texts.items():
         base.with_suffix(suffix).write_bytes(text.encode("utf-8", "backslashreplace"))
     drawn = [base.with_suffix(suffix) for suffix in (".png", ".pdf")] if result.figure is not None else []
@@ -105,47 +179,47 @@ def write(result: Result, base: Path, *, name: str = "") -> list[Path]:
     return [base.with_suffix(suffix) for suffix in texts] + drawn
 
 
-def markdown(result: Result, name: str) -> str:
-    """The Markdown text of a result: title, caption, table, picture and notes."""
-    parts = [f"**{_md(result.title)}** {_md(result.caption)}"]
-    if result.table is not None:
-        head, *rows = ([_md(cell) for cell in row] for row in (result.table.columns, *result.table.to_numpy()))
-        rule = ["---" if of_words else "---:" for of_words in _of_words(result.table)]
+def markdown(shown: Shown, name: str) -> str:
+    """The Markdown text of a page: question and verdict, title, caption, table, picture and notes."""
+    asked = [f"{_md(shown.question)} **{_md(shown.verdict.replace('*', ''))}**"] if shown.verdict else []
+    parts = [*asked, f"**{_md(shown.title)}** {_md(shown.caption)}"]
+    if shown.columns:
+        head, *rows = ([_md(cell) for cell in row] for row in (shown.columns, *shown.rows))
+        rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
-    if result.figure is not None:
-        parts.append(f"![{_md(result.title)}]({name}.png)")
-    if result.notes:
-        parts.append("\n".join(f"- {_md(note)}" for note in result.notes))
+    if shown.drawn:
+        parts.append(f"![{_md(shown.title)}]({name}.png)")
+    if shown.notes:
+        parts.append("\n".join(f"- {_md(note)}" for note in shown.notes))
     return "\n\n".join(parts) + "\n"
 
 
-def latex(result: Result, name: str) -> str:
+def latex(shown: Shown, name: str) -> str:
     """A LaTeX table environment with the notes below the table; it needs only the package booktabs."""
-    table = result.table
     lines = [
         r"\begin{table*}",
         r"\centering",
-        rf"\caption{{{_tex(result.title)} {_tex(result.caption)}}}",
+        rf"\caption{{{_tex(shown.title)} {_tex(shown.caption)}}}",
         rf"\label{{tab:{name}}}",
         r"\scriptsize",
         r"\setlength{\tabcolsep}{2pt}",
-        rf"\begin{{tabular}}{{@{{}}{''.join('l' if of_words else 'r' for of_words in _of_words(table))}@{{}}}}",
+        rf"\begin{{tabular}}{{@{{}}{''.join('l' if of_words else 'r' for of_words in _of_words(shown))}@{{}}}}",
         r"\toprule",
-        *_latex_rows(list(zip(*map(_two_lines, table.columns), strict=True))),
+        *_latex_rows(list(zip(*map(_two_lines, shown.columns), strict=True))),
         r"\midrule",
-        *_latex_rows(table.to_numpy()),
+        *_latex_rows(shown.rows),
         r"\bottomrule",
         r"\end{tabular}",
     ]
-    if result.notes:
+    if shown.notes:
         lines += [r"\par\smallskip", r"\begin{flushleft}"]
-        lines += [rf"{_tex(note)}\par" for note in result.notes] + [r"\end{flushleft}"]
+        lines += [rf"{_tex(note)}\par" for note in shown.notes] + [r"\end{flushleft}"]
     return "\n".join([*lines, r"\end{table*}"]) + "\n"
 
 
-def _of_words(table: pd.DataFrame) -> list[bool]:
+def _of_words(shown: Shown) -> list[bool]:
     """Of each column, whether it is aligned to the left: the first one, and others without a digit but with a word."""
-    texts = [" ".join(map(str, table.iloc[:, place])) for place in range(table.shape[1])]
+    texts = [" ".join(row[place] for row in shown.rows) for place in range(len(shown.columns))]
     return [
         place == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
         for place, text in enumerate(texts)

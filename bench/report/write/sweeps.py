@@ -1,7 +1,6 @@
 """Writes the table of each sweep that no page shows, beside its plan."""
 
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from bench.report.data.records import definitions
 from bench.report.data.statistics import Interval
 from bench.report.data.sweeps import RowNumbers, SweepRuns, numbers, read_sweeps, runs_of
 from bench.report.write.caption import OVER
-from bench.report.write.paper import SWEEPS, TABLE, page_names
+from bench.report.write.paper import SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, counted, shown, text, to_data, to_table
 
@@ -26,10 +25,9 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 
 
 def write_sweeps(records: list[dict[str, Any]], results_dir: Path) -> list[Path]:
-    """Writes `results_dir/sweeps/NAME/table.{csv,md,tex}` of every sweep without a page; gives the CSVs' paths."""
+    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of every sweep without a page; gives the CSVs' paths."""
     sweeps = read_sweeps(records, results_dir, _tabled())
-    places = [results_dir / SWEEPS / sweep.name / TABLE for sweep in sweeps]
-    return [write(table_of(sweep), base, name=sweep.name)[0] for sweep, base in zip(sweeps, places, strict=True)]
+    return [_write(sweep, results_dir / SWEEPS / sweep.name)[0] for sweep in sweeps]
 
 
 def write_sweep(plan: Plan) -> Path | None:
@@ -41,8 +39,13 @@ def write_sweep(plan: Plan) -> Path | None:
     for cell in plain["cells"]:
         record, _ = read_run(plan.results_dir / "runs" / cell["id"], plan.results_dir)
         known[cell["id"]] = record or not_run(cell, plain)
-    write(table_of(runs_of(plain, known, plan.results_dir)), plan.folder / TABLE, name=plan.name)
+    _write(runs_of(plain, known, plan.results_dir), plan.folder)
     return plan.folder / f"{TABLE}.md"
+
+
+def _write(sweep: SweepRuns, folder: Path) -> list[Path]:
+    table = table_of(sweep)
+    return write(table, table.shown(), folder / TABLE, name=sweep.name)
 
 
 def table_of(sweep: SweepRuns) -> Result:
@@ -65,9 +68,7 @@ def table_of(sweep: SweepRuns) -> Result:
 
 def _tabled() -> set[str]:
     """The names of the experiments that pages read."""
-    pages = {module for module, _ in page_names().values()}
-    read = [selection for page in pages for selection in import_module(f"bench.report.pages.{page}").READS]
-    return {selection.experiment for selection in read}
+    return {selection.experiment for study in studies() for selection in study.reads}
 
 
 def _headings(names: list[str]) -> dict[str, Metric]:

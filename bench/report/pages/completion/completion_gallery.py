@@ -1,13 +1,16 @@
 """Figs. 20 to 22 of DIST: completed shapes in pictures, over the sparsity of the depth image."""
 
 from bench.report import gallery
+from bench.report.compare import Comparison, heading
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, grouped, row_of, setting
-from bench.report.data.subjects.completions import POINTS, TABLE2, heading
+from bench.report.data.runs import Selection
 from bench.report.gallery import BEHIND, FOUND, FRONT, TRUE, Block, Scene
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, configured, to_data
 
+TABLE2 = Selection("table2", ("task.points",))
+POINTS = Comparison().order
 PLACE = 22
 READS = (TABLE2,)
 PRESETS = ("deepsdf", "dist_depth", "dist_mask")  # rows that are shown, where they were run

@@ -14,8 +14,8 @@ from bench.report import gallery
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, definitions, measured
-from bench.report.data.subjects.oracle import PRIORS
 from bench.report.gallery import REFERENCE, Block, Scene
+from bench.report.oracle import PRIORS
 from bench.report.write import chart
 from bench.report.write.answer import Answer
 from bench.report.write.result import Result

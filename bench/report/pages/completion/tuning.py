@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
+from bench.report.compare import CHAMFER
 from bench.report.data import statistics
 from bench.report.data.experiments import Experiment
-from bench.report.data.subjects.completions import CHAMFER
 from bench.report.data.subjects.tuning import TUNING, Tuning, left_out, tunings, unfinished
 from bench.report.write import chart
 from bench.report.write.answer import Answer

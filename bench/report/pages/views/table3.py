@@ -25,7 +25,7 @@ from bench.report.data.records import (
     value_evaluations,
 )
 from bench.report.data.statistics import Interval, bootstrap, interquartile_mean, median, share
-from bench.report.data.subjects.oracle import LABEL, NOTE, oracles
+from bench.report.oracle import LABEL, NOTE, oracles
 from bench.report.write import chart
 from bench.report.write.answer import Answer, ranked
 from bench.report.write.result import Result

@@ -1,12 +1,12 @@
-"""The page of all renderers under one loss, made from run folders whose errors and costs are known."""
+"""The comparison of rows and its pages, made from run folders whose errors and costs are known."""
 
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
-from bench.report.data.subjects.completions import EVERY
-from bench.report.pages.completion import one_loss
-from tests.report.test_report_paper import told, write_run
+from bench.report.compare import COSTS, EVERY
+from bench.report.data.runs import choose
+from bench.studies import one_loss, tuned
+from tests.report.test_report_paper import write_run
 
 # Error over DIST's, field values, seconds of the loop of a run.
 METHODS = {"dist": (1.0, 1000, 4.0), "newton": (0.5, 500, 8.0), "neus": (0.25, 9000, 30.0), "volsdf": (2.0, 9000, 40.0)}
@@ -53,10 +53,10 @@ def test_a_line_has_errors_ratio_cost_and_both_fronts(tmp_path):
     own = line(result, "newton with mask", "plane")
     assert own["error"] == pytest.approx(0.5 * 720 ** (1 / 6) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
     assert own["100"] == pytest.approx(0.5 * 3.5 * 9) and own["20"] == pytest.approx(0.5 * 3.5 * 9 * 4)
-    fronts = {name: [line(result, f"{name} with mask")[f"front_{c}"] for c in one_loss.COSTS] for name in METHODS}
+    fronts = {name: [line(result, f"{name} with mask")[f"front_{c}"] for c in COSTS] for name in METHODS}
     assert fronts == {"dist": ["", "yes"], "newton": ["yes", "yes"], "neus": ["yes", "yes"], "volsdf": ["", ""]}
     assert line(result, "dist with mask")["ratio"] == ""
-    assert "excludes 1 for 3 of 3 ratios to DIST over all families: newton with mask 0.500" in told(result)
+    assert "excludes 1 for *3 of 3* ratios to DIST: newton with mask 0.500 [0.500, 0.500];" in result.verdict
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
@@ -70,17 +70,62 @@ def test_without_the_reference_there_is_no_ratio_and_no_verdict(tmp_path):
     experiment = compared(tmp_path, shapes=1)
     kept = [record for record in experiment.records if record["renderer"] != "dist"]
     result = one_loss.make(type(experiment)(experiment.selection, tmp_path, kept))
-    assert set(result.data["ratio"]) == {""} and "ratios to DIST" not in told(result)
+    assert set(result.data["ratio"]) == {""} and "ratios to DIST" not in result.verdict
 
 
 def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
     every = {(renderer, "sofa", 0) for renderer in METHODS}
     result = one_loss.make(compared(tmp_path, families=("sofa",), shapes=1, failed=every))
-    assert one_loss.answer(result.data, []).verdict == ""
+    assert result.verdict == ""
 
 
-def test_the_answer_names_the_best_and_the_quickest(tmp_path):
-    result = one_loss.make(compared(tmp_path))
-    verdict = one_loss.answer(result.data, []).verdict
-    assert verdict.endswith("excludes 1 for *3 of 3* rows.")
-    assert "(neus with mask, 30.0 s)" in verdict and "(dist with mask, 4.00 s)" in verdict
+def test_the_verdict_names_the_best_and_the_quickest(tmp_path):
+    verdict = one_loss.make(compared(tmp_path)).verdict
+    assert "(neus with mask, 30.0 s)" in verdict and "(dist with mask, 4.00 s); n = 12 shapes." in verdict
+
+
+def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean(tmp_path):
+    runs = compared(tmp_path, families=("sofa",))
+    lacking = ("newton_mask", 5, "100")
+    cells = [(r["method"], r["config"]["index"], r["config"]["task"]["points"]) for r in runs.records]
+    kept = [record for record, cell in zip(runs.records, cells, strict=True) if cell != lacking]
+    newton = line(one_loss.make(type(runs)(runs.selection, tmp_path, kept)), "newton with mask", "sofa")
+    assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11"
+
+
+@pytest.mark.parametrize(
+    ("preset", "default"),
+    [
+        ("idr_mask", "idr_mask"),
+        ("tuned/idr_mask", "idr_mask"),
+        ("dist_mask_paper", "dist_mask"),
+        ("dist_mask_official", "dist_mask"),
+    ],
+)
+def test_a_tuned_row_is_compared_with_its_default(preset, default):
+    assert tuned.default_of(preset) == default
+
+
+def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
+    for preset, label, factor in (("dist_mask", "DIST", 2.0), ("tuned/dist_mask", "DIST, tuned", 1.0)):
+        for index in range(6):
+            for points in ("100", "20"):
+                write_run(
+                    tmp_path,
+                    "tuned",
+                    label,
+                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": preset},
+                    metrics={"chamfer_l2": factor * (1 + index) / 1000},
+                    settings={
+                        "task": {"points": points, "_target_": "completion"},
+                        "dataset": {"name": "sofa"},
+                        "index": index,
+                    },
+                )
+    result = tuned.make(choose(read_records(tmp_path)[0], tuned.READS[0], tmp_path))
+    table = result.table.set_index("Method")
+    said = "The interval excludes 1 for *1 of 1* ratios of tuned settings to the defaults: DIST, tuned on sofa 0.500"
+    assert result.verdict.startswith(said)
+    assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
+    assert table.loc["DIST", "Ratio to the default"] == ""
+    assert table.loc["DIST", "100 pts"] == "7.00"

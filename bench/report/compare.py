@@ -1,0 +1,314 @@
+"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, two figures."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.records import SCALE, RunKey, by_shape
+from bench.report.data.runs import Runs
+from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
+from bench.report.write import chart
+from bench.report.write.chart import panel_data, series
+from bench.report.write.table import Column, estimate, text
+
+EVERY = "all families"
+COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
+FAILURE = (
+    "In geometric means a run that did not end ok has the largest finite error of any row on the same shape, seed and "
+    "condition; a shape on which every row failed is left out."
+)
+CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
+ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
+RATIO = "A ratio is that of geometric means over shapes; behind it the shapes on which the row is better, ties half."
+Line = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared.
+
+    Args:
+        error: the metric, of which lower is better.
+        label: of its axis, with its factor and unit.
+        condition: the setting over which a table has columns, such as task.points; empty for none.
+        order: the first of its values, in their order.
+        reference: gives the preset that the row of a preset is divided by.
+        scale: of the error.
+    """
+
+    error: str = "chamfer_l2"
+    label: str = "Chamfer × 1000 (scene units²)"
+    condition: str = "task.points"
+    order: tuple[str, ...] = ("dense", "50%", "10%", "100", "50", "20")
+    reference: Callable[[str], str] = str
+    scale: float = SCALE
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The ratio of two rows' errors, and on how many of the shapes that both have the first is better, ties half."""
+
+    ratio: Interval
+    better: float
+    shapes: int
+
+    def __str__(self) -> str:
+        """The ratio with its interval, and the shapes."""
+        return f"{self.ratio}; {self.better:g} of {self.shapes}"
+
+
+def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
+    """The gap between two rows on the same shapes, by the geometric means of their errors; None without a shape."""
+    if not len(first):
+        return None
+    better = statistics.lower(*map(statistics.shape_medians, (first, second)))
+    return Gap(geometric_ratio(first, second), better, len(first))
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The runs of a comparison.
+
+    Args:
+        runs: at least one.
+        of: what is compared.
+    """
+
+    runs: Runs
+    of: Comparison = field(default_factory=Comparison)
+
+    @cached_property
+    def cells(self) -> pd.DataFrame:
+        """A line per run: family, row, preset, solid, view, seed, at (its condition), ok, costs, its error and score.
+
+        The score is the error in which a failure has the largest finite error of any row on the same shape, view, seed
+        and condition; it is infinite where every row failed.
+        """
+        frame = self.runs.frame
+        found = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
+            at=self.runs.setting(self.of.condition),
+            ok=(frame.status == "ok").to_numpy(bool),
+            error=self.runs.error(self.of.error, self.of.scale),
+            evaluations=frame["values"],
+            seconds=frame.loop,
+        )
+        places = [found[name] for name in ("family", "solid", "view", "seed", "at")]
+        worst = found.error.where(np.isfinite(found.error)).groupby(places).transform("max")
+        return found.assign(score=found.error.where(np.isfinite(found.error), worst).fillna(math.inf))
+
+    @cached_property
+    def families(self) -> list[str]:
+        """The families, in the order of the runs."""
+        return list(self.cells.family.unique())
+
+    @cached_property
+    def rows(self) -> list[tuple[str, str]]:
+        """The preset and the name of each row, in the order of the runs."""
+        return list(dict.fromkeys(zip(self.cells.preset, self.cells.row, strict=True)))
+
+    @cached_property
+    def conditions(self) -> list[str]:
+        """The values of the condition, in their order."""
+        found = {str(value) for value in self.cells["at"]}
+        return [value for value in self.of.order if value in found] + sorted(found - {*self.of.order})
+
+    def part(self, family: str, row: tuple[str, str], at: str | None = None) -> pd.DataFrame:
+        """The lines of a family, or of `EVERY`, and of a row, at one condition or at all."""
+        cells = self.cells[(self.cells.preset == row[0]) & (self.cells.row == row[1])]
+        cells = cells if family == EVERY else cells[cells.family == family]
+        return cells if at is None else cells[cells["at"] == at]
+
+    def median(self, family: str, row: tuple[str, str], at: str) -> float | None:
+        """The median error over shapes and seeds; None where nothing was planned."""
+        errors = self.part(family, row, at).error
+        return float(statistics.median(errors.to_numpy())) if len(errors) else None
+
+    def means(self, family: str, row: tuple[str, str]) -> dict[RunKey, float]:
+        """The geometric mean of the scores over all conditions, of each shape, view and seed of a row.
+
+        Left out are those without a run at a condition of their family, and those on which every row failed.
+        """
+        wanted = self.cells.groupby("family", sort=False)["at"].nunique()
+        found: dict[RunKey, float] = {}
+        for (name, solid, view, seed), own in self.part(family, row).groupby(
+            ["family", "solid", "view", "seed"], sort=False, dropna=False
+        ):
+            mean = float(geometric_mean(own.score.to_numpy()))
+            if len(own) == wanted[name] and math.isfinite(mean):
+                found[(name, solid), view, seed] = mean
+        return found
+
+    def error(self, family: str, row: tuple[str, str]) -> Interval:
+        """The geometric mean of a row's errors over shapes, with its interval; nan without a shape."""
+        groups = by_shape(self.means(family, row))
+        return geometric(groups) if groups else Interval(math.nan, math.nan, math.nan)
+
+    def gap(self, family: str, row: tuple[str, str], other: tuple[str, str]) -> Gap | None:
+        """The gap between two rows, on the shapes and seeds that both have."""
+        return self.gap_of(family, [row], [other])
+
+    def gap_of(self, family: str, first: list[tuple[str, str]], second: list[tuple[str, str]]) -> Gap | None:
+        """The gap between two groups of rows, each by the geometric mean of its rows' errors."""
+        if not {*first, *second} <= {*self.rows}:
+            return None
+        tables = {row: self.means(family, row) for row in (*first, *second)}
+        common = [run for run in tables[first[0]] if all(run in table for table in tables.values())]
+        means = (
+            {run: float(geometric_mean([tables[row][run] for row in of])) for run in common} for of in (first, second)
+        )
+        return gap(*map(by_shape, means))
+
+    @cached_property
+    def lines(self) -> list[Line]:
+        """A line per family and row, all families first where there are several.
+
+        Each has family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
+        reference), median costs, `front_COST`, "yes" where no row has less error for less cost, and `failed`.
+        """
+        names = [EVERY, *self.families] if len(self.families) > 1 else self.families
+        return [line for name in names for line in self._front([self._line(name, row) for row in self.rows])]
+
+    def _line(self, family: str, row: tuple[str, str]) -> Line:
+        mine = self.part(family, row)
+        reference = next((other for other in self.rows if other[0] == self.of.reference(row[0])), row)
+        costs = {cost: mine[cost][mine.ok].dropna().median() for cost in COSTS}
+        return {
+            **{"family": family, "row": row[1], "preset": row[0]},
+            **{at: self.median(family, row, at) for at in self.conditions},
+            "error": self.error(family, row),
+            "ratio": None if reference == row else self.gap(family, row, reference),
+            **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
+            "failed": f"{(~mine.ok).sum()} of {len(mine)}",
+        }
+
+    @staticmethod
+    def _front(lines: list[Line]) -> list[Line]:
+        for cost in COSTS:
+            front = statistics.on_front([line[cost] for line in lines], [line["error"].value for line in lines])
+            lines = [line | {f"front_{cost}": "yes" if on else ""} for line, on in zip(lines, front, strict=True)]
+        return lines
+
+    @property
+    def pooled(self) -> list[Line]:
+        """The lines over all families."""
+        return [line for line in self.lines if line["family"] == self.lines[0]["family"]]
+
+    def columns(self, ratio: str = "") -> list[Column]:
+        """The columns of the lines; the ratio has that heading, and without one the CSV alone has it."""
+        return [
+            *(text("family", "Family"), text("row", "Method")),
+            *(Column(at, heading(at)) for at in self.conditions),
+            *estimate("error", "Geometric mean"),
+            text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
+            *(Column(f"ratio_{end}", value=lambda line, end=end: _end(line["ratio"], end)) for end in ("low", "high")),
+            *(Column("evaluations", "Values", show=format.count), Column("seconds", "Loop", show=format.seconds)),
+            *(text(f"front_{cost}") for cost in COSTS),
+            *(text("failed", "Failed"), text("preset")),
+        ]
+
+    def shapes(self) -> str:
+        """The number of shapes per cell, as a note."""
+        counts = self.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
+        return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+
+    def best(self, least: str) -> str:
+        """The row with the least mean error and that with the least cost, as a verdict; empty where there is none."""
+        known = [line for line in self.pooled if math.isfinite(line["error"].value) and line["seconds"] is not None]
+        if not known:
+            return ""
+        best, quick = (min(known, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
+        n = max((len(line["error"].points) for line in known), default=0)
+        return (
+            f"The least {least} is *{format.number(best['error'].value)}* ({best['row']}, "
+            f"{format.seconds(best['seconds'])}); the quickest row has {format.number(quick['error'].value)} "
+            f"({quick['row']}, {format.seconds(quick['seconds'])}); n = {n} shape{'s' if n != 1 else ''}."
+        )
+
+    @style.styled
+    def draw_front(self, columns: int = 3) -> Figure:
+        """Draws the mean error of each row over each cost, over all families; points on a front are filled."""
+        figure, (axes,) = chart.sheet(3.2, 1, len(COSTS), sharey=True)
+        for axis, (cost, label) in zip(axes, COSTS.items(), strict=True):
+            known = [line for line in self.pooled if line[cost] is not None]
+            rows, errors = [(line["preset"], line["row"]) for line in known], [line["error"] for line in known]
+            chart.front(axis, rows, [line[cost] for line in known], errors, [line[f"front_{cost}"] for line in known])
+            style.log_axis(axis, "x", [line[cost] for line in known])
+            axis.set_xlabel(label)
+        axes[0].set_ylabel(self.of.label)
+        style.log_axis(axes[0], "y", [v for line in self.pooled for v in (line["error"].low, line["error"].value)])
+        style.legend_below(figure, axes[0], columns=columns)
+        return figure
+
+    @style.styled
+    def draw_conditions(self, rows: Sequence[tuple[str, str]], marks: dict[str, float], mark: str = "") -> Figure:
+        """Draws a panel per family: the median of each of the rows over the conditions.
+
+        Args:
+            marks: a value of each family, drawn as a line; none for others.
+            mark: what that value is.
+        """
+        columns = min(len(self.families), 4)
+        lines = -(-len(self.families) // columns)
+        figure, axes = chart.sheet(2.4 * lines + 0.7, lines, columns, sharey=True)
+        for axis, name in zip(axes.flat, self.families, strict=False):
+            self._conditions(axis, name, rows)
+            if name in marks:
+                chart.reference(axis.axhline, marks[name], 1.5, mark)
+        for axis in axes.flat[len(self.families) :]:
+            axis.axis("off")
+        for axis in axes[:, 0]:
+            axis.set_ylabel(self.of.label)
+        style.log_axis(axes[0, 0], "y", self.cells.error)
+        style.legend_below(figure, *axes.flat)
+        return figure
+
+    def _conditions(self, axis: Axes, family: str, rows: Sequence[tuple[str, str]]) -> None:
+        for row in rows:
+            medians = [self.median(family, row, at) for at in self.conditions]
+            if any(value is not None for value in medians):
+                chart.line(axis, row[0], range(len(medians)), style.finite(medians), label=row[1])
+        axis.set_xticks(range(len(self.conditions)), self.conditions)
+        axis.set_title(family)
+
+    def chart(self) -> dict[str, Any]:
+        """The error over each cost for the page."""
+        known = [line for line in self.pooled if math.isfinite(line["error"].value)]
+        panels = []
+        for cost, label in COSTS.items():
+            points = [
+                series(
+                    *(line["row"], line["preset"], [line[cost]], [line["error"].value]),
+                    **{"low": [line["error"].low], "high": [line["error"].high], "size": 9},
+                )
+                for line in known
+                if line[cost] is not None
+            ]
+            panels.append(panel_data("error over cost", label, self.of.label.partition(" (")[0], points))
+        return {"panels": panels}
+
+
+def excluding_one(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
+    """A sentence with how many of the known ratios have an interval that excludes 1, and which; empty without any."""
+    known = [(name, found) for name, found in ratios if found is not None and found.ratio.known]
+    sure = [f"{name} {found.ratio}" for name, found in known if found.ratio.excludes(1)]
+    named = f": {'; '.join(sure)}" if sure else ""
+    return f"The interval excludes 1 for *{len(sure)} of {len(known)}* ratios {of}{named}." if known else ""
+
+
+def heading(condition: str) -> str:
+    """The heading of a condition's column; a number counts depth points."""
+    return f"{condition} pts" if condition.isdigit() else condition or "Median"
+
+
+def _end(found: Gap | None, end: str) -> float:
+    return math.nan if found is None else getattr(found.ratio, end)

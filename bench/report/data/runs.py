@@ -1,0 +1,225 @@
+"""The runs that a study reads: the newest run of each cell of its experiment, as records and as one typed table."""
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.records.names import flat
+from bench.records.record import requested, row_name, started
+from bench.report.data.frame import to_frame
+from bench.report.data.records import SCALE, Record, Row, family, grouped, index, row_of, setting, solid, view
+
+MACHINE = ("cpu", "device", "threads")
+MIXED = ("prior", "view", "evaluation", "field")  # parts of a configuration that rows should share
+OF_ROWS = ("prior.name",)  # of these parts, what a dataset may set for itself
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The runs that a study reads.
+
+    Args:
+        experiment: its name in the runs' configurations.
+        conditions: settings in which runs of one row differ, such as task.points or split.
+        setup: parts of the setup that captions name, where they are known.
+        alike: further parts of the configuration, such as dataset or task, in which only runs like the newest are read.
+    """
+
+    experiment: str
+    conditions: tuple[str, ...] = ()
+    setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
+    alike: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The runs of an experiment in the order of their rows, a failed or planned one too.
+
+    `left_out` counts its runs that are not shown: of another scale, or replaced by a newer run of the same cell.
+    """
+
+    selection: Selection
+    results_dir: Path
+    records: list[Record]
+    left_out: int = 0
+    everything: list[Record] = field(default_factory=list, repr=False)
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """The table of `bench.load` for these runs, in the order of `records`.
+
+        Further columns: row, the name of the row in tables; preset, which decides its look; family; solid and view,
+        the number of the shape and of its view; loop, the seconds in the loop; values, the field values with coarse
+        ones.
+        """
+        table = to_frame(self.records)
+        rows = [row_of(record) for record in self.records]
+        coarse = table.evaluations_coarse.fillna(0) if "evaluations_coarse" in table else 0
+        missing = pd.Series(pd.NA, table.index, dtype="Float64")
+        spent = [table.get(f"seconds_{part}", missing) for part in ("forward", "backward")]
+        return table.assign(
+            row=[row.name for row in rows],
+            preset=[row.preset for row in rows],
+            family=[family(record) for record in self.records],
+            solid=[str(solid(record)[1]) for record in self.records],
+            view=[view(record) for record in self.records],
+            loop=(spent[0] + spent[1]).astype(float),
+            values=(table.get("evaluations_value", missing) + coarse).astype(float),
+        )
+
+    def error(self, metric: str, scale: float = SCALE) -> pd.Series:
+        """A metric of each run, times `scale`; infinite where the run did not end ok or lacks it."""
+        ok = (self.frame.status == "ok").to_numpy(bool)
+        return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
+
+    def number(self, column: str) -> pd.Series:
+        """A column as floats, nan where it is missing or no number."""
+        values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
+        return pd.to_numeric(values.astype(object).where(values.notna(), np.nan), errors="coerce").astype(float)
+
+    def setting(self, key: str) -> pd.Series:
+        """A setting of each run as text, such as task.points; empty where it is missing."""
+        column = self.frame.get(f"config.{key}")
+        return pd.Series("", self.frame.index) if column is None else column.astype("string").fillna("").astype(object)
+
+    def where(self, kept: pd.Series) -> "Runs":
+        """Those runs alone; they are not counted as left out."""
+        return replace(self, records=[record for record, keep in zip(self.records, kept, strict=True) if keep])
+
+    def other(self, selection: Selection) -> "Runs | None":
+        """The runs of another experiment of the same results folder."""
+        return choose(self.everything, selection, self.results_dir)
+
+    def folder(self, record: Record) -> Path:
+        """The record's run folder."""
+        return self.results_dir / "runs" / record["folder"]
+
+    def requested(self) -> dict[str, Any]:
+        """The configuration of the first run."""
+        return self.records[0]["config"]
+
+    def rows(self) -> dict[Row, list[Record]]:
+        """The records of each row."""
+        return grouped(self.records, row_of)
+
+    def families(self) -> dict[str, list[Record]]:
+        """The records of each family."""
+        return grouped(self.records, family)
+
+    def named(self) -> list[Record]:
+        """The records with their readable names under `name`."""
+        return [{**record, "name": name} for record, name in zip(self.records, self.names(), strict=True)]
+
+    def names(self) -> list[str]:
+        """A readable name of each run: its row's, with what else runs differ in: conditions, family, seed, shape."""
+        parts = {"": family, "seed ": itemgetter("seed"), "shape ": index}
+        varied = {word: part for word, part in parts.items() if len({str(part(record)) for record in self.records}) > 1}
+        return [
+            row_of(record).name
+            + "".join(f", {value} {name}" for name, value in self._conditions(record))
+            + "".join(f", {word}{part(record)}" for word, part in varied.items())
+            for record in self.records
+        ]
+
+    def _conditions(self, record: Record) -> list[tuple[str, Any]]:
+        """The condition of a run, by the names of the settings."""
+        found = {
+            key.rpartition(".")[2]: setting(record["config"], *key.split(".")) for key in self.selection.conditions
+        }
+        return [(name, value) for name, value in found.items() if isinstance(value, str | int | float)]
+
+    def machines(self) -> dict[tuple[Any, ...], list[str]]:
+        """The names of the runs by the machine that their times depend on: processor, accelerator, threads."""
+        known = [record for record in self.named() if record["environment"]]
+        machines = grouped(known, lambda record: tuple(record["environment"].get(key) for key in MACHINE))
+        return {machine: [record["name"] for record in records] for machine, records in machines.items()}
+
+    def mixed(self) -> list[str]:
+        """The settings of prior, view, evaluation and field in which runs differ though rows should share them."""
+        known = [flat({part: record["config"].get(part) for part in MIXED}, "") for record in self.records]
+        keys = dict.fromkeys(key for one in known for key in one)
+        skipped = {*OF_ROWS, *self.selection.conditions}
+        return [key for key in keys if key not in skipped and len({str(one[key]) for one in known if key in one}) > 1]
+
+    def of_newest_scene(self) -> "Runs":
+        """Those runs alone that have the seed and the shape of the one requested last."""
+        newest = max(self.records, key=requested)
+        kept = [r for r in self.records if (r["seed"], index(r)) == (newest["seed"], index(newest))]
+        return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
+
+
+def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
+    """The newest run of each cell of an experiment, at the scale of the run that was requested last; None without one.
+
+    A cell is a row with its renderer's settings, a task, a split, a draw, a shape, a view, a seed and the selection's
+    conditions. Rows stand in the order in which they started, and are told apart by their renderers' settings.
+    """
+    found = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
+    if not found:
+        return None
+    shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
+    newest = max(found, key=requested)
+    same = [r for r in found if all(_part(r, key, selection) == _part(newest, key, selection) for key in shared)]
+    cells: dict[Hashable, Record] = {}
+    for record in same:
+        cells[_cell(record, selection)] = record  # keeps the place of the first record, with the content of the newest
+    return Runs(selection, results_dir, named_rows(list(cells.values())), len(found) - len(cells), records)
+
+
+def together(*several: Runs | None) -> Runs:
+    """The runs of several experiments as one, for a common caption."""
+    known = [runs for runs in several if runs is not None]
+    records = sorted((record for runs in known for record in runs.records), key=started)
+    return replace(known[0], records=records, left_out=sum(runs.left_out for runs in known))
+
+
+def shared_loss(records: list[Record]) -> str:
+    """The label of the mask loss that all records have; empty where they differ, or have their renderers' own."""
+    labels = {setting(record["config"], "silhouette", "_label_") or "" for record in records}
+    return str(labels.pop()) if len(labels) == 1 else ""
+
+
+def named_rows(records: list[Record]) -> list[Record]:
+    """The records with the names of their rows under `row`.
+
+    A mask loss that all share is left out, since captions name it; rows of one name get the settings of the renderer
+    in which they differ.
+    """
+    shared = {"silhouette": {}} if shared_loss(records) else {}
+    names = [row_name(record["config"] | shared, record["renderer"]) for record in records]
+    alike = grouped(range(len(records)), lambda place: (names[place], row_of(records[place]).preset))
+    for places in alike.values():
+        settings = {place: renderer_settings(records[place]) for place in places}
+        keys = dict.fromkeys(key for one in settings.values() for key in one)
+        differ = [key for key in keys if len({one.get(key) for one in settings.values()}) > 1]
+        for place, own in settings.items():
+            told = [f"{key.strip('_')} {own[key]}" for key in differ if key in own]
+            names[place] += f" ({', '.join(told)})" if told else ""
+    return [record | {"row": name} for record, name in zip(records, names, strict=True)]
+
+
+def renderer_settings(record: Record) -> dict[str, str]:
+    """The settings of the record's renderer as text; none of a draw, whose row has all settings drawn."""
+    if record["config"].get("draw") is not None:
+        return {}
+    return {str(key): str(value) for key, value in (record["config"].get("renderer") or {}).items()}
+
+
+def _part(record: Record, key: str, selection: Selection) -> Any:
+    """A part of a run's configuration without the selection's conditions."""
+    found = setting(record["config"], *key.split("."))
+    if not isinstance(found, dict):
+        return found
+    return {name: value for name, value in found.items() if f"{key}.{name}" not in selection.conditions}
+
+
+def _cell(record: Record, selection: Selection) -> Hashable:
+    conditions = (str(setting(record["config"], *key.split("."))) for key in (*selection.conditions, "split", "draw"))
+    settings = str(sorted(renderer_settings(record).items()))
+    return (row_of(record), record["task"], settings, *solid(record), view(record), record["seed"], *conditions)
