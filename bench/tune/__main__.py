@@ -17,9 +17,9 @@ import yaml
 from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import RESULTS, read_records
-from bench.report.data.experiments import Experiment, choose, shared_loss
 from bench.report.data.records import Record
-from bench.report.data.subjects.tuning import (
+from bench.report.data.runs import Runs, choose, shared_loss
+from bench.report.tuning import (
     ONE_LOSS,
     SPACE,
     TUNING,
@@ -78,7 +78,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     return left_out(experiment, found) + [f"{path}: {row}: {text}" for row, text in told.items()]
 
 
-def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _own(method: Tuning, experiment: Runs) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """The name of a method's row, what it says, and its settings by dotted key."""
     records = [record for record in experiment.records if record["method"] == SPACE + method.method]
     over = f"on {method.validation.shape[1]} validation runs"
@@ -87,7 +87,7 @@ def _own(method: Tuning, experiment: Experiment) -> tuple[str, dict[str, Any], d
     return method.method, said, method.settings[method.best]
 
 
-def _shared(methods: list[Tuning], experiment: Experiment) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _shared(methods: list[Tuning], experiment: Runs) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """The same of the row of all methods."""
     all_of_them = pooled(methods)
     over = f"on {methods[0].validation.shape[1]} validation runs of each of {all_of_them.method},"

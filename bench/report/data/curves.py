@@ -9,8 +9,8 @@ import pandas as pd
 from scipy.stats import spearmanr
 
 from bench.records.read import curve_lines as lines
-from bench.report.data.experiments import Experiment
 from bench.report.data.records import SCALE, Record, measured
+from bench.report.data.runs import Runs
 
 HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
 COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
@@ -58,13 +58,13 @@ def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.Da
     return pd.DataFrame(parts).rename_axis("iteration").reset_index()
 
 
-def history_of(experiment: Experiment, record: Record) -> pd.DataFrame:
+def history_of(runs: Runs, record: Record) -> pd.DataFrame:
     """A run's error over seconds and evaluations: at its checkpoints, and at its end.
 
     A line of a curve has the error before its step, but the costs after it, so a checkpoint gets the costs of the line
     before it.
     """
-    curve = read(experiment.folder(record))[0].sort_values("iteration")
+    curve = read(runs.folder(record))[0].sort_values("iteration")
     costs = curve[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
     history = costs.assign(iteration=curve["iteration"], error=SCALE * curve["chamfer_l2"], loss=curve["total"])
     history = history.dropna(subset=["error"])

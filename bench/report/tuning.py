@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS, NOT_RUN
-from bench.report.data.experiments import Experiment, Selection
 from bench.report.data.records import (
     SCALE,
     Record,
@@ -24,8 +22,9 @@ from bench.report.data.records import (
     run_key,
     value_evaluations,
 )
+from bench.report.data.runs import Runs, Selection
 
-TUNING = Selection("tuning", ("completion",), ("dataset", "task", "split", "draw"), splits=True)
+TUNING = Selection("tuning", ("split",))
 ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone
 SPACE = "space/"  # before the names of methods whose settings are drawn
 VALIDATION, TEST = "validation", "test"
@@ -96,28 +95,18 @@ class Tuning:
         errors = np.exp(weights @ self.test[self.order])
         return by_shape(dict(zip(self.test_runs, errors.tolist(), strict=True)))
 
-    def effects(self) -> list[dict[str, Any]]:
-        """A line per setting: its range, its chosen value, and its rank correlation with the validation error."""
-        lines = []
-        for name in self.settings[0]:
-            values = [settings[name] for settings in self.settings]
-            rho = stats.spearmanr(values, self.scores).statistic if len({*values}) > 1 and len(values) > 2 else math.nan
-            ends = {"least": min(values), "most": max(values), "chosen": values[self.best]}
-            lines.append({"setting": name, **ends, "rho": None if math.isnan(rho) else float(rho), "n": len(values)})
-        return lines
 
-
-def unfinished(experiment: Experiment) -> int:
+def unfinished(runs: Runs) -> int:
     """The number of runs that were planned and have not ended."""
-    return sum(record["status"] in UNFINISHED for record in experiment.records)
+    return sum(record["status"] in UNFINISHED for record in runs.records)
 
 
-def tunings(experiment: Experiment) -> list[Tuning]:
+def tunings(runs: Runs) -> list[Tuning]:
     """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
 
     Validation shapes are enough: without test shapes `test` has no columns.
     """
-    ended = [record for record in experiment.records if record["status"] not in UNFINISHED]
+    ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
     tables = [{(_split(r), _draw(r), run_key(r)): r for r in records} for records in by_method.values()]
     common = {*tables[0]}.intersection(*tables[1:]) if tables else set()
@@ -155,10 +144,10 @@ def pooled(methods: list[Tuning]) -> Tuning:
     )
 
 
-def left_out(experiment: Experiment, methods: list[Tuning]) -> list[str]:
+def left_out(runs: Runs, methods: list[Tuning]) -> list[str]:
     """A note of the draws that some runs have, and that no method is read on; none where there are none."""
     used = {draw for method in methods for draw in method.draws}
-    draws = sorted({_draw(record) for record in experiment.records} - used)
+    draws = sorted({_draw(record) for record in runs.records} - used)
     return [f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, draws))}."] if draws else []
 
 

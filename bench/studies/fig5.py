@@ -1,0 +1,144 @@
+"""Fig. 5 of DIST: loss and Chamfer distance over iterations and time, and their rank correlation."""
+
+import math
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data import curves
+from bench.report.data.records import SCALE, Row, setting
+from bench.report.data.runs import Runs, Selection, shared_loss
+from bench.report.write import chart
+from bench.report.write.chart import panel_data, series
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, text, thousandfold, to_data, to_table, whole
+
+PLACE = 220
+READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
+QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", SCALE)}
+COLUMNS = (
+    *(text("row", "Method"), Column("runs", "Runs", show=whole)),
+    *(Column(key, heading, show=thousandfold) for key, heading in (("end", "End"), ("low", "least"), ("high", "most"))),
+    *(Column("seconds", "Loop", show=format.seconds), Column("spearman", "ρ"), Column("n", "of", show=whole)),
+)
+NOTES = (
+    "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
+    "not used by it.",
+    "A line is the median over a row's runs; after its end a failed run counts as infinite.",
+    "ρ is Spearman's rank correlation of loss and Chamfer over the iterations of a row's runs that have both: points "
+    "of one run are not independent, so it is no test.",
+)
+Medians = dict[str, pd.DataFrame]  # of each quantity
+
+
+def make(runs: Runs) -> Result:
+    """A curve per row, the median over its runs, and a line with its end."""
+    read = {record["folder"]: curves.read(runs.folder(record)) for record in runs.records}
+    unread = [f"{record['name']}: {why}." for record in runs.named() if (why := read[record["folder"]][1])]
+    medians: dict[Row, Medians] = {}
+    lines: list[dict[str, Any]] = []
+    for row, records in runs.rows().items():
+        own = [read[record["folder"]][0] for record in records]
+        failed = [record["status"] != "ok" for record in records]
+        medians[row] = {name: curves.median(own, failed, name) for name in QUANTITIES}
+        points = pd.concat(own, ignore_index=True).dropna(subset=[*QUANTITIES])
+        correlation = {"spearman": curves.spearman(points, *QUANTITIES), "n": len(points)}
+        lines.append({"row": row.name, "runs": len(records), **_end(medians[row]["chamfer_l2"]), **correlation})
+    return Result(
+        runs,
+        "Loss and Chamfer distance as shapes are completed.",
+        "Loss and Chamfer distance over iterations and seconds.",
+        question="What is gained in each iteration?",
+        verdict=_verdict(lines),
+        remarks=(*unread, _loss(runs), *NOTES),
+        data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
+        table=to_table(COLUMNS, lines),
+        figure=draw(medians),
+        chart={"panels": [_panel(medians, name) for name in QUANTITIES]},
+    )
+
+
+def _end(medians: pd.DataFrame) -> dict[str, Any]:
+    if medians.empty:
+        return {}
+    last = medians.iloc[-1]
+    return {"end": last["median"], "low": last["low"], "high": last["high"], "seconds": last["seconds"]}
+
+
+def _verdict(lines: list[dict[str, Any]]) -> str:
+    known = sorted((line for line in lines if "end" in line), key=lambda line: line["end"])
+    if not known:
+        return ""
+    best, last = known[0], known[-1]
+    return (
+        f"{best['row']} ends with the lowest median error, *{format.number(best['end'], SCALE)}* (Chamfer × 1000), "
+        f"{last['row']} with {format.number(last['end'], SCALE)}; n = {min(line['runs'] for line in known)} runs a row."
+    )
+
+
+def _loss(runs: Runs) -> str:
+    """The terms of the loss, and whether those of different rows can be compared."""
+    weight, width = (setting(runs.requested(), "task", f"normal_{name}") for name in ("weight", "width"))
+    normals = (
+        f"depths, normals over {width} scene units (weight {weight or 0:g}) and the silhouette, as the paper's Fig. 5"
+    )
+    terms = normals if weight else "depths and the silhouette; the paper's Fig. 5 has normals as well"
+    own = "each row has the silhouette loss of its renderer, so that losses of different rows do not compare"
+    return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else own}."
+
+
+@style.styled
+def draw(medians: dict[Row, Medians]) -> Figure:
+    """Draws loss above and Chamfer below, over iterations and seconds, a line per row."""
+    figure, axes = chart.sheet(4.6, 2, 2, sharey="row")
+    for line, (name, (label, scale)) in zip(axes, QUANTITIES.items(), strict=True):
+        for axis, along in zip(line, ("iteration", "seconds"), strict=True):
+            for row, own in medians.items():
+                shown, every = own[name], max(len(own[name]) // 6, 1)
+                y = [scale * value for value in style.finite(shown["median"])]
+                chart.line(axis, row.preset, style.finite(shown[along]), y, markevery=every, ms=3.5, label=row.name)
+            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration")
+            style.log_axis(axis, "y", pd.concat([scale * own[name]["median"] for own in medians.values()]))
+        line[0].set_ylabel(label)
+        if style.needs_log(own[name]["seconds"].max() for own in medians.values()):
+            style.log_axis(line[1], "x", pd.concat([own[name]["seconds"] for own in medians.values()]))
+    style.legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _panel(medians: dict[Row, Medians], name: str) -> dict[str, Any]:
+    label, scale = QUANTITIES[name]
+    lines = [
+        series(row.name, row.preset, own[name]["seconds"], scale * own[name]["median"], dash="-", symbol="")
+        for row, own in medians.items()
+    ]
+    return panel_data("", "time in the loop (seconds)", label.partition(" (")[0], lines)
+
+
+def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:
+    """The CSV, with three kinds of lines: of runs, of medians over a row's runs, and of a row's rank correlation."""
+    rows: list[dict[str, Any]] = []
+    for record, identity in zip(runs.records, to_data(IDENTITY, runs.records).to_dict("records"), strict=True):
+        rows += [{"kind": "run", **identity, **point} for point in _points(read[record["folder"]]) or [{}]]
+    for (row, own), line in zip(medians.items(), lines, strict=True):
+        for name, shown in own.items():
+            names = {"median": name, "low": f"{name}_low", "high": f"{name}_high"}
+            found = _points(shown.rename(columns=names))
+            rows += [{"kind": "median", "row": row.name, "n": line["runs"], **point} for point in found]
+        rows.append({"kind": "correlation", "row": row.name, "n": line["n"], "spearman": line["spearman"]})
+    return pd.DataFrame(rows, dtype=object)
+
+
+def _points(line: pd.DataFrame) -> list[dict[str, Any]]:
+    """The lines of a curve, with counts as integers."""
+    counts = ("iteration", "value_evaluations")
+    return [
+        {name: int(x) if name in counts and math.isfinite(x) else x for name, x in point.items()}
+        for point in line.to_dict("records")
+    ]
+
+
+PAGES = {"fig5": make}
