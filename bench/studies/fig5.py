@@ -100,9 +100,8 @@ def draw(medians: dict[Row, Medians]) -> Figure:
                 shown, every = own[name], max(len(own[name]) // 6, 1)
                 y = [scale * value for value in style.finite(shown["median"])]
                 chart.line(axis, row.preset, style.finite(shown[along]), y, markevery=every, ms=3.5, label=row.name)
-            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration")
+            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration", ylabel=label)
             style.log_axis(axis, "y", pd.concat([scale * own[name]["median"] for own in medians.values()]))
-        line[0].set_ylabel(label)
         if style.needs_log(own[name]["seconds"].max() for own in medians.values()):
             style.log_axis(line[1], "x", pd.concat([own[name]["seconds"] for own in medians.values()]))
     style.legend_below(figure, axes[0, 0])
