@@ -484,7 +484,7 @@ def completions(tmp_path: Path) -> Path:
     [
         (
             {"normal_weight": 1.0, "normal_width": 0.02},
-            "depths, normals over 0.02 scene units (weight 1.0) and the silhou",
+            "depths, normals over 0.02 scene units (weight 1) and the silhou",
         ),
         ({"normal_weight": 0.0, "normal_width": 0.02}, "The loss has depths and the silhouette; the paper's Fig. 5"),
         ({}, "The loss has depths and the silhouette; the paper's Fig. 5"),  # of older runs
