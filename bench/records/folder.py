@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
     *(
         "bench/report",
+        "bench/studies",
         "bench/trackers",
         "bench/merge",
         "bench/tune",

@@ -19,7 +19,8 @@ from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
 from bench.report.write import chart
 from bench.report.write.chart import panel_data, series
-from bench.report.write.table import Column, estimate, text
+from bench.report.write.result import Result
+from bench.report.write.table import Column, estimate, text, to_data, to_table
 
 EVERY = "all families"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
@@ -29,6 +30,7 @@ FAILURE = (
 )
 CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
 ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
+INTERVAL = "95 % intervals over shapes (Student's, of logarithms)"
 RATIO = "A ratio is that of geometric means over shapes; behind it the shapes on which the row is better, ties half."
 Line = dict[str, Any]
 
@@ -215,6 +217,31 @@ class Compared:
             *(text(f"front_{cost}") for cost in COSTS),
             *(text("failed", "Failed"), text("preset")),
         ]
+
+    def result(self, title: str, question: str, **changed: Any) -> Result:
+        """The page of the comparison: a line per family and row, with the front of error over cost.
+
+        Args:
+            title: as a sentence.
+            question: that its verdict answers.
+            changed: what replaces parts of the result: `verdict`, `remarks`, `data`, `figure`, ...; and `ratio`, the
+                heading of the ratios.
+        """
+        ratio = changed.pop("ratio", "Ratio to the reference")
+        columns = self.columns(ratio)
+        sure = excluding_one([(line["row"], line["ratio"]) for line in self.pooled], ratio.removeprefix("Ratio "))
+        parts: dict[str, Any] = {
+            "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost.",
+            "verdict": f"{self.best('error × 1000')} {sure}".strip(),
+            "interval": INTERVAL,
+            "estimates": [line["error"] for line in self.lines],
+            "remarks": (ERROR, f"{RATIO} {FAILURE}"),
+            "data": to_data(columns, self.lines),
+            "table": to_table(columns, self.lines),
+        } | changed
+        if "figure" not in parts:
+            parts["figure"] = self.draw_front()
+        return Result(self.runs, title, question=question, chart=self.chart(), **parts)
 
     def shapes(self) -> str:
         """The number of shapes per cell, as a note."""

@@ -8,7 +8,18 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
-from bench.report.compare import ERROR, EVERY, FAILURE, RATIO, Compared, Comparison, Gap, excluding_one, heading
+from bench.report.compare import (
+    ERROR,
+    EVERY,
+    FAILURE,
+    INTERVAL,
+    RATIO,
+    Compared,
+    Comparison,
+    Gap,
+    excluding_one,
+    heading,
+)
 from bench.report.data import statistics
 from bench.report.data.records import setting
 from bench.report.data.runs import Runs, Selection
@@ -47,7 +58,6 @@ PARTS = (
     "The gap under own losses is the product of the renderer's part and the loss's: each is the mean effect under "
     "either of the two others (Shapley values of the logarithm)."
 )
-INTERVAL = "95 % intervals over shapes (Student's, of logarithms)"
 RUNS = (
     *(FAMILY, configured("points", "task", "points"), configured("loss", "silhouette", "_label_")),
     *(*COMPLETION, *LOOP),

@@ -54,19 +54,15 @@ def make(runs: Runs) -> Result:
     columns = [
         column for column in found.columns("Ratio to DIST with mask") if column.key not in ("evaluations", "seconds")
     ]
-    return Result(
-        runs,
+    return found.result(
         "Shape completion from one depth image, over its sparsity.",
-        "Median error over {shapes and seeds} at each number of given depth points, and the geometric mean of all.",
-        question="Which method completes a shape best from sparse depth?",
+        "Which method completes a shape best from sparse depth?",
+        plotted="Median error over {shapes and seeds} at each number of given depth points, and the geometric mean.",
         verdict=found.best("error × 1000 over all numbers of points"),
-        interval="95 % intervals over shapes (Student's, of logarithms)",
-        estimates=[line["error"] for line in found.lines],
         remarks=(ERROR, " ".join((found.shapes(), _given(runs), _iterations(runs))), *NOTES),
         data=to_data(RUNS, runs.records),
         table=to_table(columns, lines),
         figure=found.draw_conditions([r for r in found.rows if not r[0].endswith(VARIANTS)], oracle, LABEL),
-        chart=found.chart(),
     )
 
 

@@ -29,19 +29,13 @@ def make(runs: Runs) -> Result:
     found = Compared(runs, Comparison(reference=default_of))
     lines = [line for line in found.lines if line["family"] in found.families]
     tuned = [(f"{line['row']} on {line['family']}", line["ratio"]) for line in lines if line["preset"][:6] == FOLDER]
-    return Result(
-        runs,
+    return found.result(
         "Methods at their defaults, tuned, and at their papers' settings.",
-        "Median error at each number of given depth points, and the geometric mean of all errors over cost.",
-        question="Are our defaults as good as tuned settings?",
+        "Are our defaults as good as tuned settings?",
         verdict=excluding_one(tuned, "of tuned settings to the defaults"),
-        interval="95 % intervals over shapes (Student's, of logarithms)",
-        estimates=[line["error"] for line in lines],
         remarks=(ERROR, *NOTES),
         data=to_data(RUNS, runs.records),
         table=to_table(found.columns("Ratio to the default"), lines),
-        figure=found.draw_front(),
-        chart=found.chart(),
     )
 
 
