@@ -28,8 +28,8 @@ def main() -> int:
     code = command_line(one)
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there
         Sweep.end()
+        from bench.report.sweeps import write_sweep
         from bench.report.write.html import write_index
-        from bench.report.write.sweeps import write_sweep
         from bench.run.summary import show_sweep
 
         table = write_sweep(plan)

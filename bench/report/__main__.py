@@ -6,10 +6,10 @@ from pathlib import Path
 from bench.records.format import size
 from bench.records.read import RESULTS, read_records
 from bench.report.data.frame import NO_PARQUET, write_frame
+from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, write_index
 from bench.report.write.one_file import write_one_file
 from bench.report.write.paper import write_paper, write_readme
-from bench.report.write.sweeps import write_sweeps
 
 USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [one_file=true] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given

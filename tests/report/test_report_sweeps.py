@@ -10,10 +10,9 @@ import pytest
 
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
-from bench.report.data.sweeps import numbers, read_sweeps
+from bench.report.sweeps import lines, read_sweeps, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
-from bench.report.write.sweeps import write_sweep, write_sweeps
 from tests.report.test_report import record, write_run
 
 
@@ -154,7 +153,7 @@ def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):
     ran(tmp_path, cells[0], 0.001)
     write_run(tmp_path, "{", cells[1].id)
     (sweep,) = read_sweeps(read_records(tmp_path)[0], tmp_path)
-    assert [(row.name, row.runs, row.failed) for row in numbers(sweep)] == [("DIST", 2, 1)]
+    assert [(row["row"], row["runs"], row["failed"]) for row in lines(sweep)] == [("DIST", 2, 1)]
 
 
 def costing(seconds: float) -> dict:

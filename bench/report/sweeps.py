@@ -1,0 +1,231 @@
+"""The table of each sweep that no study shows, beside its plan: medians over shapes and seeds, failures and costs."""
+
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.records import format
+from bench.records.metrics import HIGHER, LOWER, SHOWN, Metric, better
+from bench.records.names import differences
+from bench.records.read import Plan, not_run, read_plans, read_run
+from bench.report.data import records
+from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
+from bench.report.data.runs import Runs, Selection
+from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
+from bench.report.write.caption import OVER
+from bench.report.write.paper import SWEEPS, TABLE, studies
+from bench.report.write.result import Result, write
+from bench.report.write.table import Column, counted, shown, text, to_data, to_table
+
+MOST_VALUES = 6  # of a swept key that the caption lists
+MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
+FAILURE = (
+    "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: an "
+    "infinite error, or 0 of what is better higher. So medians are ∞ where half of the runs failed."
+)
+UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The runs of a sweep, one per planned cell, each with the name of its row; `swept` are keys with their values."""
+
+    name: str
+    swept: dict[str, list[str]]
+    runs: Runs
+
+    @property
+    def metrics(self) -> list[str]:
+        """The names of all metrics that some run has as a number, those that tables show first."""
+        found = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
+        return [*(name for name in SHOWN if name in found), *(name for name in found if name not in SHOWN)]
+
+
+def write_sweeps(known: list[Record], results_dir: Path) -> list[Path]:
+    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths."""
+    return [_write(sweep, results_dir / SWEEPS / sweep.name)[0] for sweep in read_sweeps(known, results_dir)]
+
+
+def write_sweep(plan: Plan) -> Path | None:
+    """Writes the table of a sweep that has ended, if no study shows it; gives the path of its readable form."""
+    if plan.cells[0].config.get("experiment") in _studied():
+        return None
+    plain, known = asdict(plan), {}
+    for cell in plain["cells"]:
+        record, _ = read_run(plan.results_dir / "runs" / cell["id"], plan.results_dir)
+        known[cell["id"]] = record or not_run(cell, plain)
+    _write(of_plan(plain, known, plan.results_dir), plan.folder)
+    return plan.folder / f"{TABLE}.md"
+
+
+def read_sweeps(known: list[Record], results_dir: Path) -> list[Sweep]:
+    """The sweeps of a results folder without a study."""
+    by_folder, studied = {record["folder"]: record for record in known}, _studied()
+    plans = [plan for plan in read_plans(results_dir)[0] if any(cell["id"] in by_folder for cell in plan["cells"])]
+    sweeps = [of_plan(plan, by_folder, results_dir) for plan in plans]
+    return [sweep for sweep in sweeps if sweep.runs.selection.experiment not in studied]
+
+
+def of_plan(plan: dict[str, Any], known: dict[str, Record], results_dir: Path) -> Sweep:
+    """The sweep of a plan, some of whose runs are known; cells that differ in nothing that counts have one run."""
+    cells = {cell["id"]: cell for cell in plan["cells"] if cell["id"] in known}
+    runs = [known[name] for name in cells]
+    asked = [_asked(cell["overrides"]) for cell in cells.values()]
+    keys = dict.fromkeys(key for one in asked for key in one)
+    swept = {key: list(dict.fromkeys(one[key] for one in asked if key in one)) for key in keys}
+    swept = {key: values for key, values in swept.items() if len(values) > 1}
+    found = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
+    named = [run | {"row": name} for run, name in zip(runs, found.names, strict=True)]
+    selection = Selection(plan["cells"][0]["config"].get("experiment") or "", setup=("scenes", "pixels", "machine"))
+    return Sweep(plan["name"], swept, Runs(selection, results_dir, named))
+
+
+def lines(sweep: Sweep) -> list[dict[str, Any]]:
+    """A line per row: its counts, its costs, the interval of each metric's median, and the ratio of the first metric.
+
+    The ratio is to the first row, paired by shape; None where there is none.
+    """
+    rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
+    first = next(iter(rows.values()))
+    lead = names[0] if names and better(names[0]) == LOWER else ""
+    return [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
+
+
+def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
+    shapes = grouped(runs, lambda record: run_key(record)[0]).values()
+    failures = [[record["status"] != "ok" for record in of_shape] for of_shape in shapes]
+    ended = [record for record in runs if record["status"] == "ok"]
+    reasons = Counter(f"{run['status']}: {run['reason']}".rstrip(": ") for run in runs if run["status"] != "ok")
+    rate = share([sum(failed) for failed in failures], [len(failed) for failed in failures])
+    return {
+        **{"row": row, "runs": len(runs), "failed": len(runs) - len(ended), "rate": rate},
+        "reasons": "; ".join(f"{said} ({count} runs)" if count > 1 else said for said, count in reasons.items()),
+        "loop_seconds": records.median_of_known(map(records.loop_seconds, ended)),
+        "value_evaluations": records.median_of_known(map(records.value_evaluations, ended)),
+        **{name: median_of(runs, name) for name in names},
+    }
+
+
+def median_of(runs: list[Record], metric: str) -> Interval | None:
+    """The median of a metric over shapes and seeds with its interval, a failed run as the worst value.
+
+    Where it is not known which direction of the metric is better, it is that of the runs that have the metric. None
+    where a run that ended ok lacks it, or no run has it.
+    """
+    values = {run_key(run): measured(run, metric) for run in runs}
+    ended = {run_key(run): run["status"] == "ok" for run in runs}
+    if all(value is None for value in values.values()) or any(values[key] is None for key in ended if ended[key]):
+        return None
+    if better(metric) == LOWER:
+        return _middle({run_key(run): error(run, metric) for run in runs})
+    if better(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
+        short = {key: -float(value) if ended[key] and value == value else 0.0 for key, value in values.items()}
+        found = _middle(short)
+        return Interval(-found.value, -found.high, -found.low, tuple(-point for point in found.points))
+    known = {key: value for key, value in values.items() if value is not None}
+    return _middle(known) if all(value == value and value > -math.inf for value in known.values()) else None
+
+
+def _middle(values: dict[RunKey, float]) -> Interval:
+    return bootstrap(by_shape(values), median, seed=0)
+
+
+def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | None:
+    """The ratio of medians to those of the first row over the same shapes and seeds; None for that row itself."""
+    mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
+    if not metric or runs is first or set(mine) != set(theirs):
+        return None
+    return paired_bootstrap(by_shape(mine), by_shape({key: theirs[key] for key in mine}), median, seed=0)
+
+
+def table_of(sweep: Sweep) -> Result:
+    """The table of a sweep."""
+    found, names = lines(sweep), sweep.metrics
+    headings = {name: SHOWN[name] for name in names if name in SHOWN}
+    headings = headings or {name: Metric(name) for name in names[:MOST_METRICS]}
+    stress = any(record["config"].get("stress") for record in sweep.runs.records)
+    more = [name for name in names if name not in headings]
+    return Result(
+        sweep.runs,
+        f"Sweep {sweep.name}.",
+        f"Medians over {OVER}; swept over {_listed(sweep)}.",
+        n=f"{len(sweep.runs.records)} runs" if stress else "",
+        interval="95 % bootstrap intervals over shapes" if headings else "",
+        estimates=[line[name] for line in found for name in headings if line[name] is not None],
+        remarks=(
+            FAILURE,
+            UNDIRECTED if any(not better(name) for name in headings) else "",
+            f"The CSV also has {', '.join(more)}." if more else "",
+            *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
+        ),
+        data=to_data(_data_columns(names), found),
+        table=to_table(_columns(headings, found), found),
+    )
+
+
+def _columns(headings: dict[str, Metric], found: list[dict[str, Any]]) -> list[Column]:
+    """The columns of the readable table."""
+    first = next(iter(headings.values()), Metric("")).label.split(" (")[0]
+    several = any(line["ratio"] is not None for line in found)
+    return [
+        text("row", "Run"),
+        *(shown(m.label, lambda line, name=name, m=m: _words(line[name], m.factor)) for name, m in headings.items()),
+        *([shown(f"{first} over the first row's", lambda line: _words(line["ratio"]))] if several else []),
+        shown("Failed", lambda line: counted(line["failed"], line["runs"], line["rate"])),
+        Column("loop_seconds", "Loop", show=format.seconds),
+        Column("value_evaluations", "Field values", show=format.count),
+    ]
+
+
+def _words(interval: Interval | None, factor: float = 1.0) -> str:
+    return format.MISSING if interval is None else str(interval.times(factor))
+
+
+def _data_columns(names: list[str]) -> list[Column]:
+    """The columns of the CSV: of each metric the median and the ends of its interval, in scene units."""
+    return [
+        text("row"),
+        *(column for name in (*names, "ratio") for column in _ends(name, name)),
+        *(Column(key) for key in ("runs", "failed")),
+        *_ends("failed", "rate")[1:],
+        *(text("reasons"), Column("loop_seconds"), Column("value_evaluations")),
+    ]
+
+
+def _ends(key: str, of: str) -> list[Column]:
+    """Columns of an estimate and of the ends of its interval."""
+    ends = {"": "value", "_low": "low", "_high": "high"}
+    return [Column(key + tail, value=lambda line, end=end: getattr(line[of], end, None)) for tail, end in ends.items()]
+
+
+def _listed(sweep: Sweep) -> str:
+    """The keys that were swept over, with their values or the number of these."""
+    told = [
+        f"{key} ({', '.join(values) if len(values) <= MOST_VALUES else f'{len(values)} values'})"
+        for key, values in sweep.swept.items()
+    ]
+    return ", ".join(told) or "nothing"
+
+
+def _asked(overrides: list[str]) -> dict[str, str]:
+    """The keys and values of a cell's overrides; a sign that adds a key is no part of it."""
+    pairs = [override.partition("=") for override in overrides if "=" in override]
+    return {key.lstrip("+"): value for key, _, value in pairs}
+
+
+def _apart(record: Record) -> RunKey:
+    """What a row is averaged over: shape, view and seed; a stress is no shape."""
+    solid, view, seed = run_key(record)
+    return (solid[1] if record["config"].get("stress") else solid, view, seed)
+
+
+def _studied() -> set[str]:
+    """The names of the experiments that studies read."""
+    return {selection.experiment for study in studies() for selection in study.reads}
+
+
+def _write(sweep: Sweep, folder: Path) -> list[Path]:
+    table = table_of(sweep)
+    return write(table, table.shown(), folder / TABLE, name=sweep.name)
