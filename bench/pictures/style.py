@@ -59,8 +59,8 @@ class Look:
     line: str = "-"
 
 
-_COLOURS = (
-    *("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#b8860b", "#8b2252", "#2f6f8f", "#556b2f", "#c04000"),
+_COLOURS = (  # of presets that conf does not know; of no renderer there
+    *("#7570b3", "#556b2f", "#b5179e", "#3a86ff", "#8d6e63", "#607d3b", "#c1121f", "#4a4e69", "#9a8c00", "#00788a"),
 )
 _MARKERS = ("<", ">", "p", "h", "*", "d", "8")
 _LINES = ("-", "--", "-.", ":")

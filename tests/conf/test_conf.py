@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, build, check_names, load
 from bench.hints import nearest
+from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.sweep import combinations
 from bench.tables import GROUPS, choice, names, read_yaml
@@ -279,17 +280,34 @@ def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_pl
 
 
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour a class
-def test_rows_of_an_experiment_are_told_apart_and_a_renderer_keeps_its_colour(name):
+def test_rows_of_an_experiment_are_told_apart_and_a_colour_is_of_one_class(name):
     params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
-    rows = str(params.get("+method") or params.get("renderer") or "").split(",")
+    rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
     alike = [row for row in rows if not row.startswith("tuned/")]  # drawn as their methods, hollow
     assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)
+    classes = {(look(row).colour, class_of(row)) for row in alike}
+    assert len({colour for colour, _ in classes}) == len(classes)
+
+
+def class_of(row: str) -> str:
+    """The class of a row's renderer; of a method without one, the method."""
+    said = [row] if row in names("renderer") else renderers_of(row)
+    return type(load("renderer", said[-1])).__name__ if said else row
+
+
+def renderers_of(method: str) -> list[str]:
+    """The renderers that a method chooses, that of its own last."""
+    return [base["override /renderer"] for base in defaults_of(method) if "override /renderer" in base]
+
+
+def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
+    known = {look(name).colour for name in visible("renderer") if name != "custom"}
+    assert len(known) > 20 and not known & {*style._COLOURS}
 
 
 @pytest.mark.parametrize("name", [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))])
 def test_a_method_has_the_colour_of_its_renderer(name):
-    said = [base.get("override /renderer") for base in defaults_of(name) if isinstance(base, dict)]
-    renderers = [renderer for renderer in said if renderer]
+    renderers = renderers_of(name)
     assert not renderers or look(name).colour == look(renderers[-1]).colour
 
 
