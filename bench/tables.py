@@ -20,7 +20,7 @@ GROUPS = {  # by the table's name
     **{"methods": METHOD, "tuned": TUNED, "variants": "renderer", "stresses": "stress"},
     **{"losses": "silhouette", "supervision": "supervision", "shapes": "dataset"},
 }
-CHOICES = ("task", "renderer", "silhouette", "supervision")  # groups that a method's row may choose of
+CHOICES = ("task", "renderer", "dataset", "stress", "silhouette", "supervision", "prior", "scale")  # of a method's row
 LOOK = "_look_"  # of a renderer or a method: its colour, marker and line in figures
 DROPPED = ("base", "space", "chosen")  # keys of a row that are no part of what it holds
 Node = dict[str, Any]
