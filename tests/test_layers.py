@@ -22,12 +22,13 @@ FORBIDDEN = {  # what the modules of a package may not import
     "bench": ("tests",),
     "conf": OURS,
 }
-# The rooms of bench in the order of imports: a room may use those before it. `__main__` of a room is a command's door.
+# The rooms of bench in the order of imports: a room may use those before it, and none a command.
 ROOMS = (
     "hints", "tables", "rows", "targets", "config", "progress", "records", "machine", "trackers", "shape_prior",
-    "setup", "evaluate", "pictures", "turntable", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
+    "setup", "evaluate", "pictures", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
     "run", "report", "studies",
 )  # fmt: skip
+COMMANDS = ("bench.merge", "bench.photos", "bench.prior", "bench.train", "bench.tune", "bench.turntable")
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
@@ -65,7 +66,7 @@ def room(name: str) -> str:
 
 def backward(module: str, names: set[str]) -> list[str]:
     """The imports of a module from rooms behind its own, and from rooms that have no place in the order."""
-    if module.endswith(".__main__"):  # commands: nothing imports them
+    if module.endswith(".__main__") or module in COMMANDS:  # nothing imports them
         return []
     here, found = room(module), []
     for name in (name for name in names if room(name) in ROOMS and here in ROOMS):
@@ -81,7 +82,8 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     names = imported(tree, module, is_package) - {STUDIES}
     top = module.split(".")[0]
     found = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
-    found += [f"imports a command: {name}" for name in names if top == "bench" and ".__main__" in name]
+    command = [name for name in names if ".__main__" in name or within(name, *COMMANDS)]
+    found += [f"imports a command: {name}" for name in command if top == "bench"]
     found += backward(module, names)
     if top == "renderers":
         found += [
@@ -135,11 +137,7 @@ def test_every_package_is_looked_at():
 def test_every_room_has_its_place():
     there = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
     there |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
-    commands = {path for path in there if {p.name for p in (ROOT / "bench" / path).rglob("*.py")} == COMMAND_ALONE}
-    assert there - commands | {"studies"} == set(ROOMS)
-
-
-COMMAND_ALONE = {"__init__.py", "__main__.py"}  # of a folder that holds a command and nothing to import
+    assert there | {"studies"} == {*ROOMS, *map(room, COMMANDS)}
 
 
 def test_conf_holds_yaml_only():
@@ -163,7 +161,7 @@ WRONG = (
     ("bench.records.record", "def f():\n    import bench.report"),
     ("bench.records.record", "import torch"),
     ("bench.config", "from bench.records.record import Record"),
-    ("bench.run.run", "from bench.merge.__main__ import merge"),
+    ("bench.run.run", "from bench.merge import merge"),
     ("bench.report.write.html", "import torch.nn"),
     ("bench.report.write.html", "from torch import Tensor"),
     ("bench.report.write.html", "from bench.solve.solve import COSTS"),

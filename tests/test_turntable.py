@@ -9,8 +9,7 @@ from matplotlib import colormaps
 from PIL import Image
 
 from bench.records.record import Record
-from bench.turntable.__main__ import UPRIGHT, main, read_surface, stand
-from bench.turntable.turntable import Turn, turntable
+from bench.turntable import UPRIGHT, Turn, main, read_surface, stand, turntable
 from datasets.mesh import Mesh
 
 SIZE = 32

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bench.photos.__main__ import main
+from bench.photos import main
 from datasets.captures.capture import Capture, read_capture
 from datasets.captures.formats import OPENGL, decomposed, find_layout
 from datasets.captures.hull import hull_mesh, hull_views

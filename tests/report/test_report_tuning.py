@@ -13,7 +13,7 @@ from bench.report.data.runs import choose
 from bench.report.tuning import TUNING, tunings
 from bench.studies import tuning
 from bench.tables import CONF, read_rows, read_yaml
-from bench.tune.__main__ import HEAD, WIDTH, main, write
+from bench.tune import HEAD, WIDTH, main, write
 from tests.report.test_report_paper import told, write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws

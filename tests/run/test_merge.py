@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.merge.__main__ import main, merge
+from bench.merge import main, merge
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus
 from bench.run.sweep import Plan, PlannedCell

@@ -9,13 +9,13 @@ import pytest
 import trimesh
 
 from bench.config import build, load
-from bench.merge.__main__ import merge
+from bench.merge import merge
 from bench.records import folder as run_folder
 from bench.records.read import Plan, PlannedCell, check_links, read_plans, read_records
 from bench.records.record import SCHEMA, Record, RunStatus
 from bench.report.write.html import write_index
 from bench.targets import check_targets, find_class
-from bench.turntable.__main__ import main as turntable
+from bench.turntable import main as turntable
 from tests.run.driving import command
 
 MODULE = """

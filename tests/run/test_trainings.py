@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from bench.machine.processor import cpu_name
-from bench.prior.__main__ import main as prior_main
+from bench.prior import main as prior_main
 from bench.run import trainings
 from bench.run.trainings import NETWORK, PRIOR, Training, records
 from bench.shape_prior import store as priors
 from bench.single_view import store as networks
-from bench.train.__main__ import main as train_main
+from bench.train import main as train_main
 
 SMALL = ("scale=smoke", "threads=1", "device=cpu")
 CPU = torch.device("cpu")

@@ -17,7 +17,7 @@ from bench.records.read import read_records
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.own_image import best_view, filled_share, read_picture
 from bench.tasks.single_view import DEFINITIONS, Inside
-from bench.train.__main__ import main
+from bench.train import main
 from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.scene import see

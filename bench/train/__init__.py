@@ -1,1 +1,0 @@
-"""Trains the network of a task, before it runs."""

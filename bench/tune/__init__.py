@@ -1,1 +1,0 @@
-"""Writes the tuned settings of methods."""
