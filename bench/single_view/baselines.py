@@ -1,7 +1,9 @@
-"""Shapes that need no network: the mean of the training shapes, the one that looks most alike, and the best of them."""
+"""Shapes that need no network: of the training shapes the mean, the most alike and the best; and a prior's code."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,13 +13,20 @@ from torch import Tensor
 from bench.evaluate.evaluate import Surface, surface_metrics
 from bench.progress import Report
 from bench.records.files import digest, file_lock
+from bench.setup.inputs import RunInputs
 from bench.shape_prior.store import load_whole, save_whole
 from bench.single_view.images import ImagesOf
+from bench.solve.latent_code import CodePenalty, CodeProblem
+from bench.solve.observed_view import DEPTH, GivenView
+from bench.solve.problem import OptimiserSettings
 from datasets.dataset import Dataset, Split
 from datasets.extract import extract
 from datasets.mesh import Mesh
+from datasets.shot import Shot
 from datasets.truth import Truth, sample_surface
+from renderers.checks import check_at_least
 from renderers.fields.grid import Grid
+from renderers.silhouette import SilhouetteLoss
 
 VERSION = 1  # raise it when the mean changes
 SAMPLES, REACH = 64, 1.05  # of the mean distance: per axis, and half the cube's side
@@ -53,3 +62,37 @@ def best_shape(mesh: Mesh, dataset: Dataset, count: int) -> int:
     others = (dataset.mesh(Split.TRAIN, index) for index in range(count))
     scores = [surface_metrics(Surface(*sample_surface(m, COMPARED, 1)), true, threshold=1.0) for m in others]
     return int(np.argmin([score["chamfer_l1"] for score in scores]))
+
+
+@dataclass(frozen=True)
+class MaskSearch:
+    """How a renderer finds the prior's code whose silhouette is that of an image, in place of an encoder.
+
+    The camera is known, and depths are not (DIST, Eq. 5, without its first term).
+
+    Args:
+        silhouette: loss of the mask.
+        silhouette_weight: of it.
+        code: penalty of the code.
+        optimiser: iterations and learning rate.
+    """
+
+    silhouette: SilhouetteLoss
+    silhouette_weight: float
+    code: CodePenalty
+    optimiser: OptimiserSettings
+
+    depth_loss: ClassVar[str] = DEPTH
+    depth_weight: ClassVar[float] = 0.0
+
+    def __post_init__(self) -> None:
+        check_at_least("task.search.silhouette_weight", self.silhouette_weight, 0, "10 works")
+
+    def problem(self, shot: Shot, inputs: RunInputs) -> CodeProblem:
+        """The problem of an image with a mask; it starts from code zero, the mean shape."""
+        size = (shot.camera.height, shot.camera.width)
+        none = torch.zeros(size, dtype=torch.bool, device="cpu")
+        given = GivenView(self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask).to(
+            inputs.device
+        )
+        return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device)

@@ -19,11 +19,10 @@ from bench.reconstruct.surfaces import with_colours
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext, RunInputs
-from bench.single_view.baselines import best_shape, mean_shape, most_alike
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, check_files, read_picture
-from bench.single_view.search import MaskSearch
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.problem import check_field_gradient, check_kind

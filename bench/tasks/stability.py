@@ -7,6 +7,7 @@ import numpy as np
 
 from bench.machine.limits import Limits
 from bench.pictures.run_figures import draw_failure
+from bench.pictures.style import PIXEL_NAMES
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
@@ -88,7 +89,8 @@ class Stability:
         record.notes = [*record.notes, *trials.warnings()]
         if trials.first_failure is not None:
             first, what = trials.first_failure, f"{record.name}, {record.scene}"
-            title = f"{what}: first failure ({first.outcome.failure}) at {first.severity:.3g} {self._unit}"
+            kind = PIXEL_NAMES.get(first.outcome.failure or "", first.outcome.failure)
+            title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self._unit}"
             draw_failure(run.folder, first.outcome.images, first.severity, title)
 
     def _check(self, renderer: Renderer) -> None:
