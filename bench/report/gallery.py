@@ -18,8 +18,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch, Rectangle
 
 from bench.pictures import style
-from bench.report.data.experiments import Experiment
 from bench.report.data.records import Record, family, grouped, index, row_of
+from bench.report.data.runs import Runs
 
 LARGEST, LARGEST_COMPARED = 0.9, 1.5  # inches of a picture's side at most, and of one beside a colour bar
 NAMES, BAR = 1.3, 0.7  # inches of the names of rows at most, and of a colour bar
@@ -27,6 +27,7 @@ LETTERS = 18  # of a line of a row's name
 LETTERS_PER_INCH = 19  # of names of columns
 FRAME = "#d9d9d9"
 FOUND, TRUE, START = "found_", "true_", "start_"  # of images.npz, see `bench.pictures.run_figures.save_gallery`
+SHAPES = tuple(kind + part for kind in (START, FOUND, TRUE) for part in ("normals", "hit"))
 FRONT, BEHIND = 0, 1  # its views
 REFERENCE = ("normals", "reference_normals", "hit", "reference_hit")  # see `bench.pictures.run_figures.save_images`
 COUNTED = ("size", "hits", "lost", "false", "angle_median", "angle_p99", "angle_max")
@@ -76,9 +77,9 @@ def arrays(folder: Path, names: Iterable[str]) -> tuple[Arrays, str]:
 class Scene:
     """The pictures of runs of one scene, of which all show the same part: that with the shapes of all runs."""
 
-    def __init__(self, experiment: Experiment, records: Iterable[Record], names: Iterable[str]):
+    def __init__(self, runs: Runs, records: Iterable[Record], names: Iterable[str]):
         """Reads the arrays of those names; `reasons` are why runs have none."""
-        found = {record["folder"]: arrays(experiment.folder(record), tuple(names)) for record in records}
+        found = {record["folder"]: arrays(runs.folder(record), tuple(names)) for record in records}
         self.reasons = [why for _, why in found.values() if why]
         self.arrays = {folder: known for folder, (known, _) in found.items() if known}
         hits = [a for known in self.arrays.values() for name, a in known.items() if name.endswith("hit")]
@@ -183,14 +184,14 @@ class Compared:
     largest: float
 
 
-def compared(experiment: Experiment, names: Sequence[str], most: int) -> Compared:
+def compared(runs: Runs, names: Sequence[str], most: int) -> Compared:
     """Compares the runs of one scene with its reference: normals above, differences below, at most so many columns.
 
     The scale of angles ends at the 99th percentile over all pixels, rounded up. The reference is of the largest
     picture; the name of a run with a smaller one says so.
     """
-    records = experiment.records
-    scene = Scene(experiment, records, REFERENCE)
+    records = runs.records
+    scene = Scene(runs, records, REFERENCE)
     found = [scene.arrays.get(record["folder"], {}) for record in records]
     counts = [counted(one) if one else {} for one in found]
     together = np.concatenate([np.empty(0), *(angles(one).ravel() for one in found if one)])
@@ -216,15 +217,15 @@ def missing(scenes: Iterable[Scene]) -> list[str]:
     return [f"No pictures of {count} run{'s' if count > 1 else ''}: {why}." for why, count in reasons.items()]
 
 
-def first_shapes(experiment: Experiment, most: int, presets: Sequence[str] = ()) -> Experiment:
+def first_shapes(runs: Runs, most: int, presets: Sequence[str] = ()) -> Runs:
     """The runs of the first shapes of each family, of the least seed each; of some presets, where these were run."""
-    wanted = [record for record in experiment.records if row_of(record).preset in presets] or experiment.records
+    wanted = [record for record in runs.records if row_of(record).preset in presets] or runs.records
     kept = []
     for records in grouped(wanted, family).values():
         numbers = sorted({index(record) for record in records})[:most]
         seed = min(record["seed"] for record in records)
         kept += [r for r in records if index(r) in numbers and r["seed"] == seed]
-    return replace(experiment, records=kept, left_out=experiment.left_out + len(experiment.records) - len(kept))
+    return replace(runs, records=kept, left_out=runs.left_out + len(runs.records) - len(kept))
 
 
 @style.styled

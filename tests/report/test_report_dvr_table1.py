@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from bench.report.pages.single_view import dvr_table1, single_view_budget, single_view_figures, single_view_renderers
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages.single_view import dvr_table1, single_view_budget, single_view_figures, single_view_renderers
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import write_run
 from tests.report.test_report_shapes import images

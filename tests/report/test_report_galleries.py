@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from bench.report.pages.images import rerendering
+from bench.report.pages.views import misplaced_gallery, multiview_gallery
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
 from bench.report.gallery import Block, Cell, arrays, draw, whole
 from bench.report.pages.completion import completion_gallery
-from bench.report.pages.images import rerendering
-from bench.report.pages.views import misplaced_gallery, multiview_gallery
 from tests.report.test_report_paper import told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
+from bench.report.write.shapes import history, scene_of
 
 from bench.records.read import read_records
 from bench.report.data.experiments import choose
-from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
 from bench.report.write.paper import write_paper
-from bench.report.write.shapes import history, scene_of
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import told, write_run
 

@@ -1,0 +1,90 @@
+"""Runs of shape from many views under conditions of which one varies at a time: medians, and their figure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.report.data.records import ONE_WAY, SCALE, Record, by_shape, error, family, grouped, row_of, run_key, setting
+from bench.report.data.statistics import Interval, bootstrap, median
+from bench.report.write import chart
+from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
+
+BELOW = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
+INTERVALS = "95 % bootstrap intervals over {shapes and seeds}"
+MEDIAN = estimate("error", "Median")
+NAMED = (text("family", "Family"), text("method", "Method"), text("condition", "Condition"))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A setting of the task that varies.
+
+    Args:
+        key: its name in the task.
+        label: with its unit.
+        neutral: its value where another varies.
+    """
+
+    key: str
+    label: str
+    neutral: float
+
+    def of(self, record: Record) -> float:
+        """Its value in a run."""
+        return float(setting(record["config"], "task", self.key))
+
+
+def run_columns(conditions: Sequence[Condition], *others: str) -> tuple[Column, ...]:
+    """The columns of the CSV, with these conditions and other settings of the task."""
+    keys = (*(configured(one.key, "task", one.key) for one in conditions), *IDENTITY)
+    return (FAMILY, *keys, *(configured(key, "task", key) for key in others), *metrics(ONE_WAY, "chamfer_l2"))
+
+
+def middle(records: Sequence[Record]) -> Interval:
+    """The median error from truth to prediction x 1000, over shapes and seeds; a run that failed is infinite."""
+    return bootstrap(by_shape({run_key(run): SCALE * error(run, ONE_WAY) for run in records}), median, seed=0)
+
+
+def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+    """A line per family, row, condition and its value, with all other conditions at their neutral values.
+
+    Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
+    their median `error`.
+    """
+    lines = []
+    for place, one in enumerate(conditions):
+        alone = [r for r in records if all(other.of(r) == other.neutral for other in conditions if other != one)]
+        for (name, row, at), own in grouped(alone, lambda r, one=one: (family(r), row_of(r), one.of(r))).items():
+            told = {"family": name, "method": row.name, "preset": row.preset, "condition": f"{one.label}: {at:g}"}
+            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own)})
+    return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
+
+
+@style.styled
+def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, success: float | None = None) -> Figure:
+    """Draws a row of panels per family: the error over the value of each condition, a line per method.
+
+    `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
+    """
+    of_family = grouped(lines, lambda line: line["family"])
+    figure, axes = chart.sheet(2.1 * len(of_family) + 0.5, len(of_family), len(conditions), sharey="row")
+    for panels, (name, own) in zip(axes, of_family.items(), strict=True):
+        ends = [end for line in own for end in (line["error"].value, line["error"].high, *line["error"].points)]
+        known = style.finite(ends)
+        edge = 2 * np.nanmax([*known, 0.5]) if np.isfinite(known).any() else 2.0
+        for place, (axis, one) in enumerate(zip(panels, conditions, strict=True)):
+            of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["preset"], line["method"]))
+            for (preset, row), found in of_row.items():
+                errors = [line["error"].below(edge) for line in found]
+                chart.estimates(axis, preset, [line["at"] for line in found], errors, label=row)
+            if success is not None:
+                axis.axhline(success, color="#777777", lw=0.9, label="success: below")
+            axis.set(xlabel=one.label, title=name)
+        style.log_axis(panels[0], "y", known)
+        panels[0].set_ylabel("truth to prediction × 1000\n(scene units²)")
+    style.legend_below(figure, *axes.flat, columns=3)
+    return figure

@@ -1,1 +1,0 @@
-"""Pages of shape and colour from photographs."""

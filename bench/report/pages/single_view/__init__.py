@@ -1,1 +1,0 @@
-"""Pages of shape from one image."""

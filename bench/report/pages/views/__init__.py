@@ -1,1 +1,0 @@
-"""Pages of shape and pose from views of known colours."""

@@ -1,0 +1,115 @@
+"""Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
+
+from bench.records import format
+from bench.report import gallery
+from bench.report.data.records import Record, Row, error, grouped, row_of
+from bench.report.data.runs import Runs, Selection
+from bench.report.gallery import Block, Cell, Scene
+from bench.report.medians import scene_of
+from bench.report.single_view import BASELINES, INTERVALS, OVER, RUNS, columns, draw, lines_of
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, text, thousandfold, to_data, to_table
+
+PLACE = 41
+READS = (Selection("dvr_table1", setup=("machine",)),)
+TRAINED = ("RGB", "Depth", "RGB and depth", "Masks, hull", "Occupancy")  # rows of a network, by what taught it
+# DVR (Niemeyer et al. 2020), Table 1: Chamfer-L1, in tenths of the largest edge of a shape's bounding box.
+PUBLISHED = {
+    "car": {"DVR, RGB": 0.196, "DVR, depth": 0.179, "ONet (3D)": 0.181},
+    "sofa": {"DVR, RGB": 0.224, "DVR, depth": 0.221, "ONet (3D)": 0.217},
+    "table": {"DVR, RGB": 0.280, "DVR, depth": 0.180, "ONet (3D)": 0.185},
+    "plane": {"DVR, RGB": 0.190, "DVR, depth": 0.143, "ONet (3D)": 0.151},
+}
+NOTES = (
+    "Each shape is one that no training has seen, from one image; its other images judge the mask and the colours.",
+    "Trainings from images spend their first steps on the visual hull of the masks, without a renderer, and “Masks, "
+    "hull” does nothing else.",
+    "Without a training: the code of the prior that DIST finds by the mask, knowing the camera; the mean shape; the "
+    "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat.",
+    f"{OVER} “Trained in” is once for the family, “Inference” the network with its mesh, or the search without one.",
+    "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box, which cannot be "
+    "compared directly with the measured rows.",
+)
+COLUMNS = (
+    *columns("Training"),
+    *(Column("normal_consistency", "Normals"), Column("mask_iou", "Mask IoU"), Column("psnr", "PSNR")),
+    *(Column("training", "Trained in", show=format.seconds), Column("seconds", "Inference", show=format.seconds)),
+    *(text("failed", "Failed"), text("published", "Published")),
+)
+IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz
+PICTURED = (FAMILY, *IDENTITY, *metrics("chamfer_l1", "iou"))
+
+
+def make(runs: Runs) -> Result:
+    """A line per family and row, and the published ones."""
+    of_family = {name: lines_of(runs, name, BASELINES) for name in runs.families()}
+    lines = []
+    for name, own in of_family.items():
+        published = PUBLISHED.get(name.partition("/")[0], {}).items()
+        lines += [
+            *own,
+            *({"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published),
+        ]
+    return Result(
+        runs,
+        "Shape from one image.",
+        "Medians over shapes, by what the training of the network may know; Chamfer-L1 in scene units, times 1000.",
+        question="How much must a training know, so that one image gives a shape?",
+        verdict=_verdict(of_family),
+        interval=INTERVALS,
+        estimates=[line["interval"] for line in lines if "interval" in line],
+        remarks=NOTES,
+        data=to_data(RUNS, runs.records),
+        table=to_table(COLUMNS, lines),
+        figure=draw(runs),
+    )
+
+
+def _verdict(of_family: dict[str, list[dict]]) -> str:
+    """The best training by the Chamfer-L1, in each family."""
+    said = []
+    for family, lines in of_family.items():
+        errors = {line["method"]: line["chamfer_l1"] for line in lines if line["method"] in TRAINED}
+        known = {row: value for row, value in errors.items() if value is not None}
+        if known:
+            first = min(known, key=lambda row: known[row])
+            n = max(line["runs"] for line in lines)
+            alone = thousandfold(known.get("RGB"))
+            said.append(f"{family}: {first} *{thousandfold(known[first])}*, RGB alone {alone} (n = {n})")
+    return f"Least median Chamfer-L1 × 1000 of the trainings: {'; '.join(said)}." if said else ""
+
+
+def figures(runs: Runs) -> Result:
+    """A line for a success and a failure of each family."""
+    rows, of_scene = list(runs.rows()), grouped(runs.records, scene_of)
+    shown = {scene: end for of in runs.families().values() for scene, end in _ends(of, rows[0]).items()}
+    scenes = {name: Scene(runs, of_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
+    lines = {f"{name}, {end}": _line(rows, of_scene[name], scenes[name]) for name, end in shown.items()}
+    return Result(
+        runs,
+        "Shapes from one image in pictures.",
+        "Of each family the shapes with the least and the largest Chamfer-L1 of the first row: images, and the normals "
+        "that each row found.",
+        remarks=(
+            "The given image is all that the encoder sees; normals (right, up, towards the camera as red, green, blue) "
+            "are seen by the camera of another image, which no row was given.",
+            *gallery.missing(scenes.values()),
+        ),
+        data=to_data(PICTURED, runs.records),
+        figure=gallery.draw([Block("", [*IMAGES.values(), *(row.name for row in rows)], lines)]),
+    )
+
+
+def _line(rows: list[Row], records: list[Record], scene: Scene) -> list[Cell]:
+    at = {row_of(record): record for record in records}
+    images = [scene.whole(records, name) for name in IMAGES]
+    return [*images, *(scene.cell(at.get(row), gallery.normals()) for row in rows)]
+
+
+def _ends(records: list[Record], row: Row) -> dict[str, str]:
+    """The scenes of a family's shapes with the least and the largest error of a row, and which it is."""
+    ordered = sorted((r for r in records if row_of(r) == row), key=lambda record: error(record, "chamfer_l1"))
+    return {scene_of(ordered[0]): "best", scene_of(ordered[-1]): "worst"} if ordered else {}
+
+
+PAGES = {"dvr_table1": make, "single_view_figures": figures}

@@ -1,0 +1,187 @@
+"""Table 2 and Figs. 6 to 8 of DVR, Fig. 19 of DIST: shape and colour from rendered photographs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.pictures import style
+from bench.report import gallery
+from bench.report.data.records import SCALE, Record, grouped, row_of, setting
+from bench.report.data.runs import Runs, Selection
+from bench.report.gallery import Arrays, Block, Cell, Scene, coloured
+from bench.report.medians import COST, best, draw_runs, medians, plural, scene_of, scored
+from bench.report.write.result import Result
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, thousandfold, to_data, to_table
+
+PLACE = 45
+READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
+# DVR (Niemeyer et al. 2020), Table 2: accuracy, completeness and Chamfer-L1 on DTU's scans 65, 106 and 118, in mm.
+PUBLISHED = {
+    "Colmap + sPSR, trim 0": (1.881, 0.726, 1.303),
+    "Colmap + sPSR, trim 5": (1.400, 0.782, 1.091),
+    "Colmap + sPSR, trim 7": (0.446, 1.020, 0.733),
+    "DVR (RGB)": (1.054, 0.760, 0.907),
+    "DVR (RGB and depth)": (0.789, 0.775, 0.782),
+}
+NAMES = ("seen_accuracy", "seen_completeness", "seen_chamfer_l1", "chamfer_l1", "psnr", "ssim", "mask_iou")
+NOTES = (
+    "“Seen” is what a given photograph sees of either surface, as none sees the underside; distances are in scene "
+    "units, times 1000, and two samplings of one surface by 30,000 points have a Chamfer-L1 of 5.7 to 7.1.",
+    "Colours are compared at hits on held-out photographs; with volumes and the relaxed boundary on all rays of the "
+    "foreground, in front of black.",
+    "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
+    "the masks and a budget of samples a ray.",
+    "DVR's own rows have their paper's rate and no more iterations than others, and are far from their end.",
+    "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
+    "measured rows.",
+)
+COLUMNS = (
+    text("method", "Method"),
+    Column("seen_accuracy", "Accuracy", show=thousandfold),
+    Column("seen_completeness", "Completeness", show=thousandfold),
+    Column("seen_chamfer_l1", "Chamfer-L1, seen", show=thousandfold),
+    Column("chamfer_l1", "all", show=thousandfold),
+    *(Column("psnr", "PSNR"), Column("ssim", "SSIM"), Column("mask_iou", "Mask IoU")),
+    *COST,
+)
+RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"), *LOOP)
+PICTURED = (FAMILY, *IDENTITY, *metrics("seen_chamfer_l1", "psnr"))
+
+SCENES = 2  # of `figures`
+ALIKE = {  # rows that are not shown there, since they look as another does
+    *("rgb_dist", "rgb_idr", "rgb_naive", "rgb_relaxed_boundary", "rgb_volsdf", "rgb_unisurf"),
+    *("rgbd_dvr", "dvr_paper_depth", "stereo", "poisson_5"),
+}
+ARRAYS = ("photograph", "colours", "normals", "hit")
+
+PRESET, AGAIN = "rgb_dist", 3  # the row that `rerendering` shows, where it has a run that ended ok, and its scenes
+SIZES = ("size_0_", "size_1_", "size_2_")  # of images.npz, see `bench.reconstruct.pictures`
+TURNED = {"turned_0_": "turned by 120°", "turned_1_": "turned by 240°"}  # about the vertical axis, likewise
+LIGHTS = {  # towards the light; axes to the right, up, towards the camera
+    "light from the left": (-0.8, 0.3, 0.5),
+    "light from above": (0.0, 0.9, 0.45),
+    "light from the right": (0.8, 0.3, 0.5),
+}
+AMBIENT = 0.25  # of a light; the rest falls off with the cosine
+
+
+def make(runs: Runs) -> Result:
+    """A line per row, and the published ones."""
+    lines, scenes = medians(runs, NAMES), plural(len(grouped(runs.records, scene_of)), "scene")
+    published = [
+        {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
+        for name, values in PUBLISHED.items()
+    ]
+    panels = {
+        "Chamfer-L1, seen × 1000 (scene units)": SCALE * scored(runs, "seen_chamfer_l1"),
+        "seconds in the loop": runs.frame.loop,
+    }
+    return Result(
+        runs,
+        "Shape and colour from photographs.",
+        f"Medians over {scenes} of errors on what the photographs see; in the figure a point per scene, and the "
+        f"median.{_conditions(runs)}",
+        question="Which method finds shape and colour from photographs?",
+        verdict=best(lines, "seen_chamfer_l1", "Chamfer-L1 × 1000 of what the photographs see", scenes, scale=SCALE),
+        remarks=NOTES,
+        data=to_data(RUNS, runs.records),
+        table=to_table(COLUMNS, [*lines, *published]),
+        figure=draw_runs(runs, panels),
+    )
+
+
+def _conditions(runs: Runs) -> str:
+    """What photographs there were, and how long was optimised."""
+    task = next((r["config"]["task"] for r in runs.records if setting(r["config"], "task", "optimiser")), {})
+    if setting(task, "images", "views") is None:
+        return ""
+    return (
+        f" {task['images']['views']} photographs, {task['longest']} pixels along the longer side, one in "
+        f"{task['held_out']} held out; {task['optimiser']['iterations']} iterations."
+    )
+
+
+def figures(runs: Runs) -> Result:
+    """The first scenes in pictures, one row of those that look alike."""
+    rows = [row.name for row in runs.rows() if row.preset not in ALIKE] or [row.name for row in runs.rows()]
+    every = grouped(runs.records, scene_of)
+    shown = dict(list(every.items())[:SCENES])
+    scenes = {name: Scene(runs, [r for r in of if row_of(r).name in rows], ARRAYS) for name, of in shown.items()}
+    return Result(
+        runs,
+        "Shapes from photographs in pictures.",
+        f"Colours, and normals (right, up, towards the camera as red, green, blue), of {len(shown)} of "
+        f"{plural(len(every), 'scene')}, seen by the camera of a held-out photograph.",
+        remarks=(
+            "A mesh row shows its mesh with the colours of the photographs that see a vertex, another row its field.",
+            "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
+            *gallery.missing(scenes.values()),
+        ),
+        data=to_data(PICTURED, runs.records),
+        figure=gallery.draw([_block(name, rows, of, scenes[name]) for name, of in shown.items()]),
+    )
+
+
+def _block(name: str, rows: list[str], records: list[Record], scene: Scene) -> Block:
+    """The held-out photograph and the colours of each row, normals below."""
+    at = {row_of(record).name: record for record in records}
+    photograph = scene.shared(records, lambda found: [found["photograph"]])
+    colours = [scene.cell(at.get(row), gallery.colours()) for row in rows]
+    normals = [scene.cell(at.get(row), gallery.normals()) for row in rows]
+    return Block(name, ["held out", *rows], {"colours": [photograph, *colours], "normals": [Cell(), *normals]})
+
+
+def rerendering(runs: Runs) -> Result:
+    """The shapes of one row in several sizes, from other sides, and under other lights."""
+    ended = [row for row, of in runs.rows().items() if any(run["status"] == "ok" for run in of)] or list(runs.rows())
+    row = next((row for row in ended if row.preset == PRESET), ended[0])
+    of_scene = grouped([record for record in runs.records if row_of(record) == row], scene_of)
+    kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
+    made = {name: _line(record, runs.folder(record)) for name, record in kept.items()}
+    return Result(
+        replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept)),
+        "A reconstructed shape, rendered again.",
+        f"The shape of {row.name}, of the first scenes, in several sizes, from other sides, and under other lights.",
+        remarks=(
+            "Shapes were learnt from photographs alone; the one shown was held out, sizes and lights are seen by its "
+            "camera, and turns are about the vertical axis.",
+            f"Lights: the learnt colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
+            *(f"No pictures of {name}: {why}." for name, (_, _, why) in made.items() if why),
+        ),
+        data=to_data(PICTURED, kept.values()),
+        figure=gallery.draw(
+            [Block("", max((c for c, _, _ in made.values()), key=len), {n: cells for n, (_, cells, _) in made.items()})]
+        ),
+    )
+
+
+def _line(record: Record, folder: Path) -> tuple[list[str], list[Cell], str]:
+    """The names of a line's columns, its cells, and why there are none."""
+    status = "" if record["status"] == "ok" else record["status"]
+    read = {
+        prefix: gallery.arrays(folder, [prefix + part for part in ("colours", "normals", "hit")])
+        for prefix in (*SIZES, *TURNED)
+    }
+    photograph, why = gallery.arrays(folder, ["photograph"])
+    why = next((said for _, said in read.values() if said), why)
+    if why:
+        return [], [Cell(note=status or "no picture")], why
+    last = SIZES[-1]
+    shown = {"photograph": (photograph["photograph"], read[last][0][f"{last}hit"])}
+    for prefix, (found, _) in read.items():
+        name = TURNED.get(prefix, f"{max(found[f'{prefix}hit'].shape)} pixels")
+        shown[name] = _lit(found, prefix)
+    shown |= {name: _lit(read[last][0], last, light) for name, light in LIGHTS.items()}
+    return [*shown], [Cell([(picture, style.window([hit]))], status) for picture, hit in shown.values()], ""
+
+
+def _lit(found: Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The picture of a shape, as it is or under a light, and its hits."""
+    colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
+    if light is not None:
+        colours = colours * (AMBIENT + (1 - AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)[..., None])
+    return coloured(colours, hit), hit
+
+
+PAGES = {"dvr_table2": make, "dvr_figures": figures, "rerendering": rerendering}

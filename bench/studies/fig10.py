@@ -1,0 +1,60 @@
+"""Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
+
+import numpy as np
+
+from bench.records import format
+from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, run_columns
+from bench.report.data.records import ONE_WAY
+from bench.report.data.runs import Runs, Selection
+from bench.report.medians import plural
+from bench.report.write.result import Result
+from bench.report.write.table import to_data, to_table
+
+PLACE = 50
+CONDITIONS = (
+    Condition("focal", "focal length / the scene's", 1.0),
+    Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
+)
+READS = (Selection("fig10", tuple(f"task.{one.key}" for one in CONDITIONS)),)
+NOTES = (
+    "One condition varies, the other is at 1; the noise is in standard deviations of the prior's training codes, so "
+    "that 0 is the mean shape.",
+    "A run that did not end ok counts as infinite, drawn at the upper edge.",
+    "The paper (Fig. 10, a chart without numbers) finds its method robust to both.",
+)
+
+
+def make(runs: Runs) -> Result:
+    """A line per family, method and value of a condition."""
+    lines = lines_of(runs.records, CONDITIONS)
+    return Result(
+        runs,
+        "Shape from many views under other focal lengths and starts.",
+        f"{BELOW[0].upper()}{BELOW[1:]}.",
+        question="Does another focal length or start change the shape that is found?",
+        verdict=_verdict(runs),
+        interval=INTERVALS,
+        estimates=[line["error"] for line in lines],
+        remarks=NOTES,
+        data=to_data(run_columns(CONDITIONS), runs.records),
+        table=to_table((*NAMED, *MEDIAN), lines),
+        figure=draw(lines, CONDITIONS),
+    )
+
+
+def _verdict(runs: Runs) -> str:
+    """The row and family between whose conditions the median error changes most."""
+    keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{one.key}") for one in CONDITIONS)]
+    medians = runs.error(ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
+    spread = (medians.max() / medians.min()).dropna().sort_values()
+    if spread.empty:
+        return ""
+    row, family = spread.index[-1]
+    ratio = "∞" if np.isinf(spread.iloc[-1]) else format.number(spread.iloc[-1])
+    shapes = plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
+    return (
+        f"Over all conditions the median error changes by a factor of up to *{ratio}* ({row}, {family}); n = {shapes}."
+    )
+
+
+PAGES = {"fig10": make}
