@@ -1,10 +1,12 @@
-"""Table 2 of DIST: shape completion over the sparsity of the depth image, measured and published."""
+"""Table 2 and Figs. 20 to 22 of DIST: shape completion over the sparsity of the depth image."""
 
 from typing import Any
 
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared, Comparison
-from bench.report.data.records import grouped, iterations_of, row_of
+from bench.report import gallery
+from bench.report.compare import ERROR, FAILURE, RATIO, Compared, Comparison, heading
+from bench.report.data.records import Record, grouped, iterations_of, row_of, setting
 from bench.report.data.runs import Runs, Selection
+from bench.report.gallery import BEHIND, FOUND, FRONT, TRUE, Block, Scene
 from bench.report.oracle import LABEL, NOTE, oracles
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, to_data, to_table
@@ -45,6 +47,9 @@ RUNS = (
     Column("chamfer_l2_start", value=lambda record: record["metrics_start"].get("chamfer_l2")),
     *LOOP,
 )
+PICTURED = ("deepsdf", "dist_depth", "dist_mask")  # presets of the rows in pictures, where they were run
+ARRAYS = ("given", *(kind + part for kind in (FOUND, TRUE) for part in ("normals", "hit")))
+BOTH = (FRONT, BEHIND)
 
 
 def make(runs: Runs) -> Result:
@@ -97,4 +102,42 @@ def _iterations(runs: Runs) -> str:
     return f"Iterations: {'; '.join([str(most), *others])}." if names else ""
 
 
-PAGES = {"table2": make}
+def pictures(runs: Runs) -> Result:
+    """A block per family: the given depths over their number, and each row's shape below them."""
+    shown = gallery.first_shapes(runs, 1, PICTURED)
+    scenes = {name: Scene(shown, records, ARRAYS) for name, records in shown.families().items()}
+    return Result(
+        shown,
+        "Completed shapes in pictures.",
+        "The shape with the least number of each family at each number of given depth points, from the given camera "
+        "and from behind.",
+        remarks=(
+            "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged; given depths "
+            "are yellow where they are near.",
+            "Dense depth implies the mask, “DIST with mask” sees it at all numbers of points, and DeepSDF is given the "
+            "true normals.",
+            "DIST, Figs. 20 to 22, shows shapes of ShapeNet; these are of other families and another prior.",
+            *gallery.missing(scenes.values()),
+        ),
+        data=to_data((*RUNS[:2], *COMPLETION), shown.records),
+        figure=gallery.draw([_block(name, of, scenes[name]) for name, of in shown.families().items()], across=2),
+    )
+
+
+def _block(name: str, records: list[Record], scene: Scene) -> Block:
+    """The rows of a family over the number of points, behind them the truth."""
+    found = grouped(records, _points)
+    points = [p for p in OF.order if p in found] + sorted(found.keys() - {*OF.order})
+    given = [scene.shared(found[p][:1], gallery.depth) for p in points]
+    rows = {"given depths": [*given, scene.shared(records, gallery.normals(TRUE), BOTH)]}
+    for row, own in grouped(records, row_of).items():
+        at = {_points(record): record for record in own}
+        rows[row.name] = [scene.cell(at.get(p), gallery.normals(FOUND), BOTH) for p in points]
+    return Block(name, [*map(heading, points), "truth"], rows)
+
+
+def _points(record: Record) -> str:
+    return str(setting(record["config"], "task", "points"))
+
+
+PAGES = {"table2": make, "completion_gallery": pictures}

@@ -3,8 +3,7 @@
 import pytest
 
 from bench.report.pages.rendering import table1
-from bench.report.pages.views import table3
-from bench.studies import table2
+from bench.studies import table2, table3
 
 # DIST, Table 1: steps, queries, time.
 TABLE1 = """

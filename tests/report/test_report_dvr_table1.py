@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from bench.report.pages.single_view import dvr_table1, single_view_budget, single_view_figures, single_view_renderers
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
+from bench.report.data.runs import choose
+from bench.studies import dvr_table1, single_view_budget, single_view_renderers
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import write_run
 from tests.report.test_report_shapes import images
@@ -40,8 +40,14 @@ def made(
     )  # fmt: skip
 
 
+def of(results, study, page=""):
+    """The result of a page of a study, by default of its first."""
+    make = study.PAGES[page] if page else study.make
+    return make(choose(read_records(results)[0], study.READS[0], results))
+
+
 def lines(results):
-    table = dvr_table1.make(choose(read_records(results)[0], dvr_table1.READS[0], results)).table
+    table = of(results, dvr_table1).table
     return {(line["Family"], line["Training"]): line for line in table.to_dict("records")}
 
 
@@ -76,30 +82,35 @@ def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_pa
         made(tmp_path, "Newton", 0.2, index=index, **teaches, **cost)
         made(tmp_path, "IDR", 0.3, index=index, **teaches, status="ok" if index else "empty")
         made(tmp_path, "Nearest image", 0.1, index=index, **teaches)
-    experiment = choose(read_records(tmp_path)[0], single_view_renderers.READS[0], tmp_path)
-    table = single_view_renderers.make(experiment).table.set_index("Renderer")
+    table = of(tmp_path, single_view_renderers).table.set_index("Renderer")
     assert table.loc["Newton", ["Trained in", "Field values"]].tolist() == ["90.0 s", "2.00M"]
     assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
     assert table["Over Newton"].tolist() == ["", "∞ (n = 3)", "0.500 (n = 3)"]
     assert table.loc["IDR", "Failed"] == "1 of 3"
 
 
-def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path):
+MINE = r"My \p{1} \1"  # a label is no template
+
+
+@pytest.mark.parametrize(
+    ("label", "status", "said"),
+    [
+        ("IDR", "ok", "car: IDR *1.50* (n = 3); sofa: IDR *0.500* (n = 3)."),
+        (MINE, "ok", f"car: {MINE} *1.50* (n = 3); sofa: {MINE} *0.500* (n = 3)."),
+        ("IDR", "empty", "car: IDR *∞* (n = 3); sofa: IDR *∞* (n = 3)."),
+    ],
+)
+def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path, label, status, said):
+    ROWS[MINE] = ROWS["IDR"]
     for index in range(3):
         for family, factor in (("car", 1.5), ("sofa", 0.5)):
             more = {"index": index, "dataset": family, "experiment": "single_view_renderers"}
-            made(tmp_path, "Newton", 0.2, **more)
-            made(tmp_path, "IDR", 0.2 * factor, **more, renderer="idr")
             made(tmp_path, "Mean shape", 0.01, **more, renderer="dist")
-    experiment = choose(read_records(tmp_path)[0], single_view_renderers.READS[0], tmp_path)
-    data = single_view_renderers.make(experiment).data
-    verdict = single_view_renderers.answer(data, []).verdict
-    assert verdict.endswith("shapes, one training each: car: IDR *1.50* (n = 3); sofa: IDR *0.500* (n = 3).")
-    named = data.assign(row=data["row"].where(data["row"] != "IDR", r"My \p{1} \1"))  # a label is no template
-    assert r"car: My \p{1} \1 *1.50* (n = 3)" in single_view_renderers.answer(named, []).verdict
-    failed = data.assign(status=data["status"].where(data["row"] != "IDR", "empty"))
-    assert "car: IDR *∞* (n = 3)" in single_view_renderers.answer(failed, []).verdict
-    assert single_view_renderers.answer(data[data["row"] != "Newton"], []).verdict == ""
+            made(tmp_path, label, 0.2 * factor, **more, renderer="idr", status=status)
+            if index == 0 and family == "car":
+                assert of(tmp_path, single_view_renderers).verdict == ""  # without a row of Newton
+            made(tmp_path, "Newton", 0.2, **more)
+    assert of(tmp_path, single_view_renderers).verdict.endswith(f"shapes, one training each: {said}")
 
 
 def test_a_line_has_the_seconds_of_the_training_and_of_the_inference(tmp_path):
@@ -118,13 +129,13 @@ def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
         with np.load(folder / "images.npz") as file:
             np.savez(folder / "images.npz", **file, given=np.full((4, 4, 3), index / 4))
         made(tmp_path, "Mean shape", 0.5 - chamfer, index=index)
-    result = single_view_figures.make(choose(read_records(tmp_path)[0], single_view_figures.READS[0], tmp_path))
+    result = of(tmp_path, dvr_table1, "single_view_figures")
     found = cells(result.figure.axes[0])
     assert list(dict.fromkeys(row for row, _ in found)) == ["car 1, best", "car 2, worst"]
     assert found["car 1, best", "given"] == (0.25,) * 3 and found["car 2, worst", "given"] == (0.5,) * 3
     assert found["car 1, best", "another image"] == (0.75,) * 3 and found["car 1, best", "RGB"] == (0.5, 0.5, 1.0)
     assert notes(result.figure) == ["no picture"] * 2
-    assert "No pictures of 2 runs: no images.npz." in result.notes
+    assert "No pictures of 2 runs: no images.npz." in result.shown().notes
 
 
 def budget(results, shapes, views, chamfer, index):
@@ -140,7 +151,7 @@ def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
     for (shapes, views), chamfer in errors.items():
         for index in range(3):
             budget(tmp_path, shapes, views, chamfer, index)
-    result = single_view_budget.make(choose(read_records(tmp_path)[0], single_view_budget.READS[0], tmp_path))
+    result = of(tmp_path, single_view_budget)
     table = result.table.set_index(["Shapes", "Images each"])
     assert list(table.index) == [("12", "24"), ("96", "1"), ("96", "4"), ("96", "24")]
     assert table["Chamfer-L1"].str.split().str[0].tolist() == ["60.0", "80.0", "40.0", "20.0"]
@@ -149,16 +160,15 @@ def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
     drawn = [axis.containers[0].lines[0].get_xydata().tolist() for axis in (left, right)]
     assert drawn == [[[1, 80], [4, 40], [24, 20]], [[12, 60], [96, 20]]]
     assert "96 training shapes" in left.get_xlabel() and "24 images" in right.get_xlabel()
-    assert single_view_budget.answer(result.data, []).verdict == ""  # of three shapes there are no intervals
+    assert result.verdict == ""  # of three shapes there are no intervals
 
 
 def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_training(tmp_path):
     for index in range(8):
         for (shapes, views), factor in {(96, 24): 1.0, (96, 1): 2.0, (12, 24): 1.5 if index % 2 else 0.7}.items():
             budget(tmp_path, shapes, views, (0.02 + 0.001 * index) * factor, index)
-    result = single_view_budget.make(choose(read_records(tmp_path)[0], single_view_budget.READS[0], tmp_path))
-    verdict = single_view_budget.answer(result.data, []).verdict
-    assert verdict == "The interval excludes 1 for *1 of 2* ratios to the training on 96 shapes with 24 images each."
+    said = "The interval excludes 1 for *1 of 2* ratios to the training on 96 shapes with 24 images each; n = 8 shapes."
+    assert of(tmp_path, single_view_budget).verdict == said
 
 
 @pytest.mark.parametrize("status", ["crashed", "empty"])
@@ -173,8 +183,8 @@ def test_a_failed_run_is_the_worst(tmp_path, status):
 def test_its_figure_has_a_point_for_each_shape(tmp_path):
     for index in range(3):
         made(tmp_path, "RGB", 0.1 * index, index=index)
-    (axis,) = dvr_table1.make(choose(read_records(tmp_path)[0], dvr_table1.READS[0], tmp_path)).figure.axes
-    points, middle = axis.get_lines()
-    assert sorted(points.get_ydata()) == pytest.approx([0.8, 0.9, 1.0])
-    assert list(middle.get_ydata()) == pytest.approx([0.9, 0.9])
-    assert [label.get_text() for label in axis.get_xticklabels()] == ["RGB"]
+    (axis,) = of(tmp_path, dvr_table1).figure.axes
+    points, _, middle = axis.get_lines()
+    assert sorted(points.get_xdata()) == pytest.approx([0.8, 0.9, 1.0])
+    assert list(middle.get_xdata()) == pytest.approx([0.9, 0.9])
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["RGB"]

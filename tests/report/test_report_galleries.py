@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from bench.report.pages.images import rerendering
-from bench.report.pages.views import misplaced_gallery, multiview_gallery
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
+from bench.report.data.runs import choose
 from bench.report.gallery import Block, Cell, arrays, draw, whole
-from bench.report.pages.completion import completion_gallery
+from bench.studies import dvr_table2, fig12, table2, table3
 from tests.report.test_report_paper import told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -66,8 +64,8 @@ def many_views(results, experiment, row, *, dataset="car", index=0, status="ok",
         saved(folder, **shown)
 
 
-def made(results, page):
-    return page.make(choose(read_records(results)[0], page.READS[0], results))
+def made(results, study, page):
+    return study.PAGES[page](choose(read_records(results)[0], study.READS[0], results))
 
 
 def cells(axis, across=1):
@@ -92,7 +90,7 @@ def test_completed_shapes_stand_over_the_points_with_the_truth_behind(tmp_path):
     for row, normal in (("DeepSDF samples", UP), ("DIST", RIGHT), ("DIST with mask", UP), ("IDR with mask", UP)):
         for points in ("dense", "20"):
             completed(tmp_path, row, points, found=normal)
-    result = made(tmp_path, completion_gallery)
+    result = made(tmp_path, table2, "completion_gallery")
     found = cells(result.figure.axes[0], across=2)
     assert [column for row, column in found if row == "DIST"] == ["dense", "20 pts", "truth"]
     assert list(dict.fromkeys(row for row, _ in found)) == ["given depths", *list(NAMES)[:3]]
@@ -107,7 +105,7 @@ def test_the_first_shape_of_each_family_and_the_first_seed_are_shown(tmp_path):
         for index in (3, 1):
             for seed in (1, 0):
                 completed(tmp_path, "DIST", "20", dataset=dataset, index=index, seed=seed)
-    result = made(tmp_path, completion_gallery)
+    result = made(tmp_path, table2, "completion_gallery")
     assert [axis.get_title(loc="left") for axis in result.figure.axes] == ["sofa", "plane"]
     assert result.data[["index", "seed"]].to_numpy().tolist() == [[1, 0], [1, 0]]
     assert "Not shown: 6 runs" in told(result)
@@ -119,7 +117,7 @@ def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path
     completed(tmp_path, "DIST with mask", "20", status="crashed", pictures=False)
     completed(tmp_path, "DIST with mask", "50", status="empty", found=None)
     completed(tmp_path, "DIST", "50", pictures=False)
-    result = made(tmp_path, completion_gallery)
+    result = made(tmp_path, table2, "completion_gallery")
     assert sorted(notes(result.figure)) == sorted(["not_reached", "crashed", "empty", "no picture", "no run"])
     assert cells(result.figure.axes[0], across=2)["DIST", "20 pts"] == COLOURS[RIGHT]
     assert "3 of 5 runs did not end ok" in result.caption
@@ -128,7 +126,7 @@ def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path
 
 def test_a_folder_of_another_task_has_no_such_pictures(tmp_path):
     completed(tmp_path, "DIST", "20", true_hit=None)
-    result = made(tmp_path, completion_gallery)
+    result = made(tmp_path, table2, "completion_gallery")
     assert notes(result.figure) == ["no picture"]
     assert "images.npz lacks an array: true_hit" in told(result)
 
@@ -137,7 +135,7 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
     for index in range(6):
         many_views(tmp_path, "table3", "DIST", index=index, found=UP)
         many_views(tmp_path, "table3", "Mesh, 48³", index=index, status="ok" if index else "diverged", found=RIGHT)
-    result = made(tmp_path, multiview_gallery)
+    result = made(tmp_path, table3, "multiview_gallery")
     found = cells(result.figure.axes[0])
     assert list(dict.fromkeys(row for row, _ in found)) == [f"car {index}" for index in range(4)]
     assert [found["car 0", column] for column in ("truth", "start", "DIST", "Mesh, 48³")] == [
@@ -150,7 +148,7 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
 def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
     for task in ({"degrees": 20.0}, {}, {"similarity": True}, {"shift": 0.1}, {"scale": 0.8}):
         many_views(tmp_path, "fig12", "DIST", task=task, found=UP if task else RIGHT)
-    result = made(tmp_path, misplaced_gallery)
+    result = made(tmp_path, fig12, "misplaced_gallery")
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "DIST"]
     assert columns == ["0.8 times as large", "in place", "known place", "turned by 20°", "shifted by 0.1", "truth"]
@@ -181,24 +179,27 @@ def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
     rendered(tmp_path, "Newton, RGB", "rgb_newton", size=0)
     rendered(tmp_path, "DIST, RGB", "rgb_dist")
     rendered(tmp_path, "DIST, RGB", "rgb_dist", dataset="car", status="crashed", size=0)
-    result = made(tmp_path, rerendering)
+    result = made(tmp_path, dvr_table2, "rerendering")
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "sofa 0"]
     sizes = ["2 pixels", "4 pixels", "16 pixels", "turned by 120°", "turned by 240°"]
-    assert columns == ["photograph", *sizes, *rerendering.LIGHTS]
+    assert columns == ["photograph", *sizes, *dvr_table2.LIGHTS]
     assert all(found["sofa 0", column] == pytest.approx((0.8,) * 3, abs=1e-3) for column in sizes)
-    left, above, right = (found["sofa 0", name][0] for name in rerendering.LIGHTS)
-    assert left == pytest.approx(above) == pytest.approx(0.8 * rerendering.AMBIENT, abs=1e-3)  # normals to the right
+    left, above, right = (found["sofa 0", name][0] for name in dvr_table2.LIGHTS)
+    assert left == pytest.approx(above) == pytest.approx(0.8 * dvr_table2.AMBIENT, abs=1e-3)  # normals to the right
     cosine = 0.8 / np.sqrt(0.8**2 + 0.3**2 + 0.5**2)
-    assert right == pytest.approx(0.8 * (rerendering.AMBIENT + (1 - rerendering.AMBIENT) * cosine), abs=1e-3)
+    assert right == pytest.approx(0.8 * (dvr_table2.AMBIENT + (1 - dvr_table2.AMBIENT) * cosine), abs=1e-3)
     assert notes(result.figure) == ["crashed"]
-    assert "No pictures of DIST, RGB, car 0: no images.npz." in told(result)
-    assert "1 of 2 runs did not end ok" in result.caption and "by DIST, RGB" in told(result)
+    assert "No pictures of car 0: no images.npz." in told(result)
+    assert (
+        "1 of 2 runs did not end ok" in result.caption
+        and "The shape of DIST, RGB, of the first scenes" in result.caption
+    )
 
 
 def test_without_any_picture_the_page_says_so(tmp_path):
     rendered(tmp_path, "DIST, RGB", "rgb_dist", size=0)
-    result = made(tmp_path, rerendering)
+    result = made(tmp_path, dvr_table2, "rerendering")
     assert notes(result.figure) == ["no picture"] and "no images.npz" in told(result)
 
 

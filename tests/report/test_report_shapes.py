@@ -1,15 +1,13 @@
 """The pages on shapes from photographs, made from run folders whose numbers are known."""
 
-import json
-
 import numpy as np
 import pytest
-from bench.report.pages.images import dvr_figures, dvr_table2, photos, unseen_back
-from bench.report.write.shapes import history, scene_of
 
 from bench.records.read import read_records
-from bench.report.data.experiments import choose
+from bench.report.data.runs import choose
+from bench.report.medians import scene_of
 from bench.report.write.paper import write_paper
+from bench.studies import dvr_table2, photos, unseen_back
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import told, write_run
 
@@ -50,15 +48,6 @@ def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", inde
     )
 
 
-def curve(folder, *lines):
-    """Writes a curve; a line is (seconds, values, metrics), with costs after its step and metrics before it."""
-    found = [
-        {"iteration": number, "seconds": seconds, "value_evaluations": values, "total": 1.0, **metrics}
-        for number, (seconds, values, metrics) in enumerate(lines)
-    ]
-    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in found))
-
-
 def chosen(results, page=dvr_table2):
     return choose(read_records(results)[0], page.READS[0], results)
 
@@ -88,7 +77,7 @@ def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
     assert hull[["Chamfer-L1, seen", "Failed", "Loop", "Evaluations"]].tolist() == ["50.0", "0 of 1", "500 ms", "none"]
     assert len(result.data) == 7 and set(result.data["status"]) == {"ok", "empty", "crashed"}
     assert result.data["seen_chamfer_l1"].tolist()[:3] == [0.02, 0.01, 0.04]
-    assert "2 of 7 runs did not end ok" in result.caption
+    assert "2 of 7 runs did not end ok" in result.shown().caption
 
 
 def test_a_row_that_never_ended_ok_is_worst(tmp_path):
@@ -120,70 +109,19 @@ def test_published_chamfer_is_the_mean_of_both_directions(name):
 
 
 @pytest.mark.parametrize(("scenes", "words"), [(["sofa"], "over 1 scene of"), (["sofa", "car"], "over 2 scenes of")])
-def test_the_figure_has_a_column_per_scene(tmp_path, scenes, words):
-    for scene in scenes:
-        for row, chamfer in ((NEWTON, 0.02), (HULL, 0.05)):
-            folder = made(tmp_path, row, scored(chamfer), dataset=scene)
-            if row == NEWTON:
-                curve(folder, (1.0, 400, {"seen_chamfer_l1": 0.2}), (2.0, 1000, {"seen_chamfer_l1": 0.1}))
+def test_the_figure_has_a_line_per_row_with_a_point_per_scene_and_their_median(tmp_path, scenes, words):
+    for place, scene in enumerate(scenes):
+        made(tmp_path, NEWTON, scored(0.02 + 0.02 * place), dataset=scene, seconds=3.0)
+        made(tmp_path, IDR, scored(0.02), dataset=scene, status="ok" if place else "empty")
     result = dvr_table2.make(chosen(tmp_path))
-    assert words in result.caption
-    axes = result.figure.axes
-    assert [axis.get_title() for axis in axes] == [*(f"{scene} 0" for scene in scenes), *[""] * len(scenes)]
-    assert [axis.get_xlabel() for axis in axes] == ["seconds in the loop"] * len(scenes) + ["field values"] * len(
-        scenes
-    )
-    for axis, costs in zip(axes, [[1.0, 2.0]] * len(scenes) + [[400, 1000]] * len(scenes), strict=True):
-        drawn = {line.get_label(): line for line in axis.get_lines() if not line.get_label().startswith("_")}
-        assert set(drawn) == {NEWTON, HULL}
-        assert drawn[NEWTON].get_xdata().tolist() == costs  # the beginning, at no cost, is not on a logarithmic axis
-        assert drawn[NEWTON].get_ydata() == pytest.approx([100.0, 20.0])
-        assert list(drawn[HULL].get_ydata()) == [50.0, 50.0] and list(drawn[HULL].get_xdata()) == [0, 1]
-        assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
-    (legend,) = result.figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == [NEWTON, HULL]
-
-
-def test_a_checkpoint_has_the_costs_of_the_line_before_it(tmp_path):
-    folder = made(tmp_path, NEWTON, scored(0.02))
-    lines = [
-        (1.0, 400, {"seen_chamfer_l1": 0.5}),
-        (2.0, 900, {}),
-        (4.0, 1500, {"seen_chamfer_l1": 0.25}),
-        (8.0, 3000, {}),
-    ]
-    curve(folder, *lines)
-    experiment = chosen(tmp_path)
-    found = history(experiment, experiment.records[0], "seen_chamfer_l1")
-    assert found == [(0.0, 0.0, 0.5), (2.0, 900.0, 0.25), (8.0, 3000.0, 0.02)]  # the last one is the end's
-    assert history(experiment, experiment.records[0], "unknown") == []
-    (folder / "curve.jsonl").write_text("{broken\n" + (folder / "curve.jsonl").read_text())
-    assert history(experiment, experiment.records[0], "seen_chamfer_l1") == found
-
-
-def test_without_a_curve_there_is_the_end_alone(tmp_path):
-    made(tmp_path, NEWTON, scored(0.02))
-    made(tmp_path, IDR, {}, status="crashed", evaluations={"value": None})
-    experiment = chosen(tmp_path)
-    assert history(experiment, experiment.records[0], "seen_chamfer_l1") == [(0.0, 0.0, 0.02)]
-    assert history(experiment, experiment.records[1], "seen_chamfer_l1") == []
-    figure = dvr_table2.make(experiment).figure
-    assert not any(axis.get_lines() for axis in figure.axes)
-
-
-def test_a_failed_row_without_a_loop_has_no_level(tmp_path):
-    made(tmp_path, HULL, scored(0.05))
-    made(tmp_path, STEREO, scored(0.03), status="empty")
-    for axis in dvr_table2.make(chosen(tmp_path)).figure.axes:
-        assert [line.get_label() for line in axis.get_lines() if line.get_label()[0] != "_"] == [HULL]
-
-
-def test_a_failed_run_has_no_end(tmp_path):
-    folder = made(tmp_path, NEWTON, scored(np.inf), status="empty")
-    curve(folder, (1.0, 400, {"seen_chamfer_l1": 0.5}), (2.0, 900, {"seen_chamfer_l1": 0.4}))
-    experiment = chosen(tmp_path)
-    found = history(experiment, experiment.records[0], "seen_chamfer_l1")
-    assert found == [(0.0, 0.0, 0.5), (1.0, 400.0, 0.4)]
+    assert words in result.shown().caption
+    errors, seconds = result.figure.axes
+    assert [label.get_text() for label in errors.get_yticklabels()] == [NEWTON, IDR]
+    newton, _, middle, idr, lost, *_ = errors.get_lines()
+    assert newton.get_xdata() == pytest.approx([20, 40][: len(scenes)])
+    assert middle.get_xdata() == pytest.approx([20 + 10 * (len(scenes) - 1)] * 2)
+    assert (len(idr.get_xdata()), len(lost.get_xdata())) == (len(scenes) - 1, 1)  # a failed run is at the edge
+    assert seconds.get_lines()[0].get_xdata().tolist() == [3.0] * len(scenes)
 
 
 def photographed(results, row, metrics, **changed):
@@ -192,19 +130,16 @@ def photographed(results, row, metrics, **changed):
 
 def test_photographs_need_no_chamfer(tmp_path):
     for dataset, psnr in ((FOLDER, 20.0), ("photographs/lamp", 26.0)):
-        folder = photographed(tmp_path, NEWTON, PHOTO_SCORES | {"psnr": psnr}, dataset=dataset)
-        curve(folder, (1.0, 400, {"psnr": 10.0}), (2.0, 1000, {"psnr": 15.0}))
+        photographed(tmp_path, NEWTON, PHOTO_SCORES | {"psnr": psnr}, dataset=dataset)
         photographed(tmp_path, HULL, PHOTO_SCORES | {"psnr": 12.0}, dataset=dataset, seconds=0.5)
     result = photos.make(chosen(tmp_path, photos))
     heads = ["Method", "PSNR (dB)", "SSIM", "Mask IoU", "least", "Failed", "Loop", "Evaluations"]
     assert list(result.table.columns) == heads
     assert line_of(result, NEWTON).tolist() == ["23.0", "0.500", "0.900", "0.800", "0 of 2", "2.00 s", "1.00k"]
     assert line_of(result, HULL).tolist() == ["12.0", "0.500", "0.900", "0.800", "0 of 2", "500 ms", "none"]
-    axes = result.figure.axes
-    assert [axis.get_title() for axis in axes[:2]] == [FOLDER, "photographs/lamp"]
-    assert all((axis.get_xscale(), axis.get_yscale()) == ("log", "linear") for axis in axes)
-    drawn = {line.get_label(): line for line in axes[1].get_lines()}
-    assert drawn[NEWTON].get_ydata().tolist() == [15.0, 26.0] and list(drawn[HULL].get_ydata()) == [12.0, 12.0]
+    axis = result.figure.axes[0]
+    assert axis.get_lines()[0].get_xdata().tolist() == [20.0, 26.0] and axis.get_xscale() == "linear"
+    assert result.verdict.endswith("is *23.0* (Newton, RGB), then 12.0 (Visual hull); n = 2 folders.")
 
 
 def test_photographs_without_masks_have_no_overlap(tmp_path):
@@ -243,7 +178,7 @@ def test_pictures_stand_above_their_normals_and_missing_ones_are_noted(tmp_path)
     made(tmp_path, NEUS, scored(0.03))
     images(made(tmp_path, HULL, scored(0.05), status="empty"), (0.0, 1.0, 0.0))
     images(made(tmp_path, POISSON, scored(0.05)), (0.0, 1.0, 0.0), normals=None)
-    result = dvr_figures.make(chosen(tmp_path, dvr_figures))
+    result = dvr_table2.figures(chosen(tmp_path))
     found = shown(result.figure)["sofa 0"]
     assert [column for row, column in found if row == "colours"] == ["held out", NEWTON, NEUS, HULL, POISSON]
     assert found["colours", NEWTON] == (1, 0, 0) and found["colours", HULL] == (0, 1, 0)
@@ -258,15 +193,15 @@ def test_two_scenes_are_shown_and_a_row_without_a_run_is_noted(tmp_path):
     for scene in ("sofa", "car", "plane"):
         images(made(tmp_path, NEWTON, scored(0.02), dataset=scene), (1.0, 0.0, 0.0))
     images(made(tmp_path, HULL, scored(0.05), dataset="car"), (0.0, 1.0, 0.0))
-    result = dvr_figures.make(chosen(tmp_path, dvr_figures))
-    assert list(shown(result.figure)) == ["sofa 0", "car 0"] and "The first 2 of 3 scenes." in result.caption
+    result = dvr_table2.figures(chosen(tmp_path))
+    assert list(shown(result.figure)) == ["sofa 0", "car 0"] and "of 2 of 3 scenes" in result.shown().caption
     assert notes(result.figure) == ["no run"] * 2
 
 
 def test_of_rows_that_look_alike_one_is_shown(tmp_path):
     for row in (NEWTON, IDR, HULL):
         images(made(tmp_path, row, scored(0.02)), (1.0, 0.0, 0.0))
-    result = dvr_figures.make(chosen(tmp_path, dvr_figures))
+    result = dvr_table2.figures(chosen(tmp_path))
     assert {column for _, column in shown(result.figure)["sofa 0"]} == {"held out", NEWTON, HULL}
     assert set(result.data["row"]) == {NEWTON, IDR, HULL}
 
@@ -279,7 +214,7 @@ def test_shapes_of_one_family_are_scenes_of_their_own(tmp_path):
     assert line_of(dvr_table2.make(experiment), NEWTON)["Chamfer-L1, seen"] == "30.0"
 
 
-def test_all_three_pages_are_written(tmp_path):
+def test_all_pages_are_written(tmp_path):
     for row in (NEWTON, HULL):
         images(made(tmp_path, row, scored(0.02)), (1.0, 0.0, 0.0))
         photographed(tmp_path, row, PHOTO_SCORES)

@@ -12,9 +12,8 @@ from bench.pictures import style
 from bench.records.read import read_records
 from bench.report import oracle
 from bench.report.data.runs import choose
-from bench.report.pages.completion import priors
 from bench.report.write.paper import write_paper
-from bench.studies import table2
+from bench.studies import priors, table2
 from tests.report.test_report_paper import told, write_run
 
 REFERENCE, OTHER = "DIST with mask", "Naive with mask"

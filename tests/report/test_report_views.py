@@ -8,10 +8,10 @@ from scipy import stats
 
 from bench.records.read import read_records
 from bench.report import oracle
-from bench.report.data.experiments import choose
 from bench.report.data.records import ONE_WAY
-from bench.report.pages.views import fig6, fig10, fig12, table3
+from bench.report.data.runs import choose
 from bench.report.write.paper import write_paper
+from bench.studies import fig6, fig10, fig12, table3
 from tests.report.test_report_paper import told, write_run
 
 ENDS = ONE_WAY

@@ -1,1 +1,0 @@
-"""Pages of shape from depth: Table 2, its ablations and losses, priors and scans."""
