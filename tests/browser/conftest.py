@@ -21,7 +21,9 @@ FLAGS = (
     *("--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a GPU
 )
-HARMLESS = ("GPU stall due to ReadPixels",)  # said of WebGL in software where a picture of it is taken
+HARMLESS = (  # said of WebGL in software where a picture of it is taken, and of how Plotly measures letters
+    *("GPU stall due to ReadPixels", "Canvas2D: Multiple readback operations"),
+)
 PATIENCE = 60_000  # milliseconds until something is given up, on a busy machine
 
 

@@ -24,6 +24,7 @@ def write(results: Path, number: int, **changed) -> Path:
     made["metrics"] |= {"chamfer_l2": error, "fscore": 1 / (1 + number)}
     made["config"] |= {"renderer": {"_label_": renderer.upper(), "steps": 50}, "index": number, "seed": number % 2}
     made["seconds"] |= {"forward": 1.0 + number, "backward": 0.5}
+    made["overrides"] = ["task=completion", f"renderer={renderer}"]
     made["started"] = f"2025-03-{1 + number % 28:02d}T10:00:00+00:00"
     made |= changed
     folder = results / "runs" / name

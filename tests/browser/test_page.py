@@ -1,11 +1,14 @@
 """The page in Chromium: tables, filters, links, charts and the 3D view; the address, the keyboard, two runs, phones."""
 
+import io
 import json
 import subprocess
 import sys
 import time
 
 import pytest
+import trimesh
+from PIL import Image
 
 from bench.records import format
 from bench.report.write.html import write_index
@@ -128,7 +131,7 @@ def test_filters_sorting_and_search_stand_in_the_address_and_come_back(results, 
     page.locator('#board-list [data-key="loop"]').click()
     page.locator('#board-list [data-key="loop"]').click()
     assert names_of(page) == ["NAIVE", "DVR"]
-    assert page.locator('th[aria-sort="descending"]').inner_text().startswith("Loop")
+    assert page.locator('th[aria-sort="descending"]').inner_text().startswith("Optimisation")
     page.get_by_label("Search", exact=True).fill("NAI")
     assert names_of(page) == ["NAIVE"]
     address = page.evaluate("location.hash")
@@ -177,19 +180,29 @@ def test_a_run_has_its_page(results, tab):
     text = page.locator("main").inner_text()
     for words in (
         "It ended as planned.",
-        "Sum of two means.",
         "python -m bench task=completion",
         "record = bench.run([",
         "runs = bench.load(",
-        "in the loop",
+        "of optimisation",
     ):
         assert words in text
-    assert page.locator(".pictures img").count() == len(made.PICTURES)
-    assert all(page.locator(".pictures img").evaluate_all("all => all.map((each) => each.alt.length > 5)"))
+    page.get_by_text("metrics, with definitions").click()
+    assert "Sum of two means." in page.locator("main").inner_text()
+    assert page.locator("main img").count() == len(made.PICTURES)
+    assert all(page.locator("main img").evaluate_all("all => all.map((each) => each.alt.length > 5)"))
     page.locator(".chart .scatterlayer .trace").first.wait_for()
     assert page.locator(".chart .panel").count() == 2
     page.get_by_role("button", name="Seconds").click()
-    page.get_by_text("time in the loop (seconds)").first.wait_for()
+    page.get_by_text("seconds of optimisation").first.wait_for()
+
+
+def test_a_run_has_its_result_first_scaled_as_in_tables(results, tab):
+    page = tab(results).open("#/run/completion-0001")
+    page.get_by_role("heading", name="Result").wait_for()
+    titles = page.locator("main h2").all_inner_texts()
+    assert titles[0] == "Result" and titles.index("Costs") > titles.index("Curve")
+    row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
+    assert row.locator("td").all_inner_texts() == ["45.6", "2.00", "lower"]
 
 
 def test_a_failed_run_says_what_helps(results, tab):
@@ -200,32 +213,73 @@ def test_a_failed_run_says_what_helps(results, tab):
 
 def test_the_mesh_turns_under_the_mouse_and_the_keys(results, tab):
     page = tab(results).open("#/run/completion-0000")
-    canvas = page.locator(".mesh canvas")
-    canvas.scroll_into_view_if_needed()
-    page.wait_for_function("document.querySelector('.mesh canvas').width > 300")
+    plot = drawn(page).first
+    before = plot.screenshot()
+    drag(page, plot)
+    turned = plot.screenshot()
+    assert turned != before
+    for key in ("ArrowLeft", "+"):
+        last = plot.screenshot()
+        plot.press(key)
+        page.wait_for_timeout(300)
+        assert plot.screenshot() != last
+    plot.press("Home")
+    plot.evaluate("(plot) => plot.blur()")  # whose outline is part of the picture
     page.wait_for_timeout(300)
-    before = canvas.screenshot()
-    page.get_by_role("button", name="Normals").click()
+    assert plot.screenshot() == before
+    page.mouse.wheel(0, -200)
     page.wait_for_timeout(300)
-    normals = canvas.screenshot()
-    assert before != normals
-    box = canvas.bounding_box()
+    assert plot.screenshot() != before
+    assert "642 vertices, 1,280 triangles" in page.locator(".mesh").inner_text()
+
+
+def test_a_mesh_is_shown_in_its_colours_or_in_grey(tmp_path, tab):
+    ball = trimesh.creation.icosphere(2)
+    ball.visual.vertex_colors = [[200, 30, 30, 255]] * len(ball.vertices)
+    (made.write(tmp_path, 0) / "mesh.ply").write_bytes(ball.export(file_type="ply"))
+    write_index(tmp_path)
+    page = tab(tmp_path).open("#/run/completion-0000")
+    plot = drawn(page).first
+    red, _, blue = middle(plot)
+    assert red > 2 * blue
+    page.get_by_role("button", name="Grey").click()
+    page.wait_for_timeout(300)
+    red, green, blue = middle(plot)
+    assert max(red, green, blue) < 1.2 * min(red, green, blue)
+
+
+def test_two_meshes_turn_together(results, tab):
+    page = tab(results).open("#/compare/completion-0000/completion-0001")
+    plots = drawn(page)
+    before = [plot.screenshot() for plot in plots.all()]
+    drag(page, plots.first)
+    after = [plot.screenshot() for plot in plots.all()]
+    cameras = plots.evaluate_all("all => all.map((plot) => JSON.stringify(plot.layout.scene.camera.eye))")
+    assert len(before) == 2 and all(a != b for a, b in zip(before, after, strict=True))
+    assert cameras[0] == cameras[1]
+
+
+def drawn(page):
+    """The meshes of a page, when they are there."""
+    page.locator(".plot canvas").first.wait_for()
+    page.locator(".plot").first.scroll_into_view_if_needed()
+    page.wait_for_timeout(500)
+    return page.locator(".plot")
+
+
+def drag(page, plot):
+    box = plot.bounding_box()
     page.mouse.move(box["x"] + 200, box["y"] + 100)
     page.mouse.down()
-    page.mouse.move(box["x"] + 300, box["y"] + 160, steps=4)
+    page.mouse.move(box["x"] + 210, box["y"] + 105, steps=4)
     page.mouse.up()
-    page.wait_for_timeout(300)
-    turned = canvas.screenshot()
-    assert turned != normals
-    canvas.press("ArrowLeft")
-    canvas.press("+")
-    page.wait_for_timeout(300)
-    assert canvas.screenshot() != turned
-    canvas.press("Home")
-    canvas.evaluate("(canvas) => canvas.blur()")  # whose outline is part of the picture
-    page.wait_for_timeout(300)
-    assert canvas.screenshot() == normals
-    assert "642 vertices, 1,280 triangles" in page.locator(".mesh").inner_text()
+    page.wait_for_timeout(500)
+
+
+def middle(plot):
+    """The colour of the pixel in the middle."""
+    picture = Image.open(io.BytesIO(plot.screenshot())).convert("RGB")
+    return picture.getpixel((picture.width // 2, picture.height // 2))
 
 
 def test_a_table_sorts_and_its_chart_answers_the_mouse(results, tab):
@@ -250,7 +304,7 @@ def test_a_cell_of_the_atlas_opens_its_curve_and_its_run(results, tab):
     page = tab(results).open("#/table/stability")
     page.get_by_role("button", name="wires, dist: 0.1 (0.05 to 0.2)").click()
     page.locator(".opened .scatterlayer .trace").first.wait_for()
-    assert "Breaks: 0.1 (0.05 to 0.2) units" in page.locator(".opened").inner_text()
+    assert "Breaks: 0.1 (0.05 to 0.2). The run" in page.locator(".opened").inner_text()
     assert page.locator(".opened a").get_attribute("href") == "#/run/completion-0002"
     page.keyboard.press("ArrowRight")
     page.keyboard.press("Enter")
@@ -266,9 +320,8 @@ def test_two_runs_are_compared(results, tab):
     page.get_by_role("heading", name="Settings that differ").wait_for()
     text = page.locator("main").inner_text()
     assert "renderer._label_" in text and "index" in text
-    row = page.get_by_role("row").filter(has=page.get_by_text("chamfer_l2", exact=True))
-    assert row.locator("td").all_inner_texts() == ["0.00100", "0.00200", "2.00", "A"]
-    assert page.locator(".mesh canvas").count() == 2
+    row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
+    assert row.locator("td").all_inner_texts() == ["1.00", "2.00", "2.00", "A"]
     address = page.evaluate("location.hash")
     page.get_by_role("link", name="Swap").click()
     page.get_by_role("heading", name="Settings that differ").wait_for()
@@ -341,8 +394,8 @@ def test_one_file_has_all_inside(results, tab, tmp_path):
     assert "made to be sent" in page.locator("#problems").inner_text()
     page = one.open("#/run/completion-0000", alone.name)
     page.locator(".scatterlayer .trace").first.wait_for()
-    assert page.locator(".pictures img").count() == 1
-    assert page.locator(".pictures img").evaluate("(image) => image.naturalWidth") == 40
+    assert page.locator("main img").count() == 1
+    assert page.locator("main img").evaluate("(image) => image.naturalWidth") == 40
     page = one.open("#/table/speed_front", alone.name)
     page.locator(".scatterlayer .trace").first.wait_for()
 

@@ -187,7 +187,7 @@ def test_scripts_that_a_stranger_left_among_ours_are_gone(tmp_path, tab):
     write_index(tmp_path)
     assert not any(path.read_text(encoding="utf-8") == evil for path in (tmp_path / "page").rglob("*.js"))
     page = tab(tmp_path).open("#/run/completion-0000")
-    page.locator(".mesh canvas").wait_for()
+    page.locator(".mesh canvas").first.wait_for()
     assert page.evaluate("window.hacked") is None
 
 
@@ -217,7 +217,7 @@ def test_numbers_beyond_a_float_and_odd_meshes_are_words(tmp_path, tab):
     np.savez(tmp_path / "runs" / "completion-0001" / "images.npz", hit=np.zeros(2))
     write_index(tmp_path)
     page = tab(tmp_path).open("#/run/completion-0001")
-    page.get_by_text("shorter than its header says").wait_for()
+    page.get_by_text("PLY is unexpected length").wait_for()
 
 
 def test_an_address_leads_into_the_folder_or_nowhere(tmp_path, tab):

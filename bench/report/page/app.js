@@ -2,78 +2,52 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill} = bench.dom;
+  const {element, fill, details, list} = bench.dom;
+  const {plural} = bench.format;
+  const VIEWS = new Map([
+    ["", (home, {query}) => bench.overview(home, query)],
+    ["runs", (home, {query}) => bench.overview(home, query, {alone: true})],
+    ["run", (home, {path}) => bench.run(home, path[1] || "")],
+    ["compare", (home, {path}) => bench.compare(home, path.slice(1))],
+    ["table", (home, {path}) => bench.paper(home, path[1] || "")],
+  ]);
+  let shown = false;
 
   function start() {
-    bench.oneFile = bench.store.have("list", "about").oneFile;
+    const about = bench.store.have("list", "about");
+    bench.oneFile = about.oneFile;
     bench.runs = bench.openRuns();
     document.querySelector(".skip").addEventListener("click", (event) => {
       event.preventDefault(); // the part of the address behind the # says what is shown
       document.getElementById("main").focus();
     });
-    header(bench.store.have("list", "about"));
+    document.getElementById("tools").append(bench.themeButton());
+    fill(document.getElementById("counts"), plural(bench.runs.count, "run"), bench.runs.count ? counts() : null);
+    fill(document.getElementById("problems"), problems(about.problems), bench.oneFile && element("p.note", null, about.left));
     bench.address.follow(show);
     show();
   }
 
-  function header(about) {
-    const runs = bench.runs;
-    const statuses = runs.count
-      ? runs
-          .values("status")
-          .map((status, code) => [status, runs.codes("status").filter((each) => each === code).length])
-      : [];
-    fill(
-      document.getElementById("counts"),
-      bench.format.plural(runs.count, "run"),
-      statuses.map(([status, n]) =>
-        element(
-          "a.counted",
-          {href: bench.address.to(["runs"], {task: "all", view: "runs", status})},
-          n.toLocaleString("en"),
-          " ",
-          bench.badge(status),
-        ),
-      ),
-    );
-    document.getElementById("tools").append(bench.themeButton());
-    const problems = about.problems;
-    if (problems.length)
-      fill(
-        document.getElementById("problems"),
-        element(
-          "details.note.error",
-          {id: "not-read", open: problems.length < 4},
-          element(
-            "summary",
-            null,
-            `Not read: ${bench.format.plural(problems.length, "run folder")}. Nothing below includes ${problems.length > 1 ? "them" : "it"}.`,
-          ),
-          element(
-            "ul",
-            null,
-            problems.map((problem) => element("li", null, problem)),
-          ),
-        ),
-      );
-    if (bench.oneFile) document.getElementById("problems").append(element("p.note", null, about.left));
+  /* How many runs have each status. */
+  function counts() {
+    return bench.runs.values("status").map((status, code) => {
+      const n = bench.runs.codes("status").filter((each) => each === code).length;
+      const href = bench.address.to(["runs"], {task: "all", view: "runs", status});
+      return element("a.counted", {href}, n.toLocaleString("en"), " ", bench.badge(status));
+    });
   }
 
-  let shown = false;
-
-  const VIEWS = {
-    "": (home, {query}) => bench.overview(home, {board: query}),
-    runs: (home, {query}) => bench.overview(home, {board: query, alone: true}),
-    run: (home, {path}) => bench.run(home, path[1] || ""),
-    compare: (home, {path}) => bench.compare(home, path.slice(1)),
-    table: (home, {path}) => bench.paper(home, path[1] || ""),
-  };
+  function problems(said) {
+    if (!said.length) return null;
+    const none = `Nothing below includes ${said.length > 1 ? "them" : "it"}.`;
+    const home = details(`Not read: ${plural(said.length, "run folder")}. ${none}`, list(said));
+    return Object.assign(home, {id: "not-read", className: "note error", open: said.length < 4});
+  }
 
   function show() {
     const address = bench.address.read();
     const home = document.getElementById("main");
-    const view = VIEWS[address.path[0] || ""] || VIEWS[""];
-    view(home, address);
+    (VIEWS.get(address.path[0]) || VIEWS.get(""))(home, address);
     const heading = home.querySelector("h1");
     document.title = heading ? `${heading.textContent} – implicit-bench` : "implicit-bench";
     window.scrollTo(0, 0);

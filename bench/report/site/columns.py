@@ -19,38 +19,20 @@ METRICS = SHOWN | MEASURED
 
 def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
     """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
-    return columns_of([entry(record, Folder(results_dir, record["folder"])) for record in records])
-
-
-def entry(record: Record, folder: Folder) -> dict[str, Any]:
-    """What the list has of a run, as plain data; its name follows when all runs are known."""
-    nameable = Nameable.of(record)
+    folders = [Folder(results_dir, record["folder"]) for record in records]
+    texts = {name: [of(record) for record in records] for name, of in TEXTS.items()}
+    texts |= {"name": names([Nameable.of(record) for record in records]), "thumb": [one.thumb() for one in folders]}
     return {
-        "folder": folder.name,
-        "address": folder.link(""),
-        "key": folder.key,
-        "texts": {name: of(record) for name, of in TEXTS.items()} | {"row": nameable.row, "thumb": folder.thumb()},
-        "settings": nameable.settings,
-        "numbers": {name: _rounded(of(record)) for name, of in NUMBERS.items()},
-        "after": _measured(record["metrics"]),
-        "before": _measured(record["metrics_start"]),
-        "reason": _reason(record),
-        "reused": record["reused"],
-    }
-
-
-def columns_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """The columns of entries."""
-    texts = {name: [one["texts"][name] for one in entries] for name in (*TEXTS, "row", "thumb")}
-    named = names([Nameable(one["texts"]["task"], one["texts"]["row"], one["settings"]) for one in entries])
-    return {
-        "count": len(entries),
-        **{name: [one[name] for one in entries] for name in ("folder", "address", "key", "reason")},
-        "texts": {name: _coded(values) for name, values in {**texts, "name": named}.items()},
-        "numbers": {name: [one["numbers"][name] for one in entries] for name in NUMBERS},
-        "metrics": _metrics(entries),
-        "reused": [place for place, one in enumerate(entries) if one["reused"]],
-        "tasks": _tasks(entries),
+        "count": len(records),
+        "folder": [folder.name for folder in folders],
+        "address": [folder.link("") for folder in folders],
+        "key": [folder.key for folder in folders],
+        "reason": [_reason(record) for record in records],
+        "texts": {name: _coded(values) for name, values in texts.items()},
+        "numbers": {name: [_rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
+        "metrics": _metrics(records),
+        "reused": [place for place, record in enumerate(records) if record["reused"]],
+        "tasks": _tasks(records),
     }
 
 
@@ -95,29 +77,25 @@ TEXTS = {
 }
 
 
-def _measured(part: dict[str, Any]) -> dict[str, int | float | str]:
-    """The metrics of a part of a record that are shown and are numbers."""
-    return {key: known for key in METRICS if (known := _rounded(part.get(key))) is not None}
-
-
-def _metrics(entries: list[dict[str, Any]]) -> dict[str, Any]:
+def _metrics(records: list[Record]) -> dict[str, Any]:
     """The metrics that some run has: before and after, in scene units, with their names and factors."""
-    after, before = ({key for one in entries for key in one[part]} for part in ("after", "before"))
     found = {}
-    for key in (key for key in METRICS if key in after):
-        start = [one["before"].get(key) for one in entries] if key in before else None
-        found[key] = {"key": key, **METRICS[key]._asdict(), "after": [one["after"].get(key) for one in entries]}
-        found[key] |= {"before": start}
+    for key, metric in METRICS.items():
+        after, before = ([_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start"))
+        if any(value is not None for value in after):
+            start = before if any(value is not None for value in before) else None
+            found[key] = {"key": key, **metric._asdict(), "after": after, "before": start}
     return found
 
 
-def _tasks(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _tasks(records: list[Record]) -> list[dict[str, Any]]:
     """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
     known: dict[str, set[str]] = {}
-    for one in entries:
-        known.setdefault(one["texts"]["task"], set()).update(one["after"])
+    for record in records:
+        measured = {key for key in METRICS if number(record["metrics"].get(key)) is not None}
+        known.setdefault(record["task"], set()).update(measured)
     found = []
-    for task, count in Counter(one["texts"]["task"] for one in entries).most_common():
+    for task, count in Counter(record["task"] for record in records).most_common():
         keys = sorted((key for key in METRICS if key in known[task]), key=lambda key, task=task: key != FIRST.get(task))
         found.append({"task": task, "count": count, "metrics": keys})
     return found

@@ -5,10 +5,8 @@
   /* {path: ["run", "folder"], query: {sort: "loop"}} */
   function read() {
     const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
-    return {
-      path: path.split("/").filter(Boolean).map(decode),
-      query: Object.fromEntries(new URLSearchParams(query || "")),
-    };
+    const entries = new URLSearchParams(query || "");
+    return {path: path.split("/").filter(Boolean).map(decode), query: Object.fromEntries(entries)};
   }
 
   function decode(part) {

@@ -5,6 +5,8 @@
 
   const PICTURE = /^data:image\/(png|gif|webp|jpeg);base64,[A-Za-z0-9+/=]*$/;
   const WITHIN = /^(runs|paper|sweeps)\/[A-Za-z0-9_.~%/-]*$/;
+  const ATTRIBUTE =
+    /^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|loading|scope|colspan|width|height|tabindex|placeholder)$/;
 
   /* The address, if it is a place of this page, a file of the results folder or a picture that is written into the page. */
   function safeAddress(address) {
@@ -20,8 +22,7 @@
     const made = document.createElement(tag);
     if (classes.length) made.className = classes.join(" ");
     for (const [name, value] of Object.entries(properties || {})) set(made, name, value);
-    add(made, children);
-    return made;
+    return fill(made, children);
   }
 
   function set(made, name, value) {
@@ -30,63 +31,70 @@
     else if (name === "href" || name === "src") {
       const address = safeAddress(value);
       if (address !== null) made.setAttribute(name, address);
-    } else if (name === "checked" || name === "value" || name === "disabled" || name === "open") made[name] = value;
-    else if (
-      /^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|for|loading|scope|colspan|rowspan|width|height|tabindex|style|placeholder|download|autocomplete|name|lang)$/.test(
-        name,
-      )
-    )
-      made.setAttribute(name, value === true ? "" : String(value));
+    } else if (["checked", "value", "disabled", "open"].includes(name)) made[name] = value;
+    else if (ATTRIBUTE.test(name)) made.setAttribute(name, value === true ? "" : String(value));
     else throw new Error(`dom.js knows no property ${name}`);
   }
 
-  function add(parent, children) {
-    for (const child of children.flat(Infinity)) {
-      if (child === null || child === undefined || child === false || child === "") continue;
-      parent.append(child instanceof Node ? child : document.createTextNode(String(child)));
-    }
-  }
-
-  /* Replaces all children of an element. */
+  /* Replaces all children of an element; those that are missing, false or empty are left out. */
   function fill(parent, ...children) {
-    parent.replaceChildren();
-    add(parent, children);
+    const known = children.flat(Infinity).filter((child) => ![null, undefined, false, ""].includes(child));
+    parent.replaceChildren(...known.map((child) => (child instanceof Node ? child : String(child))));
     return parent;
   }
 
+  const soft = (...children) => element("span.soft", null, children);
+  const section = (title, ...children) => element("section", null, element("h2", null, title), children);
+  const details = (title, ...children) => element("details", null, element("summary", null, title), children);
+  const list = (items) => element("ul", null, items.map((item) => element("li", null, item)));
+
+  /* Names and values, a line each. */
+  const facts = (rows) =>
+    element("dl.facts", null, rows.map(([name, value]) =>
+      element("div", null, element("dt", null, name), element("dd", null, value))));
+
+  /* What a promise gives, as `show` makes it, or a note on why it is not there. */
+  function later(promise, show) {
+    const home = element("div", null, element("p.soft", null, "Loading …"));
+    promise.then((data) => fill(home, show(data)), (error) => fill(home, element("p.note", null, error.message)));
+    return home;
+  }
+
+  /* Buttons of which one is pressed: names by key. */
+  function choice(label, names, pressed, press) {
+    const buttons = Object.entries(names).map(([key, name]) => {
+      const click = (event) => {
+        for (const button of buttons) button.setAttribute("aria-pressed", String(button === event.currentTarget));
+        press(key);
+      };
+      return element("button", {type: "button", "aria-pressed": String(key === pressed), click}, name);
+    });
+    return element("div.switch", {role: "group", "aria-label": label}, buttons);
+  }
+
   /* Text in which the words between asterisks are strong. */
-  function emphasised(text) {
-    return String(text)
-      .split("*")
-      .map((part, place) => (place % 2 ? element("strong", null, part) : part));
+  const emphasised = (text) =>
+    String(text).split("*").map((part, place) => (place % 2 ? element("strong", null, part) : part));
+
+  /* A name in letters of one width that may be broken behind its dots and underscores. */
+  const code = (name) =>
+    element("code", null, String(name).split(/(?<=[._])/).flatMap((part, n) => (n ? [element("wbr"), part] : part)));
+
+  /* Lines of code with a button that copies them. */
+  function copied(text, label) {
+    const click = ({currentTarget: button}) => {
+      const area = element("textarea.unseen", {value: text, "aria-hidden": "true"});
+      document.body.append(area);
+      area.select();
+      button.textContent = document.execCommand("copy") ? "Copied" : "Press Ctrl+C";
+      area.remove();
+      setTimeout(() => (button.textContent = "Copy"), 1500);
+    };
+    const button = element("button", {type: "button", "aria-label": label, click}, "Copy");
+    return element("div.code", null, element("pre", {tabindex: 0}, text), button);
   }
 
-  /* A name that may be broken behind its dots and underscores. */
-  const breakable = (text) =>
-    String(text)
-      .split(/(?<=[._])/)
-      .flatMap((part, place) => (place ? [element("wbr"), part] : [part]));
-
-  /* A button that copies a text. */
-  function copyButton(text, label) {
-    return element(
-      "button.small",
-      {
-        type: "button",
-        "aria-label": label,
-        click: (event) => {
-          const said = (word) => (event.target.textContent = word);
-          const area = element("textarea.hidden", {value: text, "aria-hidden": "true"});
-          document.body.append(area);
-          area.select();
-          said(document.execCommand("copy") ? "Copied" : "Press Ctrl+C");
-          area.remove();
-          setTimeout(() => said("Copy"), 1500);
-        },
-      },
-      "Copy",
-    );
-  }
-
-  bench.dom = {element, fill, emphasised, breakable, copyButton, safeAddress};
+  Object.assign(bench, {
+    dom: {element, fill, soft, section, details, list, facts, later, choice, emphasised, code, copied, safeAddress},
+  });
 })((window.implicitBench = window.implicitBench || {}));

@@ -1,10 +1,32 @@
-/* The runs as the page reads them: a text, a number or a metric of the run at a place of the list. */
+/* The runs as the page reads them: a text, a number or a metric of the run at a place of the list; and its status. */
 (function (bench) {
   "use strict";
 
+  const {element} = bench.dom;
   const {decoded} = bench.store;
+  const SEARCHED = ["name", "task", "scene", "family", "renderer", "status", "experiment", "machine"];
+  const KINDS = {
+    ok: ["good", "✓"],
+    not_reached: ["warn", "↘"],
+    timeout: ["warn", "◷"],
+    oom: ["warn", "▦"],
+    unsupported: ["mute", "–"],
+    not_run: ["mute", "○"],
+    killed: ["bad", "■"],
+    nan: ["bad", "?"],
+    diverged: ["bad", "↗"],
+    empty: ["bad", "∅"],
+    crashed: ["bad", "✕"],
+    refused: ["bad", "✕"],
+  };
 
-  function open() {
+  /* A status as a mark, a word and a colour: never by its colour alone. */
+  function badge(status) {
+    const [tone, mark] = KINDS[status];
+    return element(`span.status.${tone}`, null, element("span", {"aria-hidden": "true"}, mark), status.replace("_", " "));
+  }
+
+  function openRuns() {
     const data = bench.store.have("list", "runs");
     const {texts, numbers, metrics} = data;
     for (const name of Object.keys(numbers)) numbers[name] = numbers[name].map(decoded);
@@ -12,20 +34,15 @@
       metric.after = metric.after.map(decoded);
       metric.before = metric.before && metric.before.map(decoded);
     }
-    const places = new Map(data.folder.map((folder, place) => [folder, place]));
-    const keys = new Map(data.key.map((key, place) => [key, place]));
+    const places = new Map([...data.key, ...data.folder].map((name, n) => [name, n % data.count]));
     const reused = new Set(data.reused);
     const found = [];
+    const text = (place, column) => texts[column].values[texts[column].codes[place]];
 
     /* The words of a run that a search looks through. */
     function words(place) {
-      if (found[place] === undefined) {
-        const parts = ["name", "task", "scene", "family", "renderer", "status", "experiment", "machine"];
-        found[place] = [...parts.map((part) => text(place, part)), data.folder[place], data.reason[place]]
-          .join(" ")
-          .toLowerCase();
-      }
-      return found[place];
+      const parts = () => [...SEARCHED.map((part) => text(place, part)), data.folder[place], data.reason[place]];
+      return (found[place] = found[place] || parts().join(" ").toLowerCase());
     }
 
     /* The folder, or the key of the run where a folder's name is no text that an address can have. */
@@ -37,28 +54,23 @@
       }
     }
 
-    const text = (place, column) => texts[column].values[texts[column].codes[place]];
     return {
-      count: data.count,
-      tasks: data.tasks,
-      metrics,
-      text,
-      words,
+      ...{count: data.count, tasks: data.tasks, metrics, text, words, name},
       codes: (column) => texts[column].codes,
       values: (column) => texts[column].values,
       number: (place, column) => numbers[column][place],
       folder: (place) => data.folder[place],
-      key: (place) => data.key[place],
       reason: (place) => data.reason[place],
       reused: (place) => reused.has(place),
-      place: (name) => (places.has(name) ? places.get(name) : keys.get(name)),
+      place: (wanted) => places.get(wanted),
+      held: (place) => bench.store.have("run", data.key[place]),
+      detail: (place) => bench.store.load("run", data.key[place]),
+      mesh: (place) => bench.store.load("mesh", data.key[place]),
       picture: (place) => text(place, "thumb") && data.address[place] + text(place, "thumb"),
       link: (place) => bench.address.to(["run", name(place)]),
-      name,
-      /* The name in one line for headings: name and scene, and the seed where it is known. */
       title: (place) => `${text(place, "name")}, ${text(place, "scene")}`,
     };
   }
 
-  bench.openRuns = open;
+  Object.assign(bench, {badge, openRuns});
 })((window.implicitBench = window.implicitBench || {}));

@@ -10,8 +10,7 @@
   /* Called by the scripts of data. */
   function receive(kind, key, data) {
     received.set(`${kind}/${key}`, data);
-    const waits = waiting.get(`${kind}/${key}`);
-    if (waits) waits.resolve(data);
+    if (waiting.has(`${kind}/${key}`)) waiting.get(`${kind}/${key}`).resolve(data);
   }
 
   const have = (kind, key) => received.get(`${kind}/${key}`);
@@ -34,27 +33,21 @@
     return waiting.get(name).promise;
   }
 
-  function script(address) {
-    return new Promise((resolve, reject) => {
-      const made = document.createElement("script");
-      Object.assign(made, {src: address, onload: resolve, onerror: reject});
-      document.head.append(made);
-    });
-  }
+  const script = (src) =>
+    new Promise((onload, onerror) =>
+      document.head.append(Object.assign(document.createElement("script"), {src, onload, onerror})));
 
   let library = null;
 
-  /* A promise of Plotly, which lies beside the page and is loaded when a chart first needs it. */
+  /* A promise of Plotly, which lies beside the page and is loaded when a chart or mesh first needs it. */
   function plotly() {
     if (window.Plotly) return Promise.resolve(window.Plotly);
-    if (bench.oneFile)
-      return Promise.reject(new Error("Charts that answer the mouse are left out of a page in one file."));
     library = library || script("page/plotly.min.js").then(() => window.Plotly);
     return library;
   }
 
   /* A number, of which the scripts write those that are not finite as words; null for a missing one. */
-  const decoded = (value) => (typeof value === "string" && value in NON_FINITE ? NON_FINITE[value] : value);
+  const decoded = (value) => (typeof value === "string" && Object.hasOwn(NON_FINITE, value) ? NON_FINITE[value] : value);
 
   Object.assign(bench, {receive, store: {have, load, plotly, decoded}});
 })((window.implicitBench = window.implicitBench || {}));

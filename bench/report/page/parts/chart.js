@@ -2,164 +2,113 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill} = bench.dom;
-  const DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"};
-  const SYMBOLS = {
-    o: "circle",
-    s: "square",
-    "^": "triangle-up",
-    D: "diamond",
-    v: "triangle-down",
-    "<": "triangle-left",
-    ">": "triangle-right",
-    p: "pentagon",
-    h: "hexagon",
-    H: "hexagon2",
-    "*": "star",
-    d: "diamond-tall",
-    8: "octagon",
-    P: "cross",
-    X: "x",
-  };
-
-  /* The markers as letters, for the legend. */
-  const GLYPHS = {o: "●", s: "■", "^": "▲", D: "◆", v: "▼", "<": "◄", ">": "►", p: "⬟", h: "⬢", H: "⬣", "*": "★", d: "♦"};
-  Object.assign(GLYPHS, {8: "⬣", P: "✚", X: "✖"});
+  const {element, later} = bench.dom;
+  const {decoded} = bench.store;
+  const {number, count} = bench.format;
+  const DASHES = new Map([["-", "solid"], ["--", "dash"], ["-.", "dashdot"], [":", "dot"]]);
+  const SYMBOLS = new Map([ // Plotly's name of a marker, and a letter for the legend
+    ...[["o", "circle", "●"], ["s", "square", "■"], ["^", "triangle-up", "▲"], ["v", "triangle-down", "▼"]],
+    ...[["<", "triangle-left", "◄"], [">", "triangle-right", "►"], ["D", "diamond", "◆"], ["d", "diamond-tall", "♦"]],
+    ...[["p", "pentagon", "⬟"], ["h", "hexagon", "⬢"], ["H", "hexagon2", "⬣"], ["8", "octagon", "⬣"]],
+    ...[["*", "star", "★"], ["P", "cross", "✚"], ["X", "x", "✖"]],
+  ].map(([key, ...look]) => [key, look]));
   const MANY = 2; // panels, beyond which the legend stands above them and stays in sight
 
   /* Plotly reads some markup in its texts; a name from a record has none. */
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 
-  /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, series}]}. A series is {name, colour, symbol, dash, x, y,
-     text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name are
-     shown and hidden together. A point with a link opens it. */
+  /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, series}]}. A series is {name, colour, symbol, dash,
+     x, y, text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name are
+     shown and hidden together. A point with a link opens it. `focus` is the name of the series to bring out. */
   function chart(spec, {label, focus} = {}) {
-    const home = element("div.chart", {role: "group", "aria-label": label || "Chart"});
-    fill(home, element("p.soft", null, "Loading the chart …"));
-    bench.store.plotly().then(
-      (plotly) => draw(plotly, home, spec, focus),
-      (error) => fill(home, element("p.soft", null, error.message)),
-    );
-    return home;
+    const shown = later(bench.store.plotly(), (plotly) => drawn(plotly, spec, focus));
+    return element("div.chart", {role: "group", "aria-label": label || "Chart"}, shown);
   }
 
-  function draw(plotly, home, spec, focus) {
-    const names = [
-      ...new Set(spec.panels.flatMap((panel) => panel.series.filter(({quiet}) => !quiet).map(({name}) => name))),
-    ];
-    const off = new Set(
-      spec.panels.flatMap((panel) => panel.series.filter((series) => series.off).map(({name}) => name)),
-    );
-    const places = spec.panels.map((panel) =>
-      element("div.panel", {role: "img", "aria-label": panel.title || "Panel"}),
-    );
-    const redraw = () => places.forEach((place, number) => drawPanel(plotly, place, spec.panels[number], {off, focus}));
-    const looks = new Map(spec.panels.flatMap((panel) => panel.series).map((series) => [series.name, series]));
-    const entries = names.map((name) => entry(name, looks.get(name), off, redraw));
+  function drawn(plotly, spec, focus) {
+    const series = spec.panels.flatMap((panel) => panel.series);
+    const off = new Set(series.filter((each) => each.off).map(({name}) => name));
+    const looks = new Map(series.map((each) => [each.name, each]));
+    const names = [...new Set(series.filter(({quiet}) => !quiet).map(({name}) => name))];
+    const places = spec.panels.map(({title}) => element("div.panel", {role: "img", "aria-label": title || "Panel"}));
+    const redraw = () => places.forEach((place, n) => drawPanel(plotly, place, spec.panels[n], off, focus));
     const many = spec.panels.length > MANY;
-    const legend = names.length > 1 ? element(`div.legend${many ? ".above" : ""}`, null, entries) : null;
-    fill(
-      home,
-      many ? legend : null,
-      element(`div.panels${many ? ".many" : ""}`, null, places),
-      many ? null : legend,
-      spec.note ? element("p.soft", null, spec.note) : null,
-    );
+    const entries = names.map((name) => entry(looks.get(name), off, redraw));
+    const legend = names.length > 1 && element(`div.legend${many ? ".above" : ""}`, null, entries);
+    const panels = element(`div.panels${many ? ".many" : ""}`, null, places);
     requestAnimationFrame(redraw);
-    bench.onTheme(home, redraw);
+    bench.onTheme(panels, redraw);
+    return [many && legend, panels, !many && legend, spec.note && element("p.soft", null, spec.note)];
   }
 
-  function entry(name, look, off, redraw) {
-    const glyph = GLYPHS[look.symbol];
+  /* A button of the legend, which shows and hides a series. */
+  function entry({name, symbol, colour}, off, redraw) {
+    const [, glyph] = SYMBOLS.get(symbol) || [];
     const swatch = element(glyph ? "span.glyph" : "span.swatch", {"aria-hidden": "true"}, glyph);
-    swatch.style[glyph ? "color" : "background"] = bench.colour(look.colour);
-    const toggle = (event) => {
+    swatch.style[glyph ? "color" : "background"] = bench.colour(colour);
+    const click = ({currentTarget}) => {
       off.has(name) ? off.delete(name) : off.add(name);
-      event.currentTarget.setAttribute("aria-pressed", String(!off.has(name)));
+      currentTarget.setAttribute("aria-pressed", String(!off.has(name)));
       redraw();
     };
-    return element(
-      "button.entry",
-      {type: "button", "aria-pressed": String(!off.has(name)), click: toggle},
-      swatch,
-      name,
-    );
+    return element("button.entry", {type: "button", "aria-pressed": String(!off.has(name)), click}, swatch, name);
   }
 
-  function drawPanel(plotly, place, panel, {off, focus}) {
+  function drawPanel(plotly, place, panel, off, focus) {
     if (!place.isConnected) return;
-    const front = (series) => Number(series.name === focus); // drawn last, over the others
-    const shown = panel.series.filter((series) => !off.has(series.name)).sort((a, b) => front(a) - front(b));
+    const front = ({name}) => Number(name === focus); // drawn last, over the others
+    const shown = panel.series.filter(({name}) => !off.has(name)).sort((a, b) => front(a) - front(b));
     const traces = shown.map((series) => trace(series, focus));
     plotly.react(place, traces, layout(panel, place), {displayModeBar: false, responsive: true});
     place.removeAllListeners("plotly_click");
     place.on("plotly_click", ({points: [point]}) => {
-      const link = shown[point.curveNumber].link;
+      const {link} = shown[point.curveNumber];
       const address = link && bench.dom.safeAddress(link[point.pointNumber]);
       if (address) location.hash = address;
     });
   }
 
   function trace(series, focus) {
-    const colour = bench.colour(series.colour);
-    const dim = focus && series.name !== focus ? 0.35 : 1;
+    const color = bench.colour(series.colour);
     const lines = series.dash !== undefined;
-    const symbol = (SYMBOLS[series.symbol] || "circle") + (series.hollow ? "-open" : "");
+    const dash = DASHES.get(series.dash) || "solid";
+    const [symbol] = SYMBOLS.get(series.symbol) || ["circle"];
+    const width = focus === series.name ? 3 : 1.6;
     const made = {
       type: "scatter",
       name: plain(series.name),
-      x: series.x.map(bench.store.decoded),
-      y: series.y.map(bench.store.decoded),
+      x: series.x.map(decoded),
+      y: series.y.map(decoded),
       mode: lines ? (series.symbol ? "lines+markers" : "lines") : "markers",
-      opacity: dim,
-      line: {
-        color: colour,
-        width: focus === series.name ? 3 : 1.6,
-        dash: DASHES[series.dash] || "solid",
-        shape: series.step ? "hv" : "linear",
-      },
-      marker: {color: colour, symbol, size: series.size || 7, line: {color: colour, width: 1.5}},
+      opacity: focus && series.name !== focus ? 0.35 : 1,
+      line: {color, width, dash, shape: series.step ? "hv" : "linear"},
+      marker: {color, symbol: symbol + (series.hollow ? "-open" : ""), size: series.size || 7, line: {color, width: 1.5}},
       hoverinfo: series.quiet ? "skip" : "text",
       text: hover(series),
     };
-    if (series.low)
-      made.error_y = {
-        type: "data",
-        symmetric: false,
-        array: series.high.map((high, n) => high - series.y[n]),
-        arrayminus: series.low.map((low, n) => series.y[n] - low),
-        color: colour,
-        thickness: 1,
-        width: 2,
-      };
+    if (series.low) {
+      const [array, arrayminus] = [series.high, series.low].map((ends) => ends.map((end, n) => Math.abs(end - series.y[n])));
+      made.error_y = {type: "data", symmetric: false, array, arrayminus, color, thickness: 1, width: 2};
+    }
     return made;
   }
 
-  function hover(series) {
-    const {number} = bench.format;
-    return series.x.map((x, n) => {
-      const said = series.text ? [].concat(series.text[n]) : [`${number(x)}, ${number(series.y[n])}`];
-      return [`<b>${plain(series.name)}</b>`, ...said.map(plain)].join("<br>");
+  const hover = ({name, x, y, text}) =>
+    x.map((each, n) => {
+      const said = text ? [].concat(text[n]) : [`${number(each)}, ${number(y[n])}`];
+      return [`<b>${plain(name)}</b>`, ...said.map(plain)].join("<br>");
     });
-  }
 
   function layout(panel, place) {
     const style = getComputedStyle(document.documentElement);
-    const [text, line, card] = ["--soft", "--line", "--card"].map((name) => style.getPropertyValue(name).trim());
-    const narrow = place.clientWidth < 460;
+    const own = (name) => style.getPropertyValue(name).trim();
+    const [line, narrow] = [own("--line"), place.clientWidth < 460];
     const axis = ({title, log, reversed}, letter) => ({
+      ...(log ? ticks(panel.series.flatMap((series) => series[letter]), narrow) : {}),
       autorange: reversed ? "reversed" : true,
-      ...(log
-        ? ticks(
-            panel.series.flatMap((series) => series[letter]),
-            narrow,
-          )
-        : {}),
       title: {text: plain(title), standoff: 8},
       type: log ? "log" : "linear",
-      gridcolor: line,
-      zerolinecolor: line,
-      linecolor: line,
+      ...{gridcolor: line, zerolinecolor: line, linecolor: line},
       automargin: true,
       nticks: narrow ? 5 : 8,
     });
@@ -171,37 +120,27 @@
       hovermode: "closest",
       xaxis: axis(panel.x, "x"),
       yaxis: axis(panel.y, "y"),
-      paper_bgcolor: "rgba(0,0,0,0)",
-      plot_bgcolor: "rgba(0,0,0,0)",
-      font: {color: text, size: 12, family: style.getPropertyValue("--font")},
-      hoverlabel: {
-        bgcolor: card,
-        bordercolor: line,
-        align: "left",
-        font: {color: style.getPropertyValue("--text").trim()},
-      },
+      ...{paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)"},
+      font: {color: own("--soft"), size: 12, family: own("--font")},
+      hoverlabel: {bgcolor: own("--card"), bordercolor: line, align: "left", font: {color: own("--text")}},
     };
   }
 
-  /* Plain numbers as ticks of a logarithmic axis: powers of ten, and 2 and 5 between them where there are few. */
+  /* Plain numbers as ticks of a logarithmic axis: powers of ten, and numbers between them where there are few. */
   function ticks(values, narrow) {
-    const known = values.map(bench.store.decoded).filter((value) => value > 0 && Number.isFinite(value));
+    const known = values.map(decoded).filter((value) => value > 0 && Number.isFinite(value));
     if (!known.length) return {};
     const [low, high] = [Math.log10(Math.min(...known)), Math.log10(Math.max(...known))];
     const span = high - low;
     const steps = span > (narrow ? 1.6 : 2.6) ? [1] : span > 0.8 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 6, 8];
-    const stride = span > 7 ? 2 : 1;
     const tickvals = [];
-    for (let power = Math.floor(low) - 1; power <= Math.ceil(high) + 1; power += stride)
-      for (const step of steps) tickvals.push(step * 10 ** power);
-    const plain = (x) =>
-      x >= 1e4 || x < 1e-3 ? x.toExponential(0).replace("e+", "e") : String(Number(x.toPrecision(2)));
-    return {
-      tickvals,
-      ticktext: tickvals.map((x) =>
-        x >= 1e4 && x < 1e15 ? bench.format.count(x).replace(/\.0+(?=[kMGTP])/, "") : plain(x),
-      ),
+    for (let power = Math.floor(low) - 1; power <= Math.ceil(high) + 1; power += span > 7 ? 2 : 1)
+      tickvals.push(...steps.map((step) => step * 10 ** power));
+    const text = (x) => {
+      if (x >= 1e4 && x < 1e15) return count(x).replace(/\.0+(?=[kMGTP])/, "");
+      return x >= 1e4 || x < 1e-3 ? x.toExponential(0).replace("e+", "e") : String(Number(x.toPrecision(2)));
     };
+    return {tickvals, ticktext: tickvals.map(text)};
   }
 
   bench.chart = chart;

@@ -1,128 +1,143 @@
-/* A table whose headings sort it, whose rows follow the arrow keys, and whose cells have their headings on a phone. */
+/* One table for all: headings sort it, a long one has pages, arrow keys go from row to row, and boxes pick two runs. */
 (function (bench) {
   "use strict";
 
-  const {element, fill} = bench.dom;
+  const {element, fill, soft} = bench.dom;
+  const ON_A_PAGE = 100;
   const LONGEST_LINE = 44; // characters of a cell that stays in one line
 
-  /* A table of columns {key, label, unit, cell, kind, sortable} over items.
-     `order` is {key, down}; `sorted` is called with the key of a heading that is pressed. */
-  function table(columns, items, {order, sorted, caption, rowLabel} = {}) {
-    const head = element(
-      "tr",
-      null,
-      columns.map((column) => heading(column, order, sorted)),
-    );
-    const rows = items.map((item) =>
-      element(
-        "tr",
-        {},
-        columns.map((column) => cell(column, item)),
-      ),
-    );
-    return element(
-      "table.list",
-      {keydown: follow},
-      element("caption.unseen", null, caption || ""),
-      element("thead", null, head),
-      element("tbody", null, rows),
-    );
+  /* A table of columns {key, label, unit, kind, head, cell, get, down} over items, in a place of its own.
+     A column with `get` sorts; with `down` from the greatest. `state` is {sort, order, page}, which `changed` is told of;
+     without it items are sorted by the column `first`, or as they come. `ordered` gets the items in their order. */
+  function table(columns, items, {caption, state = {}, changed, first, ordered, cards} = {}) {
+    const home = element(`div${cards ? ".cards" : ""}`);
+    const find = (key) => columns.find((column) => column.get && column.key === key);
+
+    function set(changes, focused) {
+      Object.assign(state, {page: ""}, changes);
+      if (changed) changed(state);
+      show();
+      if (focused) home.querySelector(`[data-key="${CSS.escape(focused)}"]`).focus();
+      else home.scrollIntoView();
+    }
+
+    function show() {
+      const by = find(state.sort) || find(first);
+      const down = by && (by.key === state.sort && state.order ? state.order === "down" : Boolean(by.down));
+      const all = by ? sort(items, by.get, down) : items;
+      if (ordered) ordered(all);
+      const pages = Math.max(1, Math.ceil(all.length / ON_A_PAGE));
+      const page = Math.min(Math.max(1, Number(state.page) || 1), pages);
+      const press = (key) => set({sort: key, order: by && by.key === key ? (down ? "up" : "down") : ""}, key);
+      const rows = all.slice((page - 1) * ON_A_PAGE, page * ON_A_PAGE);
+      const made = element("table.list", {keydown: follow},
+        element("thead", null, element("tr", null, columns.map((column) => heading(column, column === by, down, press)))),
+        element("tbody", null, rows.map((item) => element("tr", null, columns.map((column) => cell(column, item))))));
+      fill(home,
+        cards && chooser(columns.filter(({get}) => get), by, set),
+        element("div.wide", {tabindex: 0, role: "region", "aria-label": caption || "Table"}, made),
+        pages > 1 && pager(page, pages, set));
+    }
+
+    show();
+    return home;
   }
 
-  function heading(column, order, sorted) {
-    const own = order && order.key === column.key;
-    const direction = own ? (order.down ? "descending" : "ascending") : null;
-    const shown =
-      column.sortable && sorted
-        ? element(
-            "button.sort",
-            {type: "button", click: () => sorted(column.key), "data-key": column.key},
-            column.label,
-            element("span.arrow", {"aria-hidden": "true"}, own ? (order.down ? "▼" : "▲") : ""),
-            column.unit ? element("small", null, column.unit) : null,
-          )
-        : [column.label, column.unit ? element("small", null, column.unit) : null];
-    return element(`th.${column.kind || "words"}`, {scope: "col", "aria-sort": direction}, shown);
+  function heading({key, label, unit, kind, get}, own, down, press) {
+    const arrow = element("span.arrow", {"aria-hidden": "true"}, own ? (down ? "▼" : "▲") : "");
+    const button = () => element("button.sort", {type: "button", "data-key": key, click: () => press(key)}, label, arrow);
+    const order = own ? (down ? "descending" : "ascending") : null;
+    return element(`th.${kind || "words"}`, {scope: "col", "aria-sort": order}, get ? button() : label, unit && element("small", null, unit));
   }
 
-  function cell(column, item) {
-    const content = column.cell(item);
-    const kind = column.head ? "th" : "td";
-    return element(
-      `${kind}.${column.kind || "words"}`,
-      {"data-label": column.label, scope: column.head ? "row" : null},
-      content,
-    );
+  const cell = ({label, kind, head, cell: show}, item) =>
+    element(`${head ? "th" : "td"}.${kind || "words"}`, {"data-label": label, scope: head && "row"}, show(item));
+
+  /* What a phone shows in place of the headings, which it has no room for. */
+  function chooser(columns, by, set) {
+    const options = columns.map(({key, label}) => element("option", {value: key}, label));
+    const change = ({target}) => set({sort: target.value, order: ""}, "sort");
+    const select = element("select", {"data-key": "sort", "aria-label": "Sort by", change}, options);
+    select.value = by.key;
+    return element("label.pick.narrow", null, "Sort by", select);
+  }
+
+  function pager(page, pages, set) {
+    const button = (to, name) =>
+      element("button", {type: "button", disabled: to < 1 || to > pages, click: () => set({page: to === 1 ? "" : String(to)})}, name);
+    return element("nav.pager", {"aria-label": "Pages of the list"},
+      ...[button(1, "« First"), button(page - 1, "‹ Previous")],
+      element("span", null, `Page ${page} of ${pages.toLocaleString("en")}`),
+      ...[button(page + 1, "Next ›"), button(pages, "Last »")]);
   }
 
   /* Up and down go to the link of the row above or below. */
   function follow(event) {
-    const step = {ArrowDown: 1, ArrowUp: -1}[event.key];
     const row = event.target.closest("tbody tr");
-    if (!step || !row || event.target.matches("input, select")) return;
-    const rows = [...row.parentElement.children];
-    const next = rows[rows.indexOf(row) + step];
-    const link = next && next.querySelector("a:not([tabindex])");
+    const next = row && {ArrowDown: row.nextElementSibling, ArrowUp: row.previousElementSibling}[event.key];
+    const link = next && !event.target.matches("input") && next.querySelector("a:not([tabindex])");
     if (!link) return;
     event.preventDefault();
     link.focus();
   }
 
+  /* Sorts items by a value; those without one come last in either direction. */
+  function sort(items, get, down) {
+    const missing = (value) => value === null || value === undefined || value === "" || Number.isNaN(value);
+    const values = items.map((item, place) => ({item, place, value: get(item)}));
+    values.sort((a, b) => {
+      if (missing(a.value) || missing(b.value)) return missing(a.value) - missing(b.value) || a.place - b.place;
+      return a.value === b.value ? a.place - b.place : a.value < b.value === !down ? -1 : 1;
+    });
+    return values.map(({item}) => item);
+  }
+
   /* The table of a page that was written as text: numbers to the right, and sorted by the first number of a cell. */
-  function written(header, rows, {link} = {}) {
-    const longest = header.map((_, place) => Math.max(0, ...rows.map((row) => (row[place] || "").length)));
-    const numeric = header.map((_, place) => isNumeric(rows.map((row) => row[place] || "")));
-    const home = element("div.wide", {tabindex: 0, role: "region", "aria-label": "Table"});
-    let order = null;
-    const columns = header.map((label, place) => ({
-      key: String(place),
-      label,
-      sortable: true,
-      head: place === 0,
-      kind: numeric[place] ? "number" : longest[place] <= LONGEST_LINE ? "words.line" : "words",
-      cell: (row) => (link && link(row, place)) || row[place],
-    }));
-    const show = () => {
-      const place = order && Number(order.key);
-      const get = (row) => (numeric[place] ? leading(rows[row][place]) : (rows[row][place] || "").toLowerCase());
-      const places = rows.map((_, row) => row);
-      const shown = order ? bench.filter.sort(places, get, order.down) : places;
-      fill(
-        home,
-        table(
-          columns,
-          shown.map((row) => rows[row]),
-          {order, sorted: press},
-        ),
-      );
-    };
-    const press = (key) => {
-      order = order && order.key === key ? (order.down ? null : {key, down: true}) : {key, down: false};
-      show();
-      home.querySelector(`[data-key="${key}"]`).focus();
-    };
-    show();
-    return home;
+  function written(header, rows) {
+    const columns = header.map((label, place) => {
+      const cells = rows.map((row) => row[place] || "");
+      const filled = cells.filter((text) => text && text !== "–" && text !== "∞");
+      const numeric = filled.length > 0 && filled.filter((text) => NUMBER.test(text)).length >= 0.7 * filled.length;
+      const line = Math.max(0, ...cells.map((text) => text.length)) <= LONGEST_LINE;
+      const kind = numeric ? "number" : line ? "words.line" : "words";
+      const get = (row) => (numeric ? leading(row[place]) : (row[place] || "").toLowerCase());
+      return {key: String(place), label, kind, get, head: place === 0, cell: (row) => row[place]};
+    });
+    return table(columns, rows);
   }
 
-  const NUMBER = /^[^\w–]*(-?[\d.,]+(?:e-?\d+)?)\s*([kMGTP]?)/;
-
-  function isNumeric(cells) {
-    const filled = cells.filter((text) => text && text !== "–" && text !== "∞");
-    return filled.length > 0 && filled.filter((text) => NUMBER.test(text)).length >= 0.7 * filled.length;
-  }
-
-  const UNITS = {ms: 1e-3, min: 60, h: 3600};
+  const NUMBER = /^[^\w–]*(-?[\d.,]+(?:e-?\d+)?)\s*([kMGTP](?=B?\b))?/;
+  const UNITS = {ms: 1e-3, min: 60, h: 3600, k: 1e3, M: 1e6, G: 1e9, T: 1e12, P: 1e15};
 
   /* The first number of a text, such as 1.43M or 12 ms; infinite for ∞, null where there is none. */
   function leading(text) {
-    if (text === "∞") return Infinity;
     const found = NUMBER.exec(text || "");
-    if (!found) return null;
-    const unit = /(?:\d)\s*(ms|min|h)\b/.exec(text);
-    const value = Number(found[1].replace(/,/g, ""));
-    return value * (unit ? UNITS[unit[1]] : 1000 ** Math.max(0, " kMGTP".indexOf(found[2] || " ")));
+    if (text === "∞" || !found) return text === "∞" ? Infinity : null;
+    const unit = /\d\s*(ms|min|h)\b/.exec(text);
+    return Number(found[1].replace(/,/g, "")) * (UNITS[unit ? unit[1] : found[2]] || 1);
   }
 
-  bench.table = {table, written, leading};
+  let picked = [];
+
+  /* A box that picks a run to compare; a third one takes the place of the second. */
+  function pick(place) {
+    const change = ({target}) => choose([...picked.filter((each) => each !== place).slice(0, 1), ...(target.checked ? [place] : [])]);
+    const checked = picked.includes(place);
+    return element("input", {type: "checkbox", "aria-label": `Compare ${bench.runs.title(place)}`, "data-pick": place, checked, change});
+  }
+
+  /* Shows the picked runs in a bar at the lower edge. */
+  function choose(places) {
+    picked = places;
+    for (const box of document.querySelectorAll("[data-pick]")) box.checked = picked.includes(Number(box.dataset.pick));
+    const home = document.getElementById("picks");
+    home.hidden = !picked.length;
+    const href = bench.address.to(["compare", ...picked.map(bench.runs.name)]);
+    fill(home,
+      picked.map((place, n) => element("span.picked", null, element(`b.${"ab"[n]}`, null, "AB"[n]), bench.runs.title(place))),
+      picked.length === 2 ? element("a.button", {href}, "Compare") : soft("Pick another run to compare with."),
+      element("button", {type: "button", click: () => choose([])}, "Clear"));
+  }
+
+  Object.assign(bench, {table, written, pick});
 })((window.implicitBench = window.implicitBench || {}));

@@ -2,258 +2,183 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill} = bench.dom;
-  const {plural} = bench.format;
-  const ON_A_PAGE = 100;
+  const {element, fill, soft, choice} = bench.dom;
+  const {number, count, seconds, date, plural, label, MISSING} = bench.format;
+  const {FILTERS, LINKED} = bench.choose;
   const MOST_METRICS = 6;
 
   /* Fills a section with the board that the query asks for, and keeps it in step with its controls. */
   function board(home, query) {
-    const runs = bench.runs;
-    const state = {task: runs.tasks[0].task, view: "methods", ...query};
+    const state = {task: bench.runs.tasks[0].task, ...query, view: query.view === "runs" ? "runs" : "methods"};
     if (query.task === "all") state.task = "";
-    const parts = {
-      tasks: element("nav.tabs", {"aria-label": "Tasks"}),
-      controls: element("div.controls"),
-      found: element("div"),
-    };
-    fill(home, element("h2", {id: "board"}, "Leaderboards"), parts.tasks, parts.controls, parts.found);
+    const keep = () => bench.address.keep(["runs"], asked(state));
     const change = (changes) => {
       Object.assign(state, {page: ""}, changes);
-      bench.address.keep(["runs"], bench.columns.asked(state));
+      keep();
       show();
     };
-    const show = () => {
-      const chosen = bench.filter.choose(runs, state);
-      fill(parts.tasks, tabs(state));
-      controls(parts.controls, state, chosen, change);
-      fill(parts.found, found(state, chosen, change));
-    };
+    const views = choice("What a row is", {methods: "Methods", runs: "Runs"}, state.view, (view) => change({view, sort: "", order: ""}));
+    const input = ({target}) => change({q: target.value});
+    const search = element("input", {type: "search", placeholder: "Search names, scenes, reasons", "aria-label": "Search", input});
+    const [filters, chips, found] = [element("div.picks"), element("div.chips"), element("div")];
+
+    function show() {
+      const focused = document.activeElement.dataset.column;
+      const chosen = bench.choose.choose(bench.runs, state);
+      if (search.value !== (state.q || "")) search.value = state.q || "";
+      fill(filters, Object.keys(FILTERS).map((column) => filter(column, state, chosen.counts[column], change)));
+      fill(chips, chipsOf(state, change));
+      fill(found, chosen.places.length ? rows(state, chosen.places, keep) : element("p.empty", null, "No run fits. Take a filter away."));
+      if (focused) filters.querySelector(`[data-column="${focused}"]`)?.focus(); // its list has been made anew
+    }
+
+    fill(home,
+      element("h2", {id: "board"}, "Leaderboards"),
+      element("nav.tabs", {"aria-label": "Tasks"}, tabs(state)),
+      element("div.controls", null, views, search, filters, chips),
+      found);
     show();
   }
 
+  /* What of the state stands in the address: all but what is so without it. */
+  const asked = (state) => ({...state, task: state.task || "all", view: state.view === "methods" ? "" : state.view});
+
   function tabs(state) {
-    const runs = bench.runs;
-    const entries = [
-      ...runs.tasks.map(({task, count: n}) => [task, task.replace("_", " "), n]),
-      ["", "all", runs.count],
-    ];
-    return entries.map(([task, name, n]) =>
-      element(
-        "a",
-        {
-          href: bench.address.to(["runs"], {task: task || "all", view: task ? "" : "runs"}),
-          "aria-current": task === state.task ? "page" : null,
-        },
-        name,
-        element("small", null, n.toLocaleString("en")),
-      ),
-    );
+    const tasks = bench.runs.tasks.map(({task, count: n}) => [task, task.replace(/_/g, " "), n]);
+    return [...tasks, ["", "all", bench.runs.count]].map(([task, name, n]) => {
+      const href = bench.address.to(["runs"], {task: task || "all", view: task ? "" : "runs"});
+      const current = task === state.task ? "page" : null;
+      return element("a", {href, "aria-current": current}, name, element("small", null, n.toLocaleString("en")));
+    });
   }
 
-  /* Controls are made once; what they offer follows from the other filters. */
-  function controls(home, state, chosen, change) {
-    if (!home.childElementCount) {
-      const search = element("input", {
-        type: "search",
-        placeholder: "Search names, scenes, reasons",
-        "aria-label": "Search",
-        value: state.q || "",
-        input: (event) => change({q: event.target.value}),
-      });
-      const selects = Object.entries(bench.filter.FILTERS).map(([column, name]) =>
-        element(
-          "label.pick",
-          null,
-          name,
-          element("select", {
-            "data-column": column,
-            "aria-label": name,
-            change: (event) => change({[column]: event.target.value}),
-          }),
-        ),
-      );
-      const views = ["methods", "runs"].map((view) =>
-        element(
-          "button",
-          {type: "button", "data-view": view, click: () => change({view, sort: "", order: ""})},
-          view === "methods" ? "Methods" : "Runs",
-        ),
-      );
-      const sorts = element(
-        "label.pick.narrow",
-        null,
-        "Sort by",
-        element("select", {
-          "data-column": "sort",
-          "aria-label": "Sort by",
-          change: (event) => change({sort: event.target.value, order: ""}),
-        }),
-      );
-      home.append(
-        element("div.switch", {role: "group", "aria-label": "What a row is"}, views),
-        search,
-        element("div.picks", null, selects, sorts),
-        element("div.chips"),
-      );
-    }
-    for (const button of home.querySelectorAll("[data-view]"))
-      button.setAttribute("aria-pressed", String(button.dataset.view === state.view));
-    for (const column of Object.keys(bench.filter.FILTERS)) offer(home, column, state, chosen.counts[column]);
-    const sort = home.querySelector('[data-column="sort"]');
-    const options = columnsOf(state, chosen).filter((column) => column.sortable);
-    fill(
-      sort,
-      options.map((column) => element("option", {value: column.key}, column.label)),
-    );
-    sort.value = orderOf(state, options).key;
-    chips(home.querySelector(".chips"), state, change);
-  }
-
-  function offer(home, column, state, counts) {
-    const select = home.querySelector(`[data-column="${column}"]`);
+  /* A list of the values that a column has under the other filters. */
+  function filter(column, state, counts, change) {
     const values = bench.runs.values(column);
-    const known = [...counts].filter(([code]) => values[code] !== "").sort((a, b) => b[1] - a[1]);
-    const options = known.map(([code, n]) =>
-      element("option", {value: values[code]}, `${values[code]} (${n.toLocaleString("en")})`),
-    );
-    if (state[column] && !known.some(([code]) => values[code] === state[column]))
-      options.push(element("option", {value: state[column]}, `${state[column]} (0)`));
-    fill(select, element("option", {value: ""}, "all"), options);
+    const known = [...counts].map(([code, n]) => [values[code], n]).filter(([value]) => value !== "").sort((a, b) => b[1] - a[1]);
+    if (state[column] && !known.some(([value]) => value === state[column])) known.push([state[column], 0]);
+    const options = known.map(([value, n]) => element("option", {value}, `${value} (${n.toLocaleString("en")})`));
+    const pick = ({target}) => change({[column]: target.value});
+    const select = element("select", {"data-column": column, "aria-label": FILTERS[column], change: pick}, element("option", {value: ""}, "all"), options);
     select.value = state[column] || "";
-    select.parentElement.hidden = options.length < 2 && !state[column];
+    return known.length > 1 || state[column] ? element("label.pick", null, FILTERS[column], select) : null;
   }
 
   /* The filters that are set, each with a button that takes it away. */
-  function chips(home, state, change) {
-    const set = [...bench.filter.LINKED, ...Object.keys(bench.filter.FILTERS), "q"].filter((column) => state[column]);
-    const clear = Object.fromEntries(set.map((column) => [column, ""]));
-    fill(
-      home,
-      set.map((column) =>
-        element(
-          "button.chip",
-          {type: "button", "aria-label": `Remove the filter ${state[column]}`, click: () => change({[column]: ""})},
-          state[column],
-          element("span", {"aria-hidden": "true"}, " ×"),
-        ),
-      ),
-      set.length > 1 ? element("button.chip.plain", {type: "button", click: () => change(clear)}, "Clear all") : null,
-    );
-    const search = home.parentElement.querySelector("input[type=search]");
-    if (search.value !== (state.q || "")) search.value = state.q || "";
+  function chipsOf(state, change) {
+    const set = [...LINKED, ...Object.keys(FILTERS), "q"].filter((column) => state[column]);
+    const chip = (column) =>
+      element("button.chip", {type: "button", "aria-label": `Remove the filter ${state[column]}`, click: () => change({[column]: ""})}, `${state[column]} ×`);
+    const clear = () => change(Object.fromEntries(set.map((column) => [column, ""])));
+    return [set.map(chip), set.length > 1 && element("button.chip.plain", {type: "button", click: clear}, "Clear all")];
   }
 
-  function found(state, chosen, change) {
-    const runs = bench.runs;
-    const {places} = chosen;
-    if (!places.length) return element("p.empty", null, "No run fits. Take a filter away.");
+  /* How many runs there are, whose machines their times are of, and the table. */
+  function rows(state, places, changed) {
+    const {runs} = bench;
     const failed = places.filter((place) => runs.text(place, "status") !== "ok").length;
-    const said =
-      `${plural(places.length, "run")}${places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : ""}, ` +
-      (failed ? `${failed.toLocaleString("en")} did not end ok` : "all ended ok");
-    const columns = columnsOf(state, chosen);
-    const order = orderOf(state, columns);
-    const sorted = (key) => {
-      change({sort: key, order: order.key !== key ? "" : order.down ? "up" : "down"});
-      document.querySelector(`#board-list [data-key="${CSS.escape(key)}"]`).focus();
+    const of = places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : "";
+    const said = `${plural(places.length, "run")}${of}, ${failed ? `${failed.toLocaleString("en")} did not end ok` : "all ended ok"}`;
+    const task = runs.tasks.find((each) => each.task === state.task);
+    const known = (key) => places.some((place) => runs.metrics[key].after[place] !== null);
+    const metrics = (task ? task.metrics : []).filter(known).slice(0, MOST_METRICS);
+    const shown = state.view === "methods" ? ofMethods(state, places, metrics) : ofRuns(state, places, metrics);
+    const table = bench.table(shown.columns, shown.items, {...shown, caption: said, state, changed, cards: true});
+    return [element("p.count", {"aria-live": "polite"}, said, shown.said || "."), machines(places), Object.assign(table, {id: "board-list"})];
+  }
+
+  function ofMethods(state, places, metrics) {
+    const {rows: items, cells} = bench.choose.methods(bench.runs, places, metrics);
+    const part = items.filter((row) => !row.complete).length;
+    const covers = cells > 1 ? `; ${plural(cells, "scene")} (shape, view, seed and what is given)` : "";
+    const unlike = part && items.length > 1
+      ? `. Medians of ${plural(part, "method")} are over other scenes: only methods with all ${cells.toLocaleString("en")} have a rank`
+      : "";
+    const ranked = metrics.length > 0 && bench.runs.metrics[metrics[0]].better !== "";
+    const first = ranked ? metrics[0] : metrics.length ? "name" : "loop";
+    const ordered = (all) => all.filter((row) => row.complete).forEach((row, n) => (row.rank = ranked ? n + 1 : null));
+    return {columns: methodColumns(state, metrics), items, first, ordered, said: `${covers}${unlike}.`};
+  }
+
+  /* A column of numbers that sorts. */
+  const numeric = (key, name, get, show, more) =>
+    ({key, label: name, kind: "number", get, cell: (item) => show(get(item), item), ...more});
+
+  function methodColumns(state, metrics) {
+    const runsOf = (name) => bench.address.to(["runs"], {...asked(state), view: "runs", name, sort: "", order: "", page: ""});
+    const share = (row) => element(`span${row.failed ? ".failed" : ".soft"}`, null, `${row.failed} of ${row.runs}`);
+    const measured = (key) => {
+      const {label: name, factor, better} = bench.runs.metrics[key];
+      const show = (value) => (Math.abs(value) === Infinity ? element("span.failed", null, "failed") : number(value, factor));
+      return numeric(key, label(name), (row) => row[key], show, {unit: "median", down: better === "higher"});
     };
-    const shown = state.view === "methods" ? ofMethods(chosen, columns, order) : ofRuns(state, places, columns, order);
     return [
-      element("p.count", {"aria-live": "polite"}, said, shown.said),
-      machines(places),
-      element("div.wide", {id: "board-list"}, bench.table.table(columns, shown.items, {order, sorted, caption: said})),
-      shown.pages > 1 ? pager(Number(state.page || 1), shown.pages, change) : null,
+      {key: "rank", label: "#", kind: "rank", cell: (row) => row.rank || soft(MISSING)},
+      {key: "name", label: "Method", head: true, get: ({name}) => name.toLowerCase(), cell: ({name}) => element("a", {href: runsOf(name)}, name)},
+      ...metrics.map(measured),
+      numeric("failed", "Failed", (row) => row.failed / row.runs, (value, row) => share(row)),
+      numeric("covered", "Scenes", (row) => row.covered, String, {down: true}),
+      ...costs((row, key) => row[key], "median, in all below"),
     ];
   }
 
-  /* The order of the query, or by the first metric with the best on top. */
-  function orderOf(state, columns) {
-    const column =
-      columns.find(({key}) => key === state.sort) ||
-      columns.find(({first}) => first) ||
-      columns.find(({sortable}) => sortable); // by name, where no metric has a better direction
-    const down = state.sort === column.key && state.order ? state.order === "down" : Boolean(column.down);
-    return {key: column.key, down};
+  function ofRuns(state, places, metrics) {
+    const {runs} = bench;
+    const measured = (key) => {
+      const {label: name, factor, better, after, before} = runs.metrics[key];
+      const ok = (place) => (runs.text(place, "status") === "ok" ? after[place] : null);
+      const start = (place) => before && before[place] !== null && element("small", null, `from ${number(before[place], factor)}`);
+      const show = (value, place) => [number(after[place], factor), start(place)];
+      return numeric(key, label(name), ok, show, {unit: before && "start below", down: better === "higher"});
+    };
+    const text = (key, name, cell) => ({key, label: name, get: (place) => runs.text(place, key).toLowerCase(), cell});
+    const columns = [
+      {key: "pick", label: "Compare", kind: "pick", cell: bench.pick},
+      {key: "picture", label: "Picture", kind: "thumb", cell: thumb},
+      {...text("name", "Run", (place) => named(place, state)), head: true},
+      text("status", "Status", (place) => [bench.badge(runs.text(place, "status")), runs.reused(place) && element("small", null, "reused")]),
+      ...metrics.map(measured),
+      ...costs((place, key) => runs.number(place, key), "in all below"),
+      numeric("started", "Started", (place) => runs.number(place, "started"), (value) => soft(date(value)), {unit: "UTC", down: true}),
+    ];
+    return {columns, items: places, first: metrics[0] || "started"};
   }
 
-  function columnsOf(state, chosen) {
-    const task = bench.runs.tasks.find((each) => each.task === state.task);
-    const known = (key) => chosen.places.some((place) => bench.runs.metrics[key].after[place] !== null);
-    const metrics = task ? task.metrics.filter(known).slice(0, MOST_METRICS) : [];
-    return state.view === "methods" ? bench.columns.methods(state, metrics) : bench.columns.runs(state, metrics);
+  const costs = (get, unit) => [
+    numeric("loop", "Optimisation", (item) => get(item, "loop"), (value, item) => [seconds(value), element("small", null, seconds(get(item, "total")))], {unit}),
+    numeric("values", "Field values", (item) => get(item, "values"), count),
+  ];
+
+  function thumb(place) {
+    const detail = bench.oneFile && bench.runs.held(place);
+    const src = bench.oneFile ? detail && detail.pictures.length && detail.pictures[0][1] : bench.runs.picture(place);
+    if (!src) return element("span.soft", {"aria-hidden": "true"}, MISSING);
+    const image = element("img", {src, alt: "", loading: "lazy", width: 60, height: 48});
+    return element("a", {href: bench.runs.link(place), tabindex: "-1", "aria-hidden": "true"}, image);
   }
 
-  function ofMethods(chosen, columns, order) {
-    const metrics = columns.filter(({metric}) => metric).map(({key}) => key);
-    const {rows, cells} = bench.filter.methods(bench.runs, chosen.places, metrics);
-    const get = columns.find(({key}) => key === order.key).get;
-    const places = bench.filter.sort(
-      rows.map((_, place) => place),
-      (place) => get(rows[place]),
-      order.down,
-    );
-    const sorted = places.map((place) => rows[place]);
-    const whole = sorted.filter((row) => row.complete);
-    const ranked = columns.some(({first}) => first);
-    whole.forEach((row, place) => (row.rank = ranked ? place + 1 : null));
-    const part = sorted.length - whole.length;
-    const covers = cells > 1 ? `; ${plural(cells, "scene")} (shape, view, seed and what is given)` : "";
-    const unlike =
-      part && sorted.length > 1
-        ? `. Medians of ${plural(part, "method")} are over other scenes: only methods with all ` +
-          `${cells.toLocaleString("en")} have a rank`
-        : "";
-    return {items: sorted, pages: 1, said: `${covers}${unlike}.`};
-  }
-
-  function ofRuns(state, places, columns, order) {
-    const get = columns.find(({key}) => key === order.key).get;
-    const sorted = bench.filter.sort(places, get, order.down);
-    const pages = Math.ceil(sorted.length / ON_A_PAGE);
-    const page = Math.min(Math.max(1, Number(state.page) || 1), pages);
-    return {items: sorted.slice((page - 1) * ON_A_PAGE, page * ON_A_PAGE), pages, said: "."};
+  function named(place, state) {
+    const {runs} = bench;
+    const about = [state.task ? "" : runs.text(place, "task"), runs.text(place, "scene"), `seed ${runs.number(place, "seed") ?? MISSING}`, runs.text(place, "experiment")];
+    const reason = runs.reason(place);
+    return [
+      element("a", {href: runs.link(place)}, runs.text(place, "name")),
+      element("small", null, about.filter(Boolean).join(" · ")),
+      reason && element("small.reason", {title: reason}, reason),
+    ];
   }
 
   /* A word on machines where the times that are shown are of several. */
   function machines(places) {
-    const runs = bench.runs;
+    const timed = places.filter((place) => bench.runs.number(place, "loop") !== null || bench.runs.number(place, "total") !== null);
     const counts = new Map();
-    for (const place of places) {
-      const machine = runs.text(place, "machine");
-      if (machine && (runs.number(place, "loop") !== null || runs.number(place, "total") !== null))
-        counts.set(machine, (counts.get(machine) || 0) + 1);
-    }
-    if (counts.size < 2)
-      return counts.size ? element("p.soft.machine", null, `Times of ${[...counts.keys()][0]}.`) : null;
-    const list = [...counts]
-      .sort((a, b) => b[1] - a[1])
-      .map(([machine, n]) => `${machine}: ${plural(n, "run")}`)
-      .join("; ");
-    return element(
-      "p.note",
-      {id: "machines"},
+    for (const machine of timed.map((place) => bench.runs.text(place, "machine")).filter(Boolean))
+      counts.set(machine, (counts.get(machine) || 0) + 1);
+    const sorted = [...counts].sort((a, b) => b[1] - a[1]);
+    if (sorted.length < 2) return sorted.length ? element("p.soft", null, `Times of ${sorted[0][0]}.`) : null;
+    return element("p.note", {id: "machines"},
       element("strong", null, "Times are of different machines or numbers of threads. "),
-      `Choose one under Machine to compare seconds. ${list}.`,
-    );
-  }
-
-  function pager(page, pages, change) {
-    const go = (to) => {
-      change({page: to === 1 ? "" : String(to)});
-      document.getElementById("board").scrollIntoView();
-    };
-    const button = (to, name) =>
-      element("button", {type: "button", disabled: to < 1 || to > pages, click: () => go(to)}, name);
-    return element(
-      "nav.pager",
-      {"aria-label": "Pages of the list"},
-      button(1, "« First"),
-      button(page - 1, "‹ Previous"),
-      element("span", null, `Page ${page} of ${pages.toLocaleString("en")}`),
-      button(page + 1, "Next ›"),
-      button(pages, "Last »"),
-    );
+      `Choose one under Machine to compare seconds. ${sorted.map(([machine, n]) => `${machine}: ${plural(n, "run")}`).join("; ")}.`);
   }
 
   bench.board = board;

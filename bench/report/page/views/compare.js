@@ -2,181 +2,112 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill} = bench.dom;
-  const {number, count, seconds} = bench.format;
+  const {element, fill, soft, section, later, code} = bench.dom;
+  const {number, count, seconds, size, label, MISSING} = bench.format;
+  const SIDES = ["A", "B"];
 
   function compare(home, names) {
-    const places = names.map((name) => bench.runs.place(name));
+    const {runs} = bench;
+    const places = names.map(runs.place);
     if (places.length !== 2 || places.includes(undefined)) {
-      fill(
-        home,
-        element("h1", null, "Compare two runs"),
-        element(
-          "p",
-          null,
-          "Pick two in the ",
-          element("a", {href: bench.address.to(["runs"], {view: "runs"})}, "list of runs"),
-          ".",
-        ),
-      );
-      return;
+      const link = element("a", {href: bench.address.to(["runs"], {view: "runs"})}, "list of runs");
+      return fill(home, element("h1", null, "Compare two runs"), element("p", null, "Pick two in the ", link, "."));
     }
-    const body = element("div", null, element("p.soft", null, "Loading …"));
-    const swapped = bench.address.to(["compare", ...places.map(bench.runs.name).reverse()]);
-    fill(
-      home,
+    const swapped = bench.address.to(["compare", ...places.map(runs.name).reverse()]);
+    return fill(home,
       element("p.crumbs", null, element("a", {href: "#/"}, "All results")),
       element("h1", null, "Two runs side by side"),
       element("div.two", null, places.map(heading)),
-      element("p.swap", null, element("a.button", {href: swapped}, "Swap")),
-      body,
-    );
-    Promise.all(places.map((place) => bench.store.load("run", bench.runs.key(place)))).then(
-      (details) => fill(body, parts(places, details)),
-      (error) => fill(body, element("p.note", null, error.message)),
-    );
+      element("p", null, element("a.button", {href: swapped}, "Swap")),
+      later(Promise.all(places.map(runs.detail)), (details) => parts(places, details)));
   }
 
-  function heading(place, number) {
-    const runs = bench.runs;
-    return element(
-      "div.side",
-      null,
-      element(
-        "p",
-        null,
-        element(`b.${"ab"[number]}`, null, "AB"[number]),
-        element("a", {href: runs.link(place)}, runs.title(place)),
-      ),
-      element(
-        "p",
-        null,
-        bench.badge(runs.text(place, "status")),
-        element("span.soft", null, runs.reason(place) || `seed ${runs.number(place, "seed") ?? "–"}`),
-      ),
-    );
+  const mark = (n) => element(`b.${"ab"[n]}`, null, SIDES[n]);
+
+  function heading(place, n) {
+    const {runs} = bench;
+    const about = runs.reason(place) || `seed ${runs.number(place, "seed") ?? MISSING}`;
+    return element("div.side", null,
+      element("p", null, mark(n), element("a", {href: runs.link(place)}, runs.title(place))),
+      element("p", null, bench.badge(runs.text(place, "status")), " ", soft(about)));
   }
 
   function parts(places, details) {
-    const {section} = bench.runParts;
-    const meshes = details.every((detail) => detail.files["mesh.ply"]);
-    const shared = bench.mesh.view();
+    const turning = [];
+    const named = details.map(({curve}, n) => ({name: `${SIDES[n]}: ${bench.runs.text(places[n], "name")}`, curve}));
     return [
-      section("Settings that differ", settings(details)),
       section("Metrics after the run", metrics(details)),
+      section("Settings that differ", settings(details)),
       section("Costs", costs(places, details)),
-      section(
-        "Curves",
-        bench.curves(
-          details.map((detail, n) => ({
-            name: `${"AB"[n]}: ${bench.runs.text(places[n], "name")}`,
-            curve: detail.curve,
-          })),
-        ),
-      ),
-      meshes
-        ? section(
-            "Meshes",
-            element(
-              "div.two",
-              null,
-              places.map((place) => bench.mesh.viewer(place, shared)),
-            ),
-          )
-        : null,
+      section("Curves", bench.curves(named)),
+      details.every(({files}) => files["mesh.ply"]) &&
+        section("Meshes", element("div.two", null, places.map((place) => bench.mesh(place, turning)))),
       section("Pictures", pictures(details)),
     ];
   }
 
-  /* The rows of which the two values are not the same text. */
-  function settings([first, second]) {
-    const others = new Map(second.settings);
-    const own = new Map(first.settings);
-    const keys = [...new Set([...own.keys(), ...others.keys()])].filter((key) => own.get(key) !== others.get(key));
-    const same = new Set([...own.keys(), ...others.keys()]).size - keys.length;
-    if (!keys.length) return element("p", null, `None: all ${same} settings are equal.`);
-    const value = (map, key) => (map.has(key) ? map.get(key) : element("span.soft", null, "–"));
-    const columns = [
-      {label: "Setting", head: true, cell: (key) => element("code", null, bench.dom.breakable(key))},
-      {label: "A", cell: (key) => value(own, key)},
-      {label: "B", cell: (key) => value(others, key)},
-    ];
-    return [
-      element("div.wide", null, bench.table.table(columns, keys, {caption: "Settings that differ"})),
-      element("p.soft", null, `${same} others are equal.`),
-    ];
+  /* A table with a column per side, and others. */
+  function table(caption, rows, name, cell, kind, ...others) {
+    const sides = SIDES.map((side, n) => ({label: side, kind, cell: (row) => cell(row, n)}));
+    return bench.table([{label: caption, head: true, cell: name}, ...sides, ...others], rows, {caption});
   }
 
-  function metrics([first, second]) {
-    const others = new Map(second.metrics.map((row) => [row[0], row]));
-    const own = new Map(first.metrics.map((row) => [row[0], row]));
-    const names = [...new Set([...own.keys(), ...others.keys()])];
-    if (!names.length) return element("p.soft", null, "Neither measured anything.");
-    const value = (map, name) => (map.has(name) ? bench.store.decoded(map.get(name)[2]) : null);
+  const ratio = (get) => ({label: "B over A", kind: "number", cell: (row) => {
+    const [a, b] = [get(row, 0), get(row, 1)];
+    return typeof a === "number" && typeof b === "number" && a > 0 && Number.isFinite(b / a) ? number(b / a) : MISSING;
+  }});
+
+  /* The rows of which the two values are not the same text. */
+  function settings(details) {
+    const sides = details.map((detail) => new Map(detail.settings));
+    const all = [...new Set(sides.flatMap((side) => [...side.keys()]))];
+    const keys = all.filter((key) => sides[0].get(key) !== sides[1].get(key));
+    if (!keys.length) return element("p", null, `None: all ${all.length} settings are equal.`);
+    const value = (key, n) => (sides[n].has(key) ? sides[n].get(key) : soft(MISSING));
+    return [table("Setting", keys, code, value), element("p.soft", null, `${all.length - keys.length} others are equal.`)];
+  }
+
+  /* Those that tables show first, scaled as there. */
+  function metrics(details) {
+    const sides = details.map((detail) => new Map(detail.metrics.map((row) => [row[0], bench.store.decoded(row[2])])));
+    const found = new Set(sides.flatMap((side) => [...side.keys()]));
+    if (!found.size) return element("p.soft", null, "Neither measured anything.");
+    const shown = new Map(Object.entries(bench.runs.metrics).filter(([key]) => found.has(key)));
+    const value = (name, n) => sides[n].get(name) ?? null;
     const better = (name) => {
-      const known = bench.runs.metrics[name];
-      const [a, b] = [value(own, name), value(others, name)];
-      if (!known || !known.better || typeof a !== "number" || typeof b !== "number" || a === b) return "";
-      return a < b === (known.better === "lower") ? "A" : "B";
+      const [a, b, {better: way} = {}] = [value(name, 0), value(name, 1), shown.get(name)];
+      if (!way || typeof a !== "number" || typeof b !== "number" || a === b) return "";
+      return mark(a < b === (way === "lower") ? 0 : 1);
     };
-    const ratio = (name) => {
-      const [a, b] = [value(own, name), value(others, name)];
-      return typeof a === "number" && typeof b === "number" && a > 0 && Number.isFinite(b / a) ? number(b / a) : "–";
-    };
-    const columns = [
-      {label: "Metric", head: true, cell: (name) => element("code", null, bench.dom.breakable(name))},
-      {label: "A", kind: "number", cell: (name) => number(value(own, name))},
-      {label: "B", kind: "number", cell: (name) => number(value(others, name))},
-      {label: "B over A", kind: "number", cell: ratio},
-      {
-        label: "Better",
-        cell: (name) => (better(name) ? element(`b.${better(name).toLowerCase()}`, null, better(name)) : ""),
-      },
-    ];
-    return element("div.wide", null, bench.table.table(columns, names, {caption: "Metrics of both"}));
+    const name = (key) => (shown.has(key) ? label(shown.get(key).label) : code(key));
+    const cell = (key, n) => number(value(key, n), shown.has(key) ? shown.get(key).factor : 1);
+    return table("Metric", [...new Set([...shown.keys(), ...found])], name, cell, "number", ratio(value), {label: "Better", cell: better});
   }
 
   function costs(places, details) {
-    const runs = bench.runs;
+    const {runs} = bench;
     const rows = [
-      ["Loop", (n) => runs.number(places[n], "loop"), seconds],
+      ["Optimisation", (n) => runs.number(places[n], "loop"), seconds],
       ["In all", (n) => runs.number(places[n], "total"), seconds],
       ["Field values", (n) => runs.number(places[n], "values"), count],
       ["Gradients of the field", (n) => runs.number(places[n], "gradients"), count],
       ["Operations", (n) => details[n].costs.flops, count],
-      ["Peak memory", (n) => details[n].costs.peak_memory_bytes, bench.format.size],
+      ["Peak memory", (n) => details[n].costs.peak_memory_bytes, size],
     ];
-    const machines = places.map((place) => runs.text(place, "machine"));
-    const columns = [
-      {label: "Cost", head: true, cell: ([label]) => label},
-      ...["A", "B"].map((side, n) => ({label: side, kind: "number", cell: ([, get, show]) => show(get(n))})),
-      {label: "B over A", kind: "number", cell: ([, get]) => (get(0) && get(1) ? number(get(1) / get(0)) : "–")},
-    ];
+    const [a, b] = places.map((place) => runs.text(place, "machine") || "an unknown machine");
     return [
-      element("div.wide", null, bench.table.table(columns, rows, {caption: "Costs of both"})),
-      machines[0] !== machines[1]
-        ? element(
-            "p.note",
-            null,
-            `Seconds do not compare: A is of ${machines[0] || "an unknown machine"}, B of ${machines[1] || "an unknown machine"}.`,
-          )
-        : null,
+      table("Cost", rows, ([name]) => name, ([, get, show], n) => show(get(n)), "number", ratio(([, get], n) => get(n))),
+      a !== b && element("p.note", null, `Seconds do not compare: A is of ${a}, B of ${b}.`),
     ];
   }
 
   function pictures(details) {
     const names = [...new Set(details.flatMap((detail) => detail.pictures.map(([name]) => name)))];
     if (!names.length) return element("p.soft", null, "Neither has pictures.");
-    return names.map((name) =>
-      element(
-        "div.two",
-        null,
-        details.map((detail) => {
-          const found = detail.pictures.find(([own]) => own === name);
-          return found ? bench.runParts.picture(found) : element("p.soft", null, `No ${name}.`);
-        }),
-      ),
-    );
+    return names.map((name) => element("div.two", null, details.map((detail) => {
+      const found = detail.pictures.find(([own]) => own === name);
+      return found ? bench.picture(found) : element("p.soft", null, `No ${name}.`);
+    })));
   }
 
   bench.compare = compare;

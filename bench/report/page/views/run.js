@@ -1,214 +1,123 @@
-/* A run's own page: what was asked, what happened, numbers, costs, the mesh, pictures, and how to make and open it again. */
+/* A run's own page: what happened, the result, pictures, mesh and curve, what it cost, and how to make and open it again. */
 (function (bench) {
   "use strict";
 
-  const {element, fill, copyButton, breakable} = bench.dom;
-  const {number, count, seconds, size, date} = bench.format;
+  const {element, fill, soft, section, details, list, facts, later, code, copied} = bench.dom;
+  const {number, count, seconds, size, date, label} = bench.format;
 
   function run(home, name) {
-    const place = bench.runs.place(name);
-    if (place === undefined) {
-      fill(
-        home,
-        element("h1", null, "There is no such run"),
-        element("p", null, `No run is called ${name}. `, element("a", {href: "#/runs"}, "All runs")),
-      );
-      return;
-    }
-    const runs = bench.runs;
-    const body = element("div", null, element("p.soft", null, "Loading …"));
-    const pick = element("label.pick-run", null, bench.picks.box(place), "Compare");
-    fill(
-      home,
-      element(
-        "p.crumbs",
-        null,
-        element("a", {href: "#/"}, "All results"),
-        " / ",
-        element(
-          "a",
-          {href: bench.address.to(["runs"], {task: runs.text(place, "task"), view: "runs"})},
-          runs.text(place, "task"),
-        ),
-      ),
+    const {runs} = bench;
+    const place = runs.place(name);
+    const back = element("a", {href: "#/runs"}, "All runs");
+    if (place === undefined)
+      return fill(home, element("h1", null, "There is no such run"), element("p", null, `No run is called ${name}. `, back));
+    const task = runs.text(place, "task");
+    const others = element("a", {href: bench.address.to(["runs"], {task, view: "runs"})}, task.replace(/_/g, " "));
+    return fill(home,
+      element("p.crumbs", null, element("a", {href: "#/"}, "All results"), " / ", others),
       element("h1", null, runs.title(place)),
-      element(
-        "p.about",
-        null,
+      element("p.about", null,
         bench.badge(runs.text(place, "status")),
-        element(
-          "span.soft",
-          null,
-          `seed ${runs.number(place, "seed") ?? "–"} · ${date(runs.number(place, "started"))} UTC · `,
-        ),
-        element("code.soft", null, runs.folder(place)),
-        pick,
-      ),
-      body,
-    );
-    bench.store.load("run", runs.key(place)).then(
-      (detail) => fill(body, parts(place, detail)),
-      (error) => fill(body, element("p.note", null, error.message)),
-    );
+        soft(`seed ${runs.number(place, "seed") ?? "–"} · ${date(runs.number(place, "started"))} UTC`),
+        element("label.pick-run", null, bench.pick(place), "Compare")),
+      later(runs.detail(place), (detail) => parts(place, detail)));
   }
 
   function parts(place, detail) {
     const [first, ...others] = detail.pictures;
+    const unlisted = !detail.metrics.some(([name]) => Object.hasOwn(bench.runs.metrics, name));
+    const links = Object.entries(detail.files).map(([name, href]) => [element("a", {href}, name), " "]);
     return [
+      element("p.asked", null, detail.asked),
       happened(place, detail),
-      element(
-        "div.columns",
-        null,
-        section("Asked", element("p", null, detail.asked)),
-        section("Costs", costs(detail.costs)),
-      ),
-      detail.files["mesh.ply"] ? section("Mesh", bench.mesh.viewer(place)) : null,
-      first
-        ? section(
-            "Pictures",
-            element(
-              "div.pictures",
-              null,
-              picture(first, true),
-              others.map((each) => picture(each)),
-            ),
-          )
-        : section("Pictures", element("p.soft", null, "This run left no picture.")),
-      detail.curve ? section("Curve", bench.curves([{name: "run", curve: detail.curve}])) : null,
-      section("Metrics, unscaled", metrics(detail.metrics)),
-      section(
-        "Make it again",
-        code(detail.command, "Copy the command"),
+      section("Result", element("div.two", null, unlisted ? null : result(detail.metrics), first && picture(first)),
+        detail.metrics.length
+          ? Object.assign(details(`All ${detail.metrics.length} metrics, with definitions`, recorded(detail.metrics)), {open: unlisted})
+          : element("p.soft", null, "This run measured nothing.")),
+      detail.files["mesh.ply"] && section("Mesh", bench.mesh(place)),
+      detail.curve && section("Curve", bench.curves([{name: "run", curve: detail.curve}])),
+      others.length > 0 && section("Pictures", element("div.pictures", null, others.map(picture))),
+      section("Costs", costs(detail.costs)),
+      section("Make it again",
+        copied(detail.command, "Copy the command"),
         element("p.soft", null, "Configurations are code: read one that is not yours first. From Python:"),
-        code(detail.again, "Copy the lines that make it again"),
-      ),
-      section("Open it in Python", code(detail.python, "Copy the lines that open it")),
-      section(
-        "Files",
-        Object.keys(detail.files).length
-          ? element(
-              "p.files",
-              null,
-              Object.entries(detail.files).map(([name, link]) => [element("a", {href: link}, name), " "]),
-            )
-          : element("p.soft", null, "None."),
-      ),
-      element(
-        "details",
-        null,
-        element("summary", null, `All ${detail.settings.length} settings`),
-        facts(detail.settings),
-      ),
-      detail.environment.length
-        ? element("details", null, element("summary", null, "Machine and versions"), facts(detail.environment))
-        : null,
+        copied(detail.again, "Copy the lines that make it again")),
+      section("Open it in Python", copied(detail.python, "Copy the lines that open it")),
+      section("Files", element("p.files", null, element("code", null, bench.runs.folder(place)), " ", links)),
+      details(`All ${detail.settings.length} settings`, facts(detail.settings)),
+      detail.environment.length > 0 && details("Machine and versions", facts(detail.environment)),
     ];
   }
 
   /* The status in words, the reason, what helps, and the notes. */
   function happened(place, {said, reason, notes, log}) {
     const ok = bench.runs.text(place, "status") === "ok";
-    return element(
-      `div.happened${ok ? ".ok" : ""}`,
-      null,
-      element(
-        "p",
-        null,
-        element("strong", null, said.meaning),
-        reason ? ` ${reason}` : ok ? "" : " No reason was recorded.",
-      ),
-      said.remedy ? element("p", null, element("b", null, "What helps: "), said.remedy) : null,
-      notes.length
-        ? element(
-            "ul",
-            null,
-            notes.map((note) => element("li", null, note)),
-          )
-        : null,
-      log.length
-        ? element(
-            "details",
-            null,
-            element("summary", null, `The last ${log.length === 1 ? "line" : `${log.length} lines`} of its log`),
-            element("pre", null, log.join("\n")),
-          )
-        : null,
-    );
+    const lines = log.length === 1 ? "line" : `${log.length} lines`;
+    return element(`div.happened${ok ? ".ok" : ""}`, null,
+      element("p", null, element("strong", null, said.meaning), ` ${reason || (ok ? "" : "No reason was recorded.")}`),
+      said.remedy && element("p", null, element("b", null, "What helps: "), said.remedy),
+      notes.length > 0 && list(notes),
+      log.length > 0 && details(`The last ${lines} of its log`, element("pre", null, log.join("\n"))));
   }
 
-  const section = (title, ...children) => element("section", null, element("h2", null, title), children);
-
-  function code(text, label) {
-    return element("div.code", null, element("pre", {tabindex: 0}, text), copyButton(text, label));
-  }
-
-  function picture([name, link, alt], wide) {
-    const shown = element("img", {src: link, alt: alt || name, loading: "lazy"});
-    return element(
-      `figure${wide ? ".wide-figure" : ""}`,
-      null,
-      bench.oneFile ? shown : element("a", {href: link}, shown),
-      element("figcaption", null, element("b", null, name), alt ? ` ${alt}` : ""),
-    );
-  }
-
-  function metrics(rows) {
-    if (!rows.length) return element("p.soft", null, "This run measured nothing.");
+  /* The metrics that tables show, as they show them: scaled, with their unit. */
+  function result(metrics) {
+    const {runs} = bench;
+    const found = new Map(metrics.map((row) => [row[0], row]));
+    const rows = Object.values(runs.metrics).filter(({key}) => found.has(key));
+    const value = ({key, factor}, column) => number(bench.store.decoded(found.get(key)[column]), factor);
+    const started = rows.some(({key}) => found.get(key)[1] !== null);
     const columns = [
-      {label: "Name", head: true, cell: ([name]) => element("code", null, breakable(name))},
-      {label: "Before", kind: "number", cell: (row) => measured(row[1])},
-      {label: "After", kind: "number", cell: (row) => measured(row[2])},
-      {label: "Definition", cell: (row) => row[3] || element("span.soft", null, "No definition recorded.")},
+      {label: "Metric", head: true, cell: (metric) => label(metric.label)},
+      ...(started ? [{label: "Before", kind: "number", cell: (metric) => value(metric, 1)}] : []),
+      {label: started ? "After" : "Value", kind: "number", cell: (metric) => value(metric, 2)},
+      {label: "Better", cell: (metric) => soft(metric.better || "–")},
     ];
-    return element("div.wide.defined", null, bench.table.table(columns, rows, {caption: "Metrics before and after"}));
+    return bench.table(columns, rows, {caption: "Result"});
   }
 
-  /* A metric; a whole number has no decimals. */
-  const measured = (value) =>
-    Number.isInteger(value) && Math.abs(value) < 1e6 ? String(value) : number(bench.store.decoded(value));
+  /* All metrics as the record has them: unscaled, with their definitions. */
+  function recorded(metrics) {
+    const shown = (value) => (Number.isInteger(value) && Math.abs(value) < 1e6 ? String(value) : number(bench.store.decoded(value)));
+    const columns = [
+      {label: "Name", head: true, cell: ([name]) => code(name)},
+      {label: "Before", kind: "number", cell: (row) => shown(row[1])},
+      {label: "After", kind: "number", cell: (row) => shown(row[2])},
+      {label: "Definition", kind: "words.defined", cell: (row) => row[3] || soft("No definition recorded.")},
+    ];
+    return [element("p.soft", null, "Unscaled, in scene units: a shape lies in a sphere of radius 1."), bench.table(columns, metrics, {caption: "All metrics"})];
+  }
+
+  function picture([name, src, alt]) {
+    const shown = element("img", {src, alt: alt || name, loading: "lazy"});
+    const caption = element("figcaption", null, element("b", null, name), alt ? ` ${alt}` : "");
+    return element("figure", null, bench.oneFile ? shown : element("a", {href: src}, shown), caption);
+  }
 
   /* A bar per phase, and what was counted. */
   function costs({phases, total, evaluations, flops, gemm_fraction, peak_memory_bytes}) {
-    const known = phases.map(([label, spent, loop]) => [label, bench.store.decoded(spent), loop]);
+    const known = phases.map(([name, spent, own]) => [name, bench.store.decoded(spent), own]);
     const most = Math.max(...known.map(([, spent]) => spent), 1e-9);
-    const loop = known.filter((phase) => phase[2]).reduce((sum, [, spent]) => sum + spent, 0);
-    const bars = known.map(([label, spent, own]) => {
+    const spent = known.filter(([, , own]) => own).reduce((sum, [, each]) => sum + each, 0);
+    const bars = known.map(([name, each, own]) => {
       const bar = element(`span.bar${own ? ".own" : ""}`, {"aria-hidden": "true"});
-      bar.style.width = `${Math.max(0.5, (100 * spent) / most)}%`;
-      return element(
-        "div.phase",
-        null,
-        element("span", null, label),
-        element("span.track", null, bar),
-        element("span.number", null, seconds(spent)),
-      );
+      bar.style.width = `${Math.max(0.5, (100 * each) / most)}%`;
+      return element("div.phase", null, element("span", null, name), element("span.track", null, bar), element("span.number", null, seconds(each)));
     });
+    const plain = ["per_ray", "work_over_bound"]; // no counts
     const counts = [
-      ...evaluations.map(([name, value]) => [
-        `evaluations, ${name.replace(/_/g, " ")}`,
-        name === "per_ray" || name === "work_over_bound" ? number(value) : count(value),
-      ]),
-      ["floating-point operations", count(flops)],
-      ["share of the machine's GEMM peak", number(gemm_fraction)],
+      ...evaluations.map(([name, value]) => [`evaluations, ${name.replace(/_/g, " ")}`, (plain.includes(name) ? number : count)(value)]),
+      ...[["floating-point operations", count(flops)], ["share of the machine's GEMM peak", number(gemm_fraction)]],
       ["peak memory", size(peak_memory_bytes)],
-    ].filter(([, value]) => value !== "–");
+    ];
+    const untimed = total === null ? "Nothing was timed." : `${seconds(total)} in all.`;
+    const timed = [element("strong", null, seconds(spent)), " of optimisation, ", seconds(total), " in all."];
     return [
-      known.length
-        ? element("p", null, element("strong", null, seconds(loop)), " in the loop, ", seconds(total), " in all.")
-        : element("p.soft", null, total === null ? "Nothing was timed." : `${seconds(total)} in all.`),
+      element("p", null, known.length ? timed : untimed),
       element("div.phases", null, bars),
-      facts(counts),
+      facts(counts.filter(([, value]) => value !== "–")),
     ];
   }
 
-  function facts(rows) {
-    return element(
-      "dl.facts",
-      null,
-      rows.map(([name, value]) => element("div", null, element("dt", null, name), element("dd", null, value))),
-    );
-  }
-
-  bench.run = run;
-  bench.runParts = {section, picture, facts};
+  Object.assign(bench, {run, picture});
 })((window.implicitBench = window.implicitBench || {}));
