@@ -1,19 +1,11 @@
 """`python -m bench task=completion renderer=dist`: one run, or with -m a sweep."""
 
 import sys
-from pathlib import Path
 
 from omegaconf import DictConfig
 
 from bench.run.command import FAILED, command_line
 from bench.run.sweep import Sweep
-
-
-def _update_index(results_dir: Path) -> Path:
-    """The report's page with a run that has ended; what it needs waits until there is something to show."""
-    from bench.report.write.html import update_index
-
-    return update_index(results_dir)
 
 
 def main() -> int:
@@ -23,7 +15,7 @@ def main() -> int:
     def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
         from bench.run.run import run_cell
 
-        statuses.append(run_cell(config, _update_index))
+        statuses.append(run_cell(config))
 
     code = command_line(one)
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there

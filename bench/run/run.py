@@ -48,14 +48,10 @@ class Interrupted(KeyboardInterrupt):
         self.folder, self.record = folder, record
 
 
-def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
+def run_cell(config: DictConfig) -> str:
     """Runs a composed configuration and gives its status.
 
     The summary of a single run is printed here; a sweep's driver prints a line per run.
-
-    Args:
-        config: configuration of the run.
-        write_index: writes the report's page of a results folder and gives its path.
 
     Raises:
         Interrupted: after Ctrl-C or SIGTERM.
@@ -74,7 +70,7 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
         folder, record = run(config)
     except Interrupted as error:
         if single:
-            show(error.folder, error.record, write_index(error.folder.parent.parent))
+            show(error.folder, error.record)
         raise
     except OSError as error:
         print(f"error: {unwritten(error)}", file=sys.stderr, flush=True)
@@ -85,7 +81,7 @@ def run_cell(config: DictConfig, write_index: Callable[[Path], Path]) -> str:
         shutil.rmtree(folder)
         raise ValueError(record.reason)
     if single:
-        show(folder, record, write_index(folder.parent.parent))
+        show(folder, record)
     return record.status
 
 

@@ -15,7 +15,7 @@ from bench.records.read import Plan
 from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
 
 
-def show(folder: Path, record: Record, index: Path) -> None:
+def show(folder: Path, record: Record) -> None:
     """Prints the outcome of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
     table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
@@ -40,7 +40,9 @@ def show(folder: Path, record: Record, index: Path) -> None:
         )
     for note in record.notes:
         print(f"note: {note}")
-    _print_next(index, *(folder / name for name in PICTURES))
+    for picture in [path for name in PICTURES if (path := folder / name).is_file()][:1]:
+        print(f"picture: {picture}")
+    _print_next(folder.parents[1])
     if record.reused:
         print(f"reused: the run of {record.started}; rerun=all runs it again")
     if record.status != RunStatus.OK and not record.reason.startswith("stopped by"):  # the command line prints that
@@ -66,18 +68,16 @@ def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
         print(f"first failure: {index.parent / 'runs' / cell.id} ({record['status']}: {record['reason']})")
     if table is not None:
         print(f"table of this sweep: {table}")
-    _print_next(index)
+    print(f"report: {index}")
+    _print_next(index.parent)
     print(plan.folder)
     return statuses
 
 
-def _print_next(index: Path, *pictures: Path) -> None:
-    """Prints what to look at next: the picture of a run, the page, and the command that makes the tables."""
-    for picture in [picture for picture in pictures if picture.is_file()][:1]:
-        print(f"picture: {picture}")
-    print(f"report: {index}")
-    where = "" if index.parent == Path("results") else f" results_dir={shlex.quote(str(index.parent))}"
-    print(f"tables: python -m bench.report{where}")
+def _print_next(results_dir: Path) -> None:
+    """Prints the command that makes the page and the tables."""
+    where = "" if results_dir == Path("results") else f" results_dir={shlex.quote(str(results_dir))}"
+    print(f"page and tables: python -m bench.report{where}")
 
 
 def _candidates(record: Record) -> Table:

@@ -3,11 +3,13 @@
 import base64
 import json
 import shlex
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
+import trimesh
 
 from bench.records.names import differences
 from bench.records.read import not_run
@@ -16,7 +18,7 @@ from bench.records.statuses import STATUSES
 from bench.report.data.names import Nameable, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
-from bench.report.site.meshes import Surface, mesh_data, read_ply, simplified
+from bench.report.site.meshes import mesh_data, read_ply, simplified
 from bench.report.site.script import safe_json, to_script
 from bench.report.site.words import TASKS, asked, command, lines_again
 from bench.report.write import html
@@ -27,6 +29,7 @@ from tests.report.page_data import Page
 from tests.report.test_report import record, write_run
 
 ROOT = Path(__file__).parents[2]
+BODY = 177  # where the numbers of the mesh begin
 
 
 def renderer(**settings) -> dict:
@@ -151,7 +154,7 @@ def test_costs_are_by_phase_and_add_up(tmp_path):
     write_run(tmp_path, record("one"), "one")
     costs = detail(record("one", notes=[]), Folder(tmp_path, "one"), tmp_path)["costs"]
     assert sum(spent for _, spent, _ in costs["phases"]) == costs["total"] == 31.5
-    assert [label for label, _, loop in costs["phases"] if loop] == ["loop: forward", "loop: backward and step"]
+    assert [label for label, _, loop in costs["phases"] if loop] == ["optimisation: forward", "optimisation: backward"]
 
 
 def test_a_long_curve_is_thinned_but_keeps_its_ends_and_checkpoints(tmp_path):
@@ -162,40 +165,51 @@ def test_a_long_curve_is_thinned_but_keeps_its_ends_and_checkpoints(tmp_path):
     assert len(kept) < 250 and {0, 1001, 4999} <= set(kept)
 
 
-def positions(data: dict, name: str, width: int) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(data[name]), "<u2").reshape(-1, width)
+def unpacked(part: dict) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(part["bdata"]), f"<{part['dtype']}")
 
 
-def test_a_mesh_is_given_as_numbers_of_sixteen_bits(tmp_path):
+def test_a_mesh_is_given_as_plotly_reads_it_with_our_second_axis_up(tmp_path):
     made.write_mesh(tmp_path / "mesh.ply")
     whole, data = read_ply(tmp_path / "mesh.ply"), mesh_data(tmp_path / "mesh.ply")
-    low, high = np.array(data["low"]), np.array(data["high"])
-    found = low + positions(data, "vertices", 3) / 65_535 * (high - low)
-    assert np.abs(found - whole.vertices).max() < 1e-5
-    assert (positions(data, "faces", 3) == whole.faces).all()
+    x, y, z = (unpacked(data[axis]) for axis in "xyz")
+    assert np.allclose(np.stack([x, z, -y], axis=1), whole.vertices, atol=1e-6)
+    assert (np.stack([unpacked(data[corner]) for corner in "ijk"], axis=1) == whole.faces).all()
+    assert data["whole"] == data["shown"] == [642, 1280] and "vertexcolor" not in data
 
 
-def test_a_large_mesh_is_merged_to_few_vertices_near_the_surface():
-    turn = np.linspace(0, 2 * np.pi, 300)
-    u, v = (grid.ravel() for grid in np.meshgrid(turn, turn))
-    vertices = np.stack([(1 + 0.3 * np.cos(v)) * np.cos(u), 0.3 * np.sin(v), (1 + 0.3 * np.cos(v)) * np.sin(u)], axis=1)
-    faces = np.stack([np.arange(len(u) - 301) + shift for shift in (0, 1, 300)], axis=1)
-    small = simplified(Surface(vertices, faces, np.full((len(u), 3), 40.0)), 5000)
+def test_a_large_mesh_is_merged_to_few_vertices_near_the_surface(tmp_path):
+    torus = trimesh.creation.torus(1, 0.3, 150, 150)
+    torus.visual.vertex_colors = np.tile(np.uint8([40, 80, 120, 255]), (len(torus.vertices), 1))
+    small = simplified(torus, 5000)
     assert 1000 < len(small.vertices) <= 5000 and small.faces.max() < len(small.vertices)
-    around = np.hypot(np.hypot(small.vertices[:, 0], small.vertices[:, 2]) - 1, small.vertices[:, 1])
-    assert np.abs(around - 0.3).max() < 0.02 and np.allclose(small.colours, 40.0)
+    around = np.hypot(np.hypot(small.vertices[:, 0], small.vertices[:, 1]) - 1, small.vertices[:, 2])
+    assert np.abs(around - 0.3).max() < 0.02
+    (tmp_path / "mesh.ply").write_bytes(small.export(file_type="ply"))
+    assert {*mesh_data(tmp_path / "mesh.ply")["vertexcolor"]} == {"#285078"}
+
+
+def test_a_mesh_that_names_a_texture_reads_no_other_file(tmp_path, caplog):
+    made.write_mesh(tmp_path / "mesh.ply")
+    content = (tmp_path / "mesh.ply").read_bytes()
+    named = content.replace(b"element vertex", b"comment TextureFile ../secret.png\nelement vertex")
+    (tmp_path / "mesh.ply").write_bytes(named)
+    assert len(read_ply(tmp_path / "mesh.ply").faces) == 1280 and not caplog.records
 
 
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda content: content[:-40], "shorter"),
-        (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "shorter"),
-        (lambda content: content.replace(b"binary_little", b"binary_big"), "not a binary PLY"),
-        (lambda content: content.replace(b"double x", b"double u"), "x, y and z"),
-        (lambda content: content.replace(b"double x", b"double y"), "x, y and z"),
-        (lambda content: b"", "not a binary PLY"),
-        (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "no triangles of its vertices"),
+        (lambda content: content[:-40], "unexpected length"),
+        (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
+        (lambda content: content.replace(b"binary_little", b"binary_big"), "not of its vertices"),
+        (lambda content: content.replace(b"double x", b"double u"), "no field of name x"),
+        (lambda content: content.replace(b"double x", b"double y"), "could not be read"),
+        (lambda content: content.replace(b"double x", b"object x"), "could not be read"),
+        (lambda content: content.replace(b"uchar int", b"double int"), "could not be read"),
+        (lambda content: b"", "Not a ply file"),
+        (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "not of its vertices"),
+        (lambda content: content[:BODY] + b"\xff" * 8 + content[BODY + 8 :], "not finite"),
     ],
 )
 def test_a_mesh_that_cannot_be_read_is_said_to_be(tmp_path, change, why):
@@ -212,13 +226,13 @@ def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
         made.write(tmp_path, number)
     write_index(tmp_path, meshes=2)
     page = Page(tmp_path)
-    shown = ["vertices" in page.read("mesh", key) for key in page.runs["key"]]
+    shown = ["x" in page.read("mesh", key) for key in page.runs["key"]]
     assert page.folders[-1] == "completion-0000" and shown == [True, True, False]
     monkeypatch.setattr("bench.report.site.meshes.read_ply", lambda path: pytest.fail("was made already"))
     write_index(tmp_path, meshes=2)
     monkeypatch.undo()
     write_index(tmp_path, meshes=None)
-    assert all("vertices" in Page(tmp_path).read("mesh", key) for key in page.runs["key"])
+    assert all("x" in Page(tmp_path).read("mesh", key) for key in page.runs["key"])
 
 
 def test_what_is_gone_leaves_the_page(tmp_path):
@@ -241,6 +255,35 @@ def test_the_page_is_not_written_through_a_link(tmp_path):
     with pytest.raises(ValueError, match="is a link"):
         write_index(results)
     assert not list(outside.iterdir())
+
+
+def test_what_another_put_in_the_place_of_a_script_is_replaced(tmp_path):
+    results, outside = tmp_path / "results", tmp_path / "outside"
+    for number in range(2):
+        made.write(results, number)
+    write_index(results)
+    linked, edited = Page(results).runs["key"]
+    for kind in ("run", "mesh"):
+        folder = results / "page" / "data" / kind
+        (folder / f"{linked}.js").rename(outside.with_name(kind))
+        (folder / f"{linked}.js").symlink_to(outside.with_name(kind))
+        (folder / f"{edited}.js").write_text("evil();")
+    write_index(results)
+    for kind in ("run", "mesh"):
+        outside.with_name(kind).write_text("evil();")
+        for key in (linked, edited):
+            script = results / "page" / "data" / kind / f"{key}.js"
+            assert not script.is_symlink() and "evil" not in script.read_text()
+
+
+def test_pages_that_are_written_at_the_same_time_have_all_runs(tmp_path):
+    def end(number: int) -> None:
+        made.write(tmp_path, number)
+        write_index(tmp_path)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(end, range(4)))
+    assert sorted(Page(tmp_path).folders) == [f"completion-{n:04}" for n in range(4)]
 
 
 def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):

@@ -101,8 +101,9 @@ def test_it_ends_well_and_its_last_line_is_its_folder(finished):
     assert not [note for note in finished.record["notes"] if not note.startswith("loaded machine")]
 
 
-def test_its_summary_names_the_report_as_it_is(finished):
-    assert f"report: {finished.results / 'index.html'}" in finished.stdout.splitlines()
+def test_its_summary_has_its_metrics_and_the_command_for_the_page_which_it_leaves_alone(finished):
+    assert f"page and tables: python -m bench.report results_dir={finished.results}" in finished.stdout.splitlines()
+    assert not (finished.results / "index.html").exists()
     assert "Chamfer" in finished.stdout
 
 

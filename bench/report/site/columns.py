@@ -81,7 +81,9 @@ def _metrics(records: list[Record]) -> dict[str, Any]:
     """The metrics that some run has: before and after, in scene units, with their names and factors."""
     found = {}
     for key, metric in METRICS.items():
-        after, before = ([_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start"))
+        after, before = (
+            [_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
+        )
         if any(value is not None for value in after):
             start = before if any(value is not None for value in before) else None
             found[key] = {"key": key, **metric._asdict(), "after": after, "before": start}

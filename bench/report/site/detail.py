@@ -14,8 +14,8 @@ from bench.report.site.words import asked, command, lines_again, lines_open
 MOST_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
 PHASES = {
     "warmup": "warm-up, off the clock",
-    "forward": "loop: forward",
-    "backward": "loop: backward and step",
+    "forward": "optimisation: forward",
+    "backward": "optimisation: backward",
     "evaluation": "evaluation and pictures",
 }
 NOT_LINES = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "chamfer_l2")

@@ -41,9 +41,7 @@ def read_ply(path: Path) -> trimesh.Trimesh:
     except READ_ERRORS as error:  # it has no exception of its own
         raise ValueError(f"mesh.ply could not be read ({' '.join(str(error).split())[:120]})") from None
     if not faces.size or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
-        raise ValueError(
-            "mesh.ply has no triangles, or some that are not of its vertices, or vertices that are not finite"
-        )
+        raise ValueError("mesh.ply has no triangles, or triangles not of its vertices, or vertices that are not finite")
     return mesh
 
 
