@@ -11,7 +11,7 @@ from rich.table import Table
 
 from bench.records.format import count, number, seconds
 from bench.records.metrics import SHOWN, Metric
-from bench.records.read import Plan
+from bench.records.read import RESULTS, Plan
 from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
 
 
@@ -76,7 +76,7 @@ def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
 
 def _print_next(results_dir: Path) -> None:
     """Prints the command that makes the page and the tables."""
-    where = "" if results_dir == Path("results") else f" results_dir={shlex.quote(str(results_dir))}"
+    where = "" if results_dir == Path(RESULTS) else f" results_dir={shlex.quote(str(results_dir))}"
     print(f"page and tables: python -m bench.report{where}")
 
 

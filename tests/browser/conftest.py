@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.report.conftest import without_shipped  # noqa: F401
+
 FLAGS = (
     *(
         "--headless",

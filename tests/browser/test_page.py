@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from bench.records import format
+from bench.report.write import paper
 from bench.report.write.html import write_index
 from bench.report.write.one_file import write_one_file
 from tests.browser import made
@@ -55,23 +56,25 @@ def results(tmp_path_factory):
 
 def write_tables(results):
     """`speed_front` with a chart, and the atlas with its curves, one cell of which leads to a run."""
-    paper = results / "paper"
-    paper.mkdir()
-    table = [["Setting", "Time", "Words"], ["---"] * 3]
-    table += [["slow", "12.0 s", "b"], ["fast", "300 ms", "a"], ["none", "–", "c"]]
-    rows = "\n".join(f"| {' | '.join(row)} |" for row in table)
-    text = f"**Error over time.** What is plotted.\n\n{rows}\n\n- A note.\n"
-    (paper / "speed_front.md").write_text(text)
+    folder = results / "paper"
+    folder.mkdir()
     points = {"name": "dist", "colour": "#0072b2", "symbol": "s", "x": [1.0, 10.0], "y": [2.0, 0.5]}
     points |= {"text": [["slow"], ["fast"]], "link": ["#/run/completion-0000", "#/run/completion-0001"]}
     other = {"name": "dvr", "colour": "#d1495b", "symbol": "^", "x": [3.0], "y": [1.0]}
     panel = {"title": "one", "x": {"title": "time", "log": True}, "y": {"title": "error", "log": True}}
     chart = {"panels": [panel | {"series": [points, other]}]}
-    front = {"question": "What does accuracy cost?", "verdict": "The least error is *0.5*.", "chart": chart}
-    (paper / "speed_front.json").write_text(json.dumps(front))
-    (paper / "stability.md").write_text(
-        "**Where it breaks.** Severities.\n\n| Axis | dist |\n| --- | ---: |\n| wires | 0.1 |\n"
-    )
+    front = {
+        "place": 1,
+        "title": "Error over time.",
+        "caption": "What is plotted.",
+        "notes": ["A note."],
+        "chart": chart,
+    }
+    front |= {"question": "What does accuracy cost?", "verdict": "The least error is *0.5*."}
+    front |= {"columns": ["Setting", "Time", "Words"], "chart": chart}
+    front |= {"rows": [["slow", "12.0 s", "b"], ["fast", "300 ms", "a"], ["none", "–", "c"]]}
+    (folder / "speed_front.json").write_text(json.dumps(front))
+    (folder / "speed_front.csv").write_text("setting,time\nslow,12\n")
     axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
     cell = {
         "short": "0.1",
@@ -89,10 +92,11 @@ def write_tables(results):
         "reason": "no alpha",
     }
     atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
-    (paper / "stability.json").write_text(json.dumps({"question": "Where?", "verdict": "At *0.1*.", "atlas": atlas}))
-    (paper / "stability_curves.md").write_text("**Curves.** Shares.\n")
+    where = {"place": 2, "title": "Where it breaks.", "columns": ["Axis", "dist"], "rows": [["wires", "0.1"]]}
+    where |= {"question": "Where?", "verdict": "At *0.1*.", "atlas": atlas}
+    (folder / "stability.json").write_text(json.dumps(where))
     curves = {"panels": [panel | {"title": "wires", "axis": "wires", "series": [points, other]}]}
-    (paper / "stability_curves.json").write_text(json.dumps({"chart": curves}))
+    (folder / "stability_curves.json").write_text(json.dumps({"title": "Curves.", "chart": curves}))
 
 
 def rows_of(page):
@@ -111,6 +115,20 @@ def test_the_first_screen_has_questions_verdicts_and_leaderboards(results, tab):
     assert set(names_of(page)) == {"DIST", "DVR", "IDR", "NEWTON", "NAIVE"}
     page.locator(".verdict").first.click()
     assert page.locator("h1").inner_text() == "Error over time"
+
+
+def test_a_table_that_is_shipped_is_marked(tmp_path, tab, monkeypatch):
+    shipped = tmp_path / "shipped"
+    (shipped / "paper").mkdir(parents=True)
+    content = {"title": "Ours.", "question": "Whose?", "verdict": "*1* of 1."}
+    (shipped / "paper" / "ours.json").write_text(json.dumps(content))
+    monkeypatch.setattr(paper, "SHIPPED", shipped)
+    made.write(tmp_path, 0)
+    write_index(tmp_path)
+    page = tab(tmp_path).open()
+    assert page.locator(".verdict .from").inner_text() == "Ours · shipped"
+    page.locator(".verdict").click()
+    assert "not of the runs on this page" in page.locator("main").inner_text()
 
 
 def test_methods_count_failures_as_worst_and_are_ranked_on_the_same_scenes_alone(results, tab):

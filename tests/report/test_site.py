@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from bench.records.names import differences
-from bench.records.read import not_run
+from bench.records.read import RESULTS, not_run
 from bench.records.record import NOT_RUN, RunStatus
 from bench.records.statuses import STATUSES
 from bench.report.data.names import Nameable, names
@@ -126,7 +126,7 @@ def test_a_planned_cell_has_the_command_that_its_sweep_planned():
     plan = {"name": "fig5-1", "asked": "2026-01-01"}
     cell = {"id": "a", "task": "completion", "renderer": "dist", "dataset": "car", "seed": 0, "method": ""}
     planned = not_run(cell | {"config": {}, "overrides": ["+experiment=fig5", "index=1"]}, plan)
-    assert command(planned, Path("results")) == "python -m bench +experiment=fig5 index=1"
+    assert command(planned, Path(RESULTS)) == "python -m bench +experiment=fig5 index=1"
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):
@@ -146,7 +146,7 @@ def test_the_lines_for_python_ask_for_what_was_typed():
     with mock.patch("bench.run", run):
         exec(lines_again(record("x", overrides=typed), Path("my results")), {})
     run.assert_called_once_with([*typed[:2], typed[3]], results_dir="my results")
-    long = lines_again(record("x", overrides=[f"task.points={n}" for n in range(20)]), Path("results"))
+    long = lines_again(record("x", overrides=[f"task.points={n}" for n in range(20)]), Path(RESULTS))
     assert max(map(len, long.splitlines())) < 90 and "results_dir" not in long
 
 

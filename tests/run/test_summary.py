@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.read import Plan, PlannedCell
+from bench.records.read import RESULTS, Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run.summary import show, show_sweep
 
@@ -35,10 +35,10 @@ def test_a_run_ends_with_its_picture_and_the_command_for_page_and_tables(tmp_pat
 
 def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    record = ended(Path("results"), "a")
-    show(Path("results/runs/a"), record)
+    record = ended(Path(RESULTS), "a")
+    show(Path(RESULTS) / "runs" / "a", record)
     out = capsys.readouterr().out.splitlines()
-    assert out[-2:] == ["page and tables: python -m bench.report", "results/runs/a"]
+    assert out[-2:] == ["page and tables: python -m bench.report", f"{RESULTS}/runs/a"]
     assert not any(line.startswith("picture") for line in out)
 
 

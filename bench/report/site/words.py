@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records import metrics
+from bench.records.read import RESULTS
 from bench.report.data.records import Record, iterations_of, setting
 
 TASKS = {
@@ -97,7 +98,7 @@ def _overrides(record: Record) -> list[str]:
 
 
 def _default(results_dir: Path) -> bool:
-    return results_dir.as_posix() == "results"
+    return results_dir.as_posix() == RESULTS
 
 
 def _known(of: Any, record: Record) -> Any:

@@ -31,7 +31,7 @@
     element("a.verdict", {href: link(paper)},
       element("span.question", null, paper.question),
       element("span.answer", null, emphasised(paper.verdict)),
-      element("span.from", null, paper.title));
+      element("span.from", null, paper.title, paper.shipped ? " · shipped" : ""));
 
   function paper(home, name) {
     const known = all().find((each) => each.name === name);
@@ -42,6 +42,7 @@
       element("h1", null, known.title || known.name),
       known.question && element("p.question", null, known.question),
       known.verdict && element("p.answer.large", null, emphasised(known.verdict)),
+      known.shipped && element("p.note", null, "Shipped with the program: not of the runs on this page."),
       later(bench.store.load("paper", known.key), (data) => parts(known, data)));
   }
 
