@@ -6,8 +6,8 @@ from bench.models.candidates import by_size, candidate
 from bench.models.model import Size
 from bench.models.study import choose
 from bench.pictures.size_chart import AXES
-from bench.report.data.subjects.parsimony import SIZES
 from bench.setup.fields import SIZE_WORDS, ModelSettings
+from bench.studies.parsimony import SIZES
 from tests.models.test_models import FIT, GROWTH, VIEWS, an_error, evidence_of
 
 # On fandisk, both are under half a pixel: the grid has fewer free numbers, the network fewer stored ones.

@@ -10,9 +10,9 @@ from bench.pictures import style
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import choose
-from bench.report.pages.rendering import table1
 from bench.report.write import paper
 from bench.report.write.paper import find_paper, studies, write_paper
+from bench.studies import table1
 from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
 
 STUDY = """

@@ -7,19 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.colors import to_rgb
 
 from bench.pictures import style
 from bench.records.read import read_records
-from bench.report import gallery
 from bench.report.__main__ import main
 from bench.report.data import curves
-from bench.report.data.experiments import Experiment, choose
-from bench.report.pages.rendering import fig4, fig7, gradients, gradients_visibility, table1
+from bench.report.data.runs import Runs, choose
 from bench.report.write import result as tables
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper
-from bench.studies import fig5
+from bench.studies import fig4, fig5, fig7, gradients, table1
 from tests.report.page_data import Page
 from tests.report.test_report import HOSTILE
 
@@ -104,7 +101,7 @@ def write_curve(folder: Path, losses: list[float], chamfers: dict[int, float], s
     (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def chosen(results: Path, name: str) -> Experiment | None:
+def chosen(results: Path, name: str) -> Runs | None:
     return choose(read_records(results)[0], PAGES[name].READS[0], results)
 
 
@@ -191,54 +188,6 @@ def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
     assert f"Doubtful times, see the notes of the run: {NAIVE}." in table1.make(chosen(tmp_path, "table1")).notes
 
 
-def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
-    write_run(tmp_path, "table1", "of ours", metrics=costs(5))
-    write_run(tmp_path, "table1", DYNAMIC, metrics=costs(2_100_000))
-    timed_out = {"status": "timeout", "reason": "64 pixels took over 60 s"}
-    write_run(tmp_path, "table1", NAIVE, metrics=costs(6_100_000, size=32), **timed_out)
-    write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck", environment={})
-    main([f"results_dir={tmp_path}"])
-    rows = table(tmp_path)
-    assert list(rows.index) == [NAIVE, PARALLEL, DYNAMIC, "of ours"]  # the paper's order, then others
-    assert list(rows["queries"]) == ["", "", "2100000", "5"]  # those of the asked size: as N/A in the paper
-    assert list(rows["size"]) == [64, 64, 64, 64]
-    assert list(rows["finished_queries"]) == ["6100000", "", "", ""]
-    assert list(rows["finished_size"]) == ["32", "", "", ""]
-    assert list(rows["published_queries"]) == ["N/A", "6.06M", "1.99M", ""]
-    assert list(rows["published_time"]) == ["N/A", "3.39s", "1.23s", ""]
-    assert list(rows["published_steps"]) == ["50", "50", "50", ""]
-    assert list(rows["status"]) == ["timeout", "crashed", "ok", "ok"]
-    assert list(rows["reason"]) == ["64 pixels took over 60 s", "no luck", "", ""]
-    row = rows.loc[DYNAMIC]
-    shown = (
-        "forward_s",
-        "backward_s",
-        "step_s",
-        "step_s_low",
-        "step_s_high",
-        "lost",
-        "false",
-        "wrong",
-        "depth_error_max",
-    )
-    assert [float(row[name]) for name in shown] == [0.5, 0.25, 0.75, 0.625, 0.875, 12, 8, 3, 0.25]
-
-
-def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
-    write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), definitions={"queries": "Field values."})
-    write_run(tmp_path, "table1", NAIVE, metrics=costs(size=32), status="timeout", reason="over 60 s")
-    write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck")
-    made = table1.make(chosen(tmp_path, "table1"))
-    assert list(made.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
-    assert made.table["Step"].iloc[2] == "750 ms (625–875)"
-    assert made.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
-    for words in ("car 0", "64×64 pixels", "4 layers of 128", "Some CPU", "2 threads", "5 repeats", "n = 3 runs"):
-        assert words in made.caption
-    assert "GTX 1080Ti" in told(made)
-    assert "2 of 3 runs did not end ok: Naive sphere tracing: timeout (over 60 s); + parallel: crashed" in made.caption
-    assert [note for note in made.notes if note.endswith("Field values.")] == ["Queries: Field values."]
-
-
 def test_rows_of_several_seeds_and_shapes_are_told_apart(tmp_path):
     for settings in ({"seed": 0}, {"seed": 1}):
         write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), settings=settings)
@@ -300,75 +249,10 @@ def judged(tmp_path: Path) -> Path:
     return write_judged(tmp_path)
 
 
-def test_gradients_have_a_row_for_each_renderer_and_band(reported):
-    rows = pd.read_csv(reported / "paper" / "gradients.csv").set_index(["row", "band"])
-    assert list(rows.index) == [(name, band) for name in ("dist", "dvr", "naive") for band in gradients.BANDS]
-    assert rows.loc[("dvr", "oblique"), "code_scale"] == 4.0
-    assert rows.loc[("dist", "grazing"), "camera_median_error"] == pytest.approx(3e-4)
-    assert np.isnan(rows.loc[("dvr", "frontal"), "camera_scale"])
-    assert rows.loc[("dist", "silhouette"), "image_cosine"] == 0.75
-    assert rows.loc[("dist", "silhouette"), "pixels"] == 77
-    assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
-    text = (reported / "paper" / "gradients.md").read_text()
-    assert (
-        "- Code cosine, Camera cosine: Of both.\n- Pixels: Drawn.\n" in text
-        and "naive: oom (8 GB)" in text
-        and "gradients.png" in text
-    )
-    assert "Code pooled cosine | Code pooled scale | Code cosine" in text
-    assert "A pooled number compares the gradients of all pixels of a band at once" in text
-    assert rows.loc[("dist", "grazing"), "code_pooled_cosine"] == 0.97
-    assert r"\begin{tabular}" in (reported / "paper" / "gradients.tex").read_text()
-
-
-def seen(blur: str, error: float) -> dict[str, float]:
-    """The metrics at the outline, at a blur."""
-    numbers = {"image_cosine": 0.9, "image_scale": 1.1, "image_error": error, "image_spread": 2.0}
-    return {f"silhouette_{blur}.{name}": value for name, value in (numbers | {"values_per_ray": 30.0}).items()}
-
-
-def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
-    blurred = seen("1e-03", 0.3) | seen("3e-02", 0.2)
-    own = {key.replace("_1e-03", ""): value for key, value in seen("1e-03", 0.9).items()}
-    write_run(tmp_path, "gradients", None, metrics=bands() | own, renderer="idr")
-    write_run(tmp_path, "gradients", None, metrics=bands() | own | blurred, renderer="neus")
-    write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
-    main([f"results_dir={tmp_path}"])
-    rows = pd.read_csv(tmp_path / "paper" / "gradients_visibility.csv").set_index("row")
-    assert rows.loc["neus", "blur"].tolist() == [0.001, 0.03]
-    assert rows.loc["neus", "image_error"].tolist() == [0.3, 0.2]
-    assert rows.loc["idr", "image_error"] == 0.9 and np.isnan(rows.loc["idr", "blur"])
-    assert rows.loc["naive", "status"] == "oom"
-    figure = gradients_visibility.draw(
-        rows.reset_index().assign(
-            name=lambda r: r["row"],
-            preset=lambda r: r["row"],
-            blur=lambda r: r["blur"].map("{:g}".format).replace("nan", ""),
-        )
-    )
-    by_blur, _, by_cost = figure.axes
-    drawn_lines = [list(line.get_ydata()) for line in by_blur.lines if len(line.get_ydata())]
-    assert sorted(drawn_lines) == [[0.3, 0.2], [0.9, 0.9]]
-    assert {line.get_label() for line in by_cost.lines} >= {"neus"}
-
-
-def drawn(axis, label: str) -> list[float]:
+def drawn(axis, label: str, letter: str = "y") -> list[float]:
+    """The values of the line with a label, along an axis."""
     line = next(line for line in axis.lines if line.get_label() == label)
-    return [float(y) for y in line.get_ydata()]
-
-
-def test_gradients_figure_plots_the_numbers_of_its_csv(judged):
-    made = gradients.make(chosen(judged, "gradients"))
-    axes = made.figure.axes
-    own = made.data[made.data["row"] == "dvr"].set_index("band").loc[["frontal", "oblique", "grazing"]]
-    assert drawn(axes[0], "dvr") == list(own["code_pooled_cosine"]) == [0.99, 0.98, 0.97]
-    assert drawn(axes[3], "dvr") == list(own["code_scale"]) == [2.0, 4.0, 6.0]
-    assert drawn(axes[6], "dvr") == list(own["code_median_error"])
-    assert (drawn(axes[2], "dvr"), drawn(axes[5], "dvr")) == ([0.75], [1.0])
-    assert axes[6].get_yscale() == axes[7].get_yscale() == "log"
-    assert not axes[8].get_visible()
-    assert "naive (oom)" in [line.get_label() for line in axes[0].lines]
-    assert_labelled(made.figure, x_labels=False)
+    return [float(value) for value in getattr(line, f"get_{letter}data")()]
 
 
 def assert_labelled(figure, x_labels: bool = True) -> None:
@@ -377,95 +261,6 @@ def assert_labelled(figure, x_labels: bool = True) -> None:
     assert charts
     for axis in charts:
         assert axis.get_ylabel() and (axis.get_xlabel() or not x_labels)
-
-
-def test_fig4_counts_what_the_pictures_show(tmp_path):
-    write_images(write_run(tmp_path, "fig4", PARALLEL))
-    write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1, tilt=10.0)
-    write_images(write_run(tmp_path, "fig4", NAIVE, status="timeout", reason="slow"), size=8)
-    write_run(tmp_path, "fig4", "+ aggressive")
-    made = fig4.make(chosen(tmp_path, "fig4"))
-    rows = made.data.set_index("row")
-    assert list(rows.index) == [PARALLEL, DYNAMIC, NAIVE, "+ aggressive"]
-    assert list(rows["size"]) == [24, 24, 8, None]
-    assert (rows.loc[PARALLEL, "lost"], rows.loc[PARALLEL, "false"], rows.loc[PARALLEL, "angle_max"]) == (0, 0, 0)
-    reference, moved = ball(24, 0.0, 0.0)[1], ball(24, 0.1, 0.0)[1]
-    assert rows.loc[DYNAMIC, "lost"] == (reference & ~moved).sum() > 0
-    assert rows.loc[DYNAMIC, "false"] == (moved & ~reference).sum() > 0
-    assert rows.loc[DYNAMIC, "hits"] == reference.sum()
-    assert "No pictures of 1 run: no images.npz." in made.notes
-    titles = [label.get_text().replace("\n", " ") for label in made.figure.axes[0].get_xticklabels()]
-    assert titles == ["reference", PARALLEL, DYNAMIC, f"{NAIVE}, 8 px", "+ aggressive"]
-    assert [text.get_text() for text in made.figure.axes[0].texts if text.get_text()] == ["timeout", "no picture"]
-    assert any("degrees" in axis.get_ylabel() for axis in made.figure.axes)
-
-
-def test_angles_are_degrees_where_both_hit(tmp_path):
-    write_images(tmp_path, tilt=10.0)
-    images = gallery.arrays(tmp_path, gallery.REFERENCE)[0]
-    angles = gallery.angles(images)
-    assert np.isnan(angles).sum() == (~images["hit"]).sum()
-    within = np.abs(images["normals"][..., 1]) < 0.1  # the turn is about y
-    assert np.nanmedian(angles[within]) == pytest.approx(10.0, abs=0.2)
-
-
-def test_lost_and_false_pixels_have_their_colours(tmp_path):
-    write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1)
-    made = fig4.make(chosen(tmp_path, "fig4"))
-    images = gallery.arrays(tmp_path / "runs" / "run000", gallery.REFERENCE)[0]
-    shown = made.figure.axes[0].get_images()[-1].get_array()
-    for colour, mask, other in ((style.MISSED, "reference_hit", "hit"), (style.SPURIOUS, "hit", "reference_hit")):
-        wrong = images[mask] & ~images[other]
-        assert wrong.any() and ((shown == to_rgb(colour)).all(-1) == wrong).all()
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        (b"", "cannot be read"),
-        (b"PK\x03\x04 not a zip", "cannot be read"),
-        ({"hit": np.ones((2, 2))}, "lacks an array"),
-        ({name: np.ones((2, 2 + place)) for place, name in enumerate(gallery.REFERENCE)}, "different sizes"),
-    ],
-)
-def test_broken_pictures_are_a_remark(tmp_path, content, why):
-    path = write_run(tmp_path, "fig4", DYNAMIC) / "images.npz"
-    path.write_bytes(content) if isinstance(content, bytes) else np.savez(path, **content)
-    made = fig4.make(chosen(tmp_path, "fig4"))
-    assert why in told(made) and list(made.data["lost"]) == [None]
-
-
-@pytest.fixture
-def thresholds(tmp_path: Path) -> Path:
-    for epsilon, lost, false in ((5e-5, 0, 1), (5e-2, 4, 100), (5e-7, 40, 0)):
-        metrics = costs(lost=lost, false=false, depth_error_median=epsilon / 2)
-        write_images(write_run(tmp_path, "fig7", None, metrics=metrics, settings={"renderer": {"epsilon": epsilon}}))
-    settings = {"renderer": {"epsilon": 5e-3}}
-    write_run(tmp_path, "fig7", None, settings=settings, status="killed", reason="stopped", environment={})
-    return tmp_path
-
-
-def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(thresholds):
-    made = fig7.make(chosen(thresholds, "fig7"))
-    assert list(made.data["epsilon"]) == [5e-2, 5e-3, 5e-5, 5e-7]
-    assert list(made.data["lost_share"]) == [0.01, None, 0.0, 0.1]
-    assert list(made.data["false_share"]) == [0.25, None, 0.0025, 0.0]
-    assert list(made.data["status"]) == ["ok", "killed", "ok", "ok"]
-    charts = {axis.get_ylabel(): axis for figure in made.figure.subfigs for axis in figure.axes}
-    shares, depth = charts["pixels (% of the reference's hits)"], charts["median depth error (scene units)"]
-    assert drawn(shares, "erosion") == pytest.approx([1.0, np.nan, 0.0, 10.0], nan_ok=True)
-    assert drawn(shares, "dilation") == pytest.approx([25.0, np.nan, 0.25, 0.0], nan_ok=True)
-    assert drawn(depth, "dist") == pytest.approx([2.5e-2, np.nan, 2.5e-5, 2.5e-7], nan_ok=True)
-    assert shares.get_xscale() == depth.get_xscale() == "log"
-    assert_labelled(made.figure.subfigs[1])
-    assert "killed (stopped)" in made.caption
-
-
-def test_pictures_are_of_one_scene(tmp_path):
-    write_images(write_run(tmp_path, "fig7", None, settings={"index": 1}))
-    write_images(write_run(tmp_path, "fig7", None, settings={"index": 0}))
-    made = fig7.make(chosen(tmp_path, "fig7"))
-    assert list(made.data["index"]) == [0] and "Not shown: 1 run" in told(made)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 
 import numpy as np
 import pandas as pd
@@ -11,12 +10,8 @@ import pytest
 from bench.records.read import read_records
 from bench.report.data.curves import history_of
 from bench.report.data.runs import choose
-from bench.report.data.subjects.speed import COMPLETION, TARGET, TRIALS, settings
-from bench.report.pages.speed import speed, speed_curves
 from bench.report.write import chart
-from bench.report.write.html import write_index
-from bench.report.write.paper import write_paper
-from tests.report.page_data import Page
+from bench.studies import speed_curves, speed_front
 from tests.report.test_report_paper import told, write_run
 
 
@@ -51,18 +46,17 @@ def completed(results, label, errors, **changed):
     return folder
 
 
-def rendered(results, label, seconds, error, *, size=64, status="ok"):
+def rendered(results, label, seconds, error, *, size=64, index=0, queries=1000):
     """A rendering."""
-    metrics = {"forward_seconds": seconds, "error_p95": error, "queries": 1000}
-    return write_run(
-        results, "speed_rendering", label, task="ablation", dataset="sofa", status=status, metrics=metrics,
-        settings={"view": {"resolution": size}, "split": "train"},
-    )  # fmt: skip
+    metrics = {"forward_seconds": seconds, "error_p95": error, "queries": queries}
+    settings = {"view": {"resolution": size}, "split": "train", "index": index}
+    write_run(results, "speed_rendering", label, task="ablation", dataset="sofa", metrics=metrics, settings=settings)
 
 
-def made(results, make):
-    records, page = read_records(results)[0], sys.modules[make.__module__]
-    return make(*(choose(records, selection, results) for selection in page.READS))
+def made(results, study=speed_front):
+    (make,) = study.PAGES.values()
+    records = read_records(results)[0]
+    return make(*(choose(records, selection, results) for selection in study.READS))
 
 
 @pytest.fixture
@@ -77,63 +71,53 @@ def three(tmp_path):
 
 
 def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
-    data = made(three, speed.make_front).data.set_index("setting")
+    page = made(three)
+    data = page.data.set_index("setting")
     assert data["dominated"].to_dict() == {"fast": False, "good": False, "bad": True, "broken": True}
     chance = 7 / 27  # that at least two of three draws are the shape that it did not fail on; then it beats "fast"
     expected = {"fast": 1 - chance, "good": 1.0, "bad": 0.0, "broken": chance}
     assert data["on_front"].to_dict() == pytest.approx(expected, abs=0.03)
     assert data.loc["good", ["seconds", "error"]].tolist() == pytest.approx([3.0, 0.6])
-    assert data.loc["broken", ["failed", "runs"]].tolist() == [2, 3]
-    assert math.isinf(data.loc["broken", "error"])
+    assert data.loc["broken", ["failed", "runs"]].tolist() == [2, 3] and math.isinf(data.loc["broken", "error"])
+    ends = "fast (*1.00 s*, error × 1000 7.00) to good (*3.00 s*, error × 1000 0.600)"
+    assert page.verdict == f"On the front of completing a shape: 2 of 4 settings, {ends}; n = 3 shapes."
 
 
-def test_failed_and_dominated_points_are_drawn(three):
-    records = read_records(three)[0]
-    rows = [settings(choose(records, trial.selection, three), trial) for trial in TRIALS]
-    points = {point.row.name: point for point in speed.place(rows[0])}
-    assert rows[1] == []
-    assert points["broken"].infinite and not points["broken"].on_front
-    assert (points["broken"].x, points["broken"].y) == pytest.approx((1.5 * 4, 1.5 * 8))
-    figure = made(three, speed.make_front).figure
-    drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in figure.axes[0].lines
+def test_failed_and_dominated_points_are_drawn_and_the_front_is_numbered(three):
+    axis = made(three).figure.axes[0]
+    drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in axis.lines
              if len(line.get_xdata()) == 1}  # fmt: skip
-    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0), (6.0, 12.0)}
+    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0), (6.0, 12.0)}  # the last beyond all finite ones
     assert drawn[6.0, 12.0].get_marker() == "x"
     assert drawn[4.0, 8.0].get_markerfacecolor() == "none"
     assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
+    assert {text.get_text(): text.xy for text in axis.texts} == {"1": (1.0, 7.0), "2": pytest.approx((3.0, 0.6))}
+    assert [text.get_text()[:6] for text in axis.get_legend().get_texts()] == ["1 fast", "2 good"]
 
 
-@pytest.mark.parametrize(("names", "x"), [(("one", "two", "three", "four"), 0.5), (("capsule", "rounded box"), 0.01)])
-def test_names_of_near_points_cover_neither_each_other_nor_the_axis(names, x):
-    _, ((axes,),) = chart.sheet(3.4)
-    axes.set(xlim=(0, 1), ylim=(0, 1))
-    chart.name_points(axes, [(name, x, 0.5) for name in names])
-    axes.figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in axes.texts]
-    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
-    assert min(box.x0 for box in boxes) >= axes.get_window_extent().x0
+def test_points_of_a_front_that_are_near_have_their_numbers_together():
+    _, ((axis,),) = chart.sheet(3.4)
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    speed_front._number(axis, [(0.1, 0.9), (0.5, 0.5), (0.501, 0.499), (0.502, 0.498), (0.9, 0.1)])
+    assert [text.get_text() for text in axis.texts] == ["1", "2–4", "5"]
 
 
 def test_one_draw_has_no_probability(tmp_path):
     for label, errors in (("fast", [9, 6]), ("good", [9, 5, 1])):
         completed(tmp_path, label, errors)
-    result = made(tmp_path, speed.make_front)
+    result = made(tmp_path)
     assert result.table["P(on the front)"].tolist() == ["–", "–"]
     assert result.data["on_front"].isna().all() and result.data["error_low"].isna().all()
     assert "One shape and one seed are one draw" in told(result)
-    assert not [text for text in result.figure.axes[0].texts if "1.00" in text.get_text()]
+    assert [text.get_text() for text in result.figure.axes[0].get_legend().get_texts()] == ["1 fast", "2 good"]
 
 
 def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path):
     for index, (mine, other) in enumerate(((1.0, 1.2), (1.5, 1.1), (1.0, 1.4))):
-        for label, seconds in (("dist", mine), ("dist, K 3", other), ("dist, 20 steps", 0.9)):
-            error = 0.03 if "steps" in label else 0.01 + index / 1000
-            folder = rendered(tmp_path, label, seconds, error)
-            record = json.loads((folder / "record.json").read_text())
-            record["config"]["index"] = index
-            record["metrics"]["queries"] -= 500 * ("steps" in label)
-            (folder / "record.json").write_text(json.dumps(record))
-    data = made(tmp_path, speed.make_front).data.set_index("setting")
+        rendered(tmp_path, "dist", mine, 0.01 + index / 1000, index=index)
+        rendered(tmp_path, "dist, K 3", other, 0.01 + index / 1000, index=index)
+        rendered(tmp_path, "dist, 20 steps", 0.9, 0.03, index=index, queries=500)
+    data = made(tmp_path).data.set_index("setting")
     columns = ["seconds", "error", "evaluations", "on_front", "dominated"]
     assert data.loc["dist", columns].tolist() == data.loc["dist, K 3", columns].tolist()
     assert data.loc["dist", "seconds"] == pytest.approx(1.2)  # of 1.1, 1.3 and 1.2, the shapes' medians
@@ -141,32 +125,27 @@ def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path
 
 
 def test_bands_are_drawn_from_six_shapes_on(three, tmp_path):
-    axis = made(three, speed_curves.make).figure.axes[0]
+    axis = made(three, speed_curves).figure.axes[0]
     assert not axis.collections and len([line for line in axis.lines if line.get_linewidth() == 0.5]) > 3
     for index in range(3, 6):
         completed(tmp_path, "fast", [9, 6 + index], index=index)
-    axis = made(three, speed_curves.make).figure.axes[0]
+    axis = made(three, speed_curves).figure.axes[0]
     assert axis.collections and not [line for line in axis.lines if line.get_linewidth() == 0.5]
 
 
 def test_the_charts_of_the_page_have_the_numbers_and_lead_to_the_runs(three):
-    write_paper(read_records(three)[0], three)
-    write_index(three)
-    page = Page(three)
-    front = page.paper("speed_front")["chart"]["panels"][0]
-    data = pd.read_csv(three / "paper" / "speed_front.csv")
-    shown = [x for series in front["series"] if series["name"] != "front" for x in series["x"]]
-    finite = data[np.isfinite(data["seconds"]) & np.isfinite(data["error"])]
-    assert sorted(shown) == pytest.approx(sorted(finite["seconds"]), rel=1e-4)
-    curves = page.paper("speed_curves")["chart"]["panels"][0]["series"]
-    links = {link for series in curves for link in series["link"]}
-    assert links and links <= {f"#/run/{folder}" for folder in page.folders}
+    page = made(three)
+    shown = [x for series in page.chart["panels"][0]["series"] if series["name"] != "front" for x in series["x"]]
+    assert sorted(shown) == sorted(page.data["seconds"][np.isfinite(page.data["seconds"].astype(float))])
+    page = made(three, speed_curves)
+    curves = page.chart["panels"][0]["series"]
+    assert {link for one in curves for link in one["link"]} < {f"#/run/{name}" for name in page.data["folder"]}
     line = next(series for series in curves if series["name"] == "good")
     assert line["y"] == [5, 3, 0.5] and "3.00 s" in line["text"][-1][-1]
 
 
 def test_a_look_costs_what_was_spent_before_it(three):
-    data = made(three, speed_curves.make).data
+    data = made(three, speed_curves).data
     good = data[(data["row"] == "good") & (data["index"] == 0)]
     assert good["error"].tolist() == [9, 5, 3, 0.5]
     assert good["seconds"].tolist() == [0, 1, 2, 3]
@@ -175,18 +154,21 @@ def test_a_look_costs_what_was_spent_before_it(three):
 
 
 def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
-    assert TARGET == 1e-3
-    table = made(three, speed_curves.make).table.set_index("Setting")
+    assert speed_curves.TARGET == 1e-3
+    page = made(three, speed_curves)
+    table = page.table.set_index("Setting")
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
-    assert table.loc["bad"].tolist() == ["3", "0", "–", "0.775"]
+    assert table.loc["bad"].tolist() == ["3", "0", "–", "0.775"]  # the last is the rank correlation of loss and error
     assert table.loc["broken"].tolist() == ["3", "1", "1.00 s", "–"]  # failed runs did not, whatever they scored
+    assert page.verdict.startswith("good reaches an error of 1 (Chamfer × 1000) first, in *3.00 s*")
+    assert "3 of 4 settings do not reach it" in page.verdict
 
 
 def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_path):
     for index in range(5):
         completed(tmp_path, "dist", [9, 8], index=index, status="nan")
     completed(tmp_path, "dist", [9, 8, 8, 0.5], index=5)
-    figure = made(tmp_path, speed_curves.make).figure
+    figure = made(tmp_path, speed_curves).figure
     figure.draw_without_rendering()  # also where every median is infinite
     (steps,) = [line for line in figure.axes[2].lines if len(line.get_xdata()) > 1]
     assert steps.get_ydata()[-1] == pytest.approx(5 / 6)
@@ -195,17 +177,16 @@ def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_pat
 def test_a_run_without_a_curve_that_ended_ok_is_censored_when_it_ended(tmp_path):
     folder = completed(tmp_path, "dist", [9, 8, 2])
     (folder / "curve.jsonl").unlink()
-    (record,) = read_records(tmp_path)[0]
-    history = history_of(choose([record], COMPLETION.selection, tmp_path), record)
-    assert speed_curves.time_to(history, record) == (2.0, False)
+    runs = choose(read_records(tmp_path)[0], speed_curves.READS[0], tmp_path)
+    (record,) = runs.records
+    assert speed_curves.time_to(history_of(runs, record), record) == (2.0, False)
 
 
 def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
     for index in range(2):
         completed(tmp_path, "dist", [9, 1], index=index)
     completed(tmp_path, "idr", [9, 1], renderer="idr")
-    result = made(tmp_path, speed.make_front)
-    row = result.table.set_index("Setting").loc["idr"]
+    row = made(tmp_path).table.set_index("Setting").loc["idr"]
     assert row["Failed"] == "0 of 1, 1 missing"
     assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
 
@@ -213,9 +194,9 @@ def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
 def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
     folder = completed(tmp_path, "dist", [9, 1])
     record = json.loads((folder / "record.json").read_text())
-    record["seconds"]["forward"] = "nan"
+    record["seconds"]["forward"] = math.nan
     (folder / "record.json").write_text(json.dumps(record))
-    assert math.isinf(made(tmp_path, speed.make_front).data["seconds"].iloc[0])
+    assert math.isinf(made(tmp_path).data["seconds"].iloc[0])
 
 
 def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
@@ -223,7 +204,7 @@ def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
     settings = {"index": 0, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "validation"}
     write_run(tmp_path, "speed_completion", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
               settings=settings, minute=0)  # fmt: skip
-    result = made(tmp_path, speed.make_front)
+    result = made(tmp_path)
     assert result.data["error"].tolist() == [1.0]
     assert "Not shown: 1 run" in told(result)
 
@@ -241,23 +222,16 @@ def test_renderings_of_another_size_are_not_compared(tmp_path):
     rendered(tmp_path, "dist", 1.0, 0.01)
     rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
     rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
-    result = made(tmp_path, speed.make_front)
-    data = result.data
-    assert "Not shown: 1 renderings of another size." in result.notes
-    assert data["setting"].tolist() == ["dist", "dist, 20 steps"]
-    assert data["dominated"].tolist() == [False, False]
-    assert data["evaluations"].tolist() == [1000, 1000]
-
-
-def test_loss_and_error_are_correlated_by_rank(three):
-    ranks = made(three, speed_curves.make).table.set_index("Setting")["ρ of loss and error"]
-    assert ranks.to_dict() == {"good": "1.00", "bad": "0.775", "fast": "–", "broken": "–"}  # one look has none
+    result = made(tmp_path)
+    assert "Not shown: 1 renderings of another size." in told(result)
+    assert result.data["setting"].tolist() == ["dist", "dist, 20 steps"]
+    assert result.data["dominated"].tolist() == [False, False]
+    assert result.data["evaluations"].tolist() == [1000, 1000]
 
 
 def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
     completed(tmp_path, "dist", [9, 5, 1])
     folder = completed(tmp_path, "idr", [9, 5, 1], status="timeout", renderer="idr")
     (folder / "curve.jsonl").unlink()
-    for make in (speed.make_front, speed_curves.make):
-        result = made(tmp_path, make)
-        assert "idr" in result.table.to_string()
+    for study in (speed_front, speed_curves):
+        assert "idr" in made(tmp_path, study).table.to_string()

@@ -6,11 +6,9 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.records import row_of
-from bench.report.data.runs import choose, shared_loss
-from bench.report.data.runs import named_rows as named_by_rows
-from bench.report.data.subjects.atlas import STABILITY, atlas
-from bench.report.pages.stability import stability, stability_curves
+from bench.report.data.runs import choose, named_rows, shared_loss
 from bench.report.write.paper import write_paper
+from bench.studies import stability
 from tests.report.test_report_paper import told, write_run
 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
@@ -69,52 +67,38 @@ def broke(
     return folder
 
 
-def made(results, function):
-    return function(choose(read_records(results)[0], STABILITY, results))
+def made(results, page="stability"):
+    return stability.PAGES[page](choose(read_records(results)[0], stability.READS[0], results))
 
 
 def test_a_breakdown_stands_with_its_interval(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.5)
-    table = made(tmp_path, stability.make)
-    assert table.table.loc[0, "Axis"] == "wires"
-    assert table.table.loc[0, "DIST"] == "0.100 (0.126 to 0.0794)"
-    worst = "DIST: worst on wires 0.100 scene units (0.126 to 0.0794)."
-    assert f"{worst} Failed trials: 3 missed, 1 spurious." in table.notes
-    assert "n = 10 trials in all, of 1 axes and 1 renderers" in table.caption
-    assert "25 % of a full grid's" in told(table)
+    broke(tmp_path, "wires", "DVR", 1.1)
+    page = made(tmp_path)
+    assert page.table.iloc[0].tolist()[:3] == ["wires", "scene units", "0.100 (0.126 to 0.0794)"]
+    assert page.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
+    assert page.data["failures"].tolist() == ["3 lost; 1 false"] * 2
+    assert page.verdict == "DVR does not break on *1 of 1* axes, DIST on 0 of 1 (n = 20 trials)."
+    assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of a full grid's" in told(page)
+    assert page.atlas["cells"][0][0]["shade"] == 0.5 and page.atlas["cells"][0][1]["short"] == "none"
 
 
 def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
     broke(tmp_path, "camera_inside", "DIST", 0.5, repeats=1)
     broke(tmp_path, "camera_inside", "DVR", -0.1, repeats=1)
-    result = made(tmp_path, stability.make)
+    result = made(tmp_path)
     assert result.table.loc[0, ["DIST", "DVR"]].tolist() == ["0.100 (one trial)", "at once (1 of 1 failed)"]
     assert result.data[["breakdown_low", "breakdown_high", "level_low", "level_high"]].isna().all(axis=None)
-    curves = made(tmp_path, stability_curves.make)
-    assert curves.data["share"].notna().all() and curves.data[["low", "high"]].isna().all(axis=None)
-    bars = [line for line in curves.figure.axes[0].lines if line.get_linewidth() == 2]
-    assert not bars
-    broke(tmp_path, "wires", "DIST", 0.5)
-    repeated = made(tmp_path, stability_curves.make)
-    assert len([line for axis in repeated.figure.axes for line in axis.lines if line.get_linewidth() == 2]) == 1
-
-
-def test_how_far_surfaces_moved_is_told_and_not_ranked(tmp_path):
-    for label, moved in (("DIST", 0.5), ("DVR", 0.001)):
-        broke(tmp_path, "quantised", label, 0.5, surface_moved=moved)
-        broke(tmp_path, "wires", label, 0.5)  # a second axis, since one alone gives no rank
-    told_of = "Distance by which the surface moved at the breakdowns, in scene units: quantised 0.00100 to 0.500."
-    assert told_of in made(tmp_path, stability.make).notes
-    assert made(tmp_path, stability.make_cost).data["rank"].tolist() == [1.5, 1.5]
+    curves = made(tmp_path, "stability_curves").data
+    assert curves["share"].notna().all() and curves[["low", "high"]].isna().all(axis=None)
 
 
 def test_a_loss_that_all_rows_share_is_in_the_caption_and_not_in_their_names(tmp_path):
     for label in ("DIST", "DVR"):
         broke(tmp_path, "wires", label, 0.5, loss="DIST's mask loss")
-    result = made(tmp_path, stability.make)
+    result = made(tmp_path)
     assert list(result.table.columns) == ["Axis", "Unit", "DIST", "DVR"]
-    assert "every row with DIST's mask loss." in result.caption
-    assert [record["name"] for record in result.runs.named()] == ["DIST", "DVR"]
+    assert "every row with DIST's mask loss." in told(result)
 
 
 def test_losses_that_differ_are_in_the_names_of_rows():
@@ -124,16 +108,18 @@ def test_losses_that_differ_are_in_the_names_of_rows():
     assert shared_loss([record("a"), record("a")]) == "a"
     assert shared_loss([record("a"), record("b")]) == shared_loss([record("a"), record(None)]) == ""
     assert shared_loss([record(None)]) == ""
-    assert [row_of(one).name for one in named_by_rows([record("a"), record("b")])] == ["dist, a", "dist, b"]
-    assert [row_of(one).name for one in named_by_rows([record("a"), record("a")])] == ["dist", "dist"]
+    assert [row_of(one).name for one in named_rows([record("a"), record("b")])] == ["dist, a", "dist, b"]
+    assert [row_of(one).name for one in named_rows([record("a"), record("a")])] == ["dist", "dist"]
 
 
 def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
     broke(tmp_path, "wires", "DIST", -0.1)
     broke(tmp_path, "wires", "DVR", 1.1)
-    row = made(tmp_path, stability.make).table.iloc[0]
+    broke(tmp_path, "wires", "IDR", 0.5, mild_successes=1, severe_successes=4)
+    row = made(tmp_path).table.iloc[0]
     assert row["DIST"] == "at once (5 of 5 failed, 48-100 %)"
     assert row["DVR"] == "none (0 of 5 failed, 0-52 %)"  # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
+    assert row["IDR"].startswith("success rises with severity (mild: 4 of 5 failed")
 
 
 def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
@@ -141,10 +127,10 @@ def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
     broke(tmp_path, "wires", "DVR", 0.5, status="crashed")
     broke(tmp_path, "alpha", "DIST", 0.5)
     broke(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
-    result = made(tmp_path, stability.make)
+    result = made(tmp_path)
     assert list(result.table["DVR"]) == ["crashed", "–"]
-    assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in result.caption
-    assert made(tmp_path, stability_curves.make).figure is not None
+    assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in told(result)
+    assert [cell["shade"] for line in result.atlas["cells"] for cell in line] == [0.5, None, 0.5, None]
 
 
 def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
@@ -155,7 +141,7 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
         broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
     broke(tmp_path, "alpha", "DIST", 0.9)
     broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
-    rows = made(tmp_path, stability.make_cost).data.set_index("row")
+    rows = made(tmp_path, "stability_cost").data.set_index("row")
     columns = ["axes", "at_once", "never", "cost"]
     assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
     assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
@@ -169,35 +155,28 @@ def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
     if status != "missing":
         broke(tmp_path, "thin_plate", "DIST", 0.1, status=status)
     broke(tmp_path, "thin_plate", "DVR", 0.1)
-    rows = made(tmp_path, stability.make_cost).data.set_index("row")
+    rows = made(tmp_path, "stability_cost").data.set_index("row")
     assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
-    if status != "missing":
-        assert "DIST: worst on thin plate timeout" in " ".join(made(tmp_path, stability.make).notes)
+    assert made(tmp_path).table["DIST"].tolist()[1] == ("" if status == "missing" else status)
 
 
 def test_rows_of_other_criteria_are_not_compared(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
     broke(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
-    result = made(tmp_path, stability.make)
+    result = made(tmp_path)
     assert list(result.table.columns) == ["Axis", "Unit", "DVR"]
     assert "Success: 0.99 of the true hits" in told(result) and "Not shown: 1 run" in told(result)
 
 
-def test_axes_stand_in_their_groups(tmp_path):
-    broke(tmp_path, "wires", "DIST", 0.5)
-    records = read_records(tmp_path)[0]
-    grid = atlas(choose(records, STABILITY, tmp_path))
-    (row,) = grid.rows
-    assert (grid.axes, row.name, grid.stress("wires", "group")) == (["wires"], "DIST", "viewing")
-
-
-def test_curves_have_a_row_a_level_with_its_interval(tmp_path):
+def test_curves_have_a_line_a_level_with_its_interval_and_a_panel_an_axis(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.45)
-    data = made(tmp_path, stability_curves.make).data
-    assert len(data) == 11
-    assert data["successes"].sum() == 5
+    broke(tmp_path, "gap", "DIST", 0.45)
+    page = made(tmp_path, "stability_curves")
+    data = page.data[page.data["axis"] == "wires"]
+    assert len(data) == 11 and data["successes"].sum() == 5 and data["level"].iloc[-1] == 1.0
     assert (data["low"] <= data["share"]).all() and (data["share"] <= data["high"]).all()
-    assert data["level"].iloc[-1] == 1.0
+    assert [panel["axis"] for panel in page.chart["panels"]] == ["wires", "gap"]
+    assert page.chart["panels"][0]["series"][0]["y"] == [100] * 5 + [0] * 6
 
 
 def test_all_three_are_written(tmp_path):
@@ -205,13 +184,4 @@ def test_all_three_are_written(tmp_path):
     (folder / "curve.jsonl").write_text("not a line\n")
     written = write_paper(read_records(tmp_path)[0], tmp_path)
     assert [path.stem for path in written] == ["stability", "stability_cost", "stability_curves"]
-    for path in written:
-        assert path.with_suffix(".png").stat().st_size > 1000
-
-
-def test_a_row_that_breaks_nowhere_is_told_without_a_worst_axis(tmp_path):
-    broke(tmp_path, "wires", "DIST", 1.1)
-    broke(tmp_path, "wires", "DVR", -0.1)
-    notes = " ".join(made(tmp_path, stability.make).notes)
-    assert "DIST: breaks on none of 1 axes. Failed trials:" in notes
-    assert "DVR: worst on wires at once (5 of 5 failed, 48-100 %" in notes
+    assert all(path.with_suffix(".png").stat().st_size > 1000 for path in written[:2])

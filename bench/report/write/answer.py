@@ -4,7 +4,6 @@ import math
 import re
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlencode
 
 import pandas as pd
 
@@ -95,11 +94,6 @@ def presets_of(data: pd.DataFrame, names: str = "row") -> dict[str, str]:
         known = data[data[column].notna()]
         found |= dict(zip(known[names].astype(str), known[column].astype(str), strict=True))
     return found
-
-
-def runs_of(row: str) -> str:
-    """The address of the runs of a row in the page's list."""
-    return "#/runs?" + urlencode({"task": "all", "view": "runs", "q": row})
 
 
 def _short(value: float, scale: float) -> str:

@@ -7,18 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
-from matplotlib.transforms import Bbox
 
 from bench.pictures import style
 from bench.report.data.statistics import Interval
-
-# Where a name may stand, from its point, in points of type: the first of those where it hides the least.
-OFFSETS = ((0, 9), (0, -9), (6, 0), (-6, 0), (3, 9), (-3, 9), (3, -9), (-3, -9), (0, 18), (0, -18), (0, 27))
-OFFSETS += ((12, 18), (-12, 18), (12, -18), (-12, -18), (20, 27), (-20, 27), (20, -27), (-20, -27))
-OFFSETS += ((20, 36), (-20, 36), (20, -36), (-20, -36), (20, 45), (-20, 45), (20, -45), (-20, -45), (30, 63), (30, -63))
-FAR = 16  # from a name that is further off, in points of type, a line leads to its point
-LETTER, LINE = 0.6, 1.14  # approximate width of a letter, and height of a line, in sizes of the type
 
 
 def sheet(
@@ -99,37 +90,6 @@ def reference(draw: Callable[..., Any], value: float, times: float, label: str) 
     draw(times * value, color="#777777", lw=0.9, ls=":", label=f"{times:g} times that")
 
 
-def name_points(axes: Axes, named: list[tuple[str, float, float]], *, size: float = 7) -> None:
-    """Writes a name next to each point, on the first side where it covers the fewest points and names.
-
-    A side that is not wholly within the axes counts as if it covered all of them.
-
-    Args:
-        axes: axes with their final limits.
-        named: name and position of each point; an empty name is not written.
-        size: of the letters.
-    """
-    figure = axes.figure
-    figure.draw_without_rendering()  # places the axes
-    scale = 72 / figure.dpi  # points per pixel
-    points = axes.transData.transform([(x, y) for _, x, y in named] or np.empty((0, 2))) * scale
-    inside = Bbox(axes.get_window_extent().get_points() * scale)
-    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in points]
-    for (name, *where), at, this in zip(named, points, list(taken), strict=True):
-        if not name:
-            continue
-        boxes = [_box(at, offset, len(name), size) for offset in OFFSETS]
-        others = [box for box in taken if box is not this]
-        hidden = [sum(map(box.overlaps, others)) + len(others) * (not _within(box, inside)) for box in boxes]
-        place = hidden.index(min(hidden))
-        dx, dy = OFFSETS[place]
-        how = {"ha": _align(dx), "va": "center", "fontsize": size, "textcoords": "offset points"}
-        if math.hypot(dx, dy) > FAR:
-            how["arrowprops"] = {"arrowstyle": "-", "color": "#999999", "lw": 0.5, "shrinkA": 0, "shrinkB": 3}
-        axes.annotate(name, where, (dx, dy), path_effects=[withStroke(linewidth=2, foreground="white")], **how)
-        taken.append(boxes[place])
-
-
 def panel_data(title: str, x: str, y: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     """A panel of the page's chart; an axis is logarithmic where its values are positive and span a factor above 3."""
     axes = {}
@@ -149,19 +109,3 @@ def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any
 
 def _rounded(values: Any) -> list[float]:
     return [float(f"{value:.5g}") for value in np.asarray(values, float)]
-
-
-def _within(box: Bbox, outer: Bbox) -> bool:
-    return bool(outer.x0 <= box.x0 and box.x1 <= outer.x1 and outer.y0 <= box.y0 and box.y1 <= outer.y1)
-
-
-def _align(dx: float) -> str:
-    return "center" if dx == 0 else "left" if dx > 0 else "right"
-
-
-def _box(at: np.ndarray, offset: tuple[int, int], letters: int, size: float) -> Bbox:
-    """The approximate box of a name of so many letters of a size, in points."""
-    dx, dy = offset
-    width, height = LETTER * size * letters, LINE * size
-    left = at[0] + dx - {"left": 0.0, "center": width / 2, "right": width}[_align(dx)]
-    return Bbox.from_bounds(left, at[1] + dy - height / 2, width, height)

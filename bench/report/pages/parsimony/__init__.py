@@ -1,1 +1,0 @@
-"""Pages of how much model a scene needs."""

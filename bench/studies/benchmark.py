@@ -1,0 +1,129 @@
+"""Renderers that were timed in turn in one process: their costs over those of the first one, and their errors."""
+
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+
+from bench.records import format
+from bench.report.data.records import Record, measured, setting
+from bench.report.data.runs import Runs, Selection
+from bench.report.write.result import Result
+from bench.report.write.table import Column, shown, text, to_data, to_table, together, whole
+
+PLACE = 15
+BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.ablation
+READS = (
+    Selection(
+        "benchmark",
+        ("task.size", "task.threads"),
+        setup=("scenes", "network", "machine"),
+        alike=("dataset", "view", "prior", "task"),
+    ),
+)
+COSTS = {
+    "forward": "Forward ratio",
+    "forward_cpu": "Forward ratio, CPU",
+    "step": "Step ratio",
+    "step_cpu": "Step ratio, CPU",
+}
+NOTES = (
+    "Values are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
+    "decide nothing.",
+    "Work over bound: the operations of a step over those of one value and one gradient per hit.",
+    "Memory: the largest growth of the memory of the process (CPU) or of PyTorch (GPU) in a step.",
+    "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
+    "hit.",
+)
+
+
+def make(runs: Runs) -> Result:
+    """A line per image size, number of threads and renderer."""
+    # The task sets its own number of threads: a column has it, and no caption.
+    records = [record | {"environment": record["environment"] | {"threads": None}} for record in runs.records]
+    lines = [line for record in sorted(records, key=_place) for line in _lines(record)]
+    rounds = sorted({line["rounds"] for line in lines if line["rounds"]})
+    return Result(
+        replace(runs, records=records),
+        "Renderers timed in turn, in one process.",
+        "Seconds of one rendering and of one step of an optimisation, and their ratios to those of the first renderer "
+        f"of the same round: medians of {' or '.join(map(str, rounds))} rounds, in brackets the least and the largest.",
+        question="Which renderer is fastest, timed in turn in one process?",
+        verdict=_verdict(pd.DataFrame(lines)),
+        remarks=NOTES,
+        data=to_data(COLUMNS, lines),
+        table=to_table(COLUMNS, lines),
+    )
+
+
+def _verdict(data: pd.DataFrame) -> str:
+    """The least ratio of a step at the largest size that ended ok; empty where there is none."""
+    if "step_ratio" not in data:
+        return ""
+    known = data[(data["status"] == "ok") & data["step_ratio"].notna()]
+    large = known[known["size"] == known["size"].max()]
+    others = large[~large["first"]]
+    if not len(others):
+        return ""
+    best = others.loc[others["step_ratio"].idxmin()]
+    ends = format.interval(best["step_ratio_low"], best["step_ratio_high"])
+    return (
+        f"At {best['size']} × {best['size']} pixels a step of {best['renderer']} takes "
+        f"*{format.number(best['step_ratio'])}* {ends} of the time of {large['renderer'].iloc[0]}; n = "
+        f"{best['rounds']:.0f} rounds on one shape."
+    )
+
+
+def _place(record: Record) -> tuple[int, int]:
+    """The size of the image and the number of threads."""
+    return setting(record["config"], "task", "size"), setting(record["config"], "task", "threads")
+
+
+def _lines(record: Record) -> list[dict[str, Any]]:
+    """A line per renderer of a run."""
+    names = dict.fromkeys(name.split(".")[0] for name in record["metrics"] if "." in name)
+    return [_line(record, name) for name in names or [BASE]]
+
+
+def _line(record: Record, name: str) -> dict[str, Any]:
+    keys = [key.removeprefix(f"{name}.") for key in record["metrics"] if key.startswith(f"{name}.")]
+    size, threads = _place(record)
+    return {
+        **{"size": size, "threads": threads, "rounds": record["metrics"].get("rounds")},
+        **{"renderer": record["renderer"] if name == BASE else name, "first": name == BASE},
+        **{key: record[key] for key in ("status", "reason", "folder")},
+        **{key: measured(record, f"{name}.{key}") for key in keys},
+    }
+
+
+def _ratio(cost: str) -> Column:
+    """The median of a ratio, and between which ends it lay."""
+
+    def words(line: dict[str, Any]) -> str:
+        middle, low, high = (line.get(f"{cost}_ratio{end}") for end in ("", "_low", "_high"))
+        if middle is None:
+            return format.MISSING
+        return "1" if line["first"] else f"{middle:.2f} ({low:.2f}–{high:.2f})"
+
+    return Column(f"{cost}_ratio", COSTS[cost], words=words)
+
+
+COLUMNS = (
+    *(Column("size", "Size", show=whole), Column("threads", "Threads", show=whole), text("renderer", "Renderer")),
+    *(*map(text, ("status", "reason", "folder")), Column("rounds")),
+    Column("queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))),
+    Column("coarse_queries"),
+    Column("forward_seconds", "Forward", show=format.seconds),
+    Column("step_seconds", "Step", show=format.seconds),
+    *map(Column, ("forward_cpu", "step_cpu")),
+    *map(_ratio, COSTS),
+    *(Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
+    Column("peak_memory_bytes", "Memory of a step", show=format.size),
+    Column("work_over_bound", "Work over bound"),
+    *map(Column, ("rays", "hits", "lost", "false", "wrong")),
+    shown("Missed / spurious / wrong depth", together(dict.get, whole, "lost", "false", "wrong")),
+    *map(Column, ("depth_error_median", "depth_error_p99", "depth_error_max")),
+    shown("Depth error median / p99", together(dict.get, format.number, "depth_error_median", "depth_error_p99")),
+)
+
+PAGES = {"benchmark": make}

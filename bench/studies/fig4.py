@@ -1,0 +1,45 @@
+"""Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
+
+from bench.report import gallery
+from bench.report.data.runs import Runs, Selection
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, metric, through, to_data
+
+PLACE = 210
+READS = (Selection("fig4", alike=("dataset", "view", "prior", "task")),)
+NOTES = (
+    "Pictures are cropped to the part with hits.",
+    "A row that did not finish at the requested size is shown at the largest size at which it did.",
+)
+MOST_COLUMNS = 5
+COLUMNS = (  # of a record and the counts of its picture
+    *through(lambda line: line[0], *IDENTITY),
+    *through(lambda line: line[1], *map(Column, gallery.COUNTED)),
+    *through(lambda line: line[0], metric("depth_error_median")),
+)
+
+
+def make(runs: Runs) -> Result:
+    """The reference and a column per row; rows without pictures keep their place."""
+    chosen = runs.of_newest_scene()
+    found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
+    data = to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
+    wrong = (data["lost"] + data["false"]).dropna().astype(float)
+    least, most = (data.loc[wrong.idxmin()], data.loc[wrong.idxmax()]) if len(wrong) else ({}, {})
+    return Result(
+        chosen,
+        "Errors of each strategy in the image.",
+        "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
+        "normals.",
+        question="Which pixels does each strategy get wrong?",
+        verdict=f"Missed and spurious pixels: *{wrong.min():.0f}* ({least['row']}) to {wrong.max():.0f} "
+        f"({most['row']}) of {most['hits']:,.0f}; n = one shape."
+        if len(wrong)
+        else "",
+        remarks=(*found.missing, *NOTES),
+        data=data,
+        figure=gallery.draw(found.blocks, largest=found.largest),
+    )
+
+
+PAGES = {"fig4": make}

@@ -1,0 +1,240 @@
+"""Errors of gradients against central differences: at hits by the angle of the ray, and at the outline by the blur."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.report.data.records import Record, measured
+from bench.report.data.runs import Runs, Selection
+from bench.report.write import chart
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, text, to_data, to_table, whole
+
+PLACE = 200
+READS = (Selection("gradients", alike=("dataset", "view", "prior", "task")),)
+ANGLES = {"frontal": "#9ecae1", "oblique": "#4292c6", "grazing": "#08306b"}  # bands of hits, and their colours
+OUTLINE = "silhouette"
+BANDS = (*ANGLES, OUTLINE, "colour")
+ERRORS = ("pooled_cosine", "pooled_scale", "cosine", "scale", "median_error", "p99_error")
+COUNTS = ("pixels", "excluded")
+OF_IMAGE = ("image_cosine", "image_scale")
+NUMBERS = (*COUNTS, *(f"{of}_{error}" for of in ("code", "camera", "texture") for error in ERRORS), *OF_IMAGE)
+VISIBLE = {  # numbers of the image at the outline, and their headings
+    **dict(zip(OF_IMAGE, ("Cosine", "Scale"), strict=True)),
+    **{"image_error": "Error", "image_spread": "Noise of a ray", "values_per_ray": "Values per ray"},
+}
+NOTES = (
+    "A pooled number compares the gradients of all pixels of a band as one long vector: a factor that differs between "
+    "pixels lowers the pooled cosine, and not a pixel's own.",
+    "An error is the length of the difference over that of the true gradient; hits are frontal, oblique or grazing by "
+    "the angle of ray and normal, and the silhouette is one image.",
+    "Excluded are pixels where visibility changes, the root is not found again, or the renderer hits nothing or "
+    "another surface.",
+    "Colour is the gradient of a smooth paint of point and normal towards shape (code), camera and paint (texture).",
+)
+VISIBLE_NOTES = (
+    "A pixel at the outline is the mean over many rays of the distance that each sees, with the far side of the unit "
+    "sphere behind, and the truth are central differences of that image, in which visibility changes.",
+    "Error is the length of the difference over that of the true gradient, so that zeros have 1; noise is the error of "
+    "one ray per pixel, and falls with the square root of their number.",
+    "Blur is the length over which a renderer spreads the gradient of visibility (NeuS 1/s, VolSDF beta, the width of "
+    "UNISURF's occupancy, the band of the relaxed boundary); a pixel at the outline is about 0.01 scene units wide.",
+    "A blur of a pixel or more moves the gradient to the pixels beside, which lowers a pixel's cosine and scale, and "
+    "not the sum over the image.",
+    "Of a disc, at the defaults, the truth has an error of 0.07 of its length and a cosine of 0.997, since few of a "
+    "pixel's rays change sides.",
+)
+
+
+def make(runs: Runs) -> Result:
+    """A line per renderer and band, failed runs too."""
+    told = _by_band(runs)
+    unseen = int((told.loc[told["band"].isin(ANGLES), ["code_median_error", "camera_median_error"]] == 0).sum().sum())
+    return Result(
+        runs,
+        "Errors of the gradients.",
+        "Cosine and scale of a renderer's gradient against the true one, pooled over the pixels of a band and per "
+        "pixel (1 where it is exact), and the relative error; in the figure the median error and, at the silhouette, "
+        "cosine and scale.",
+        question="Are the gradients true?",
+        verdict=_verdict(told),
+        remarks=(
+            *NOTES,
+            f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else "",
+        ),
+        data=told.drop(columns="name"),
+        table=to_table(COLUMNS, _lines(told)),
+        figure=draw(told),
+    )
+
+
+def make_visibility(runs: Runs) -> Result:
+    """A line per renderer and blur, failed runs too."""
+    told = _by_blur(runs)
+    return Result(
+        runs,
+        "Gradients of what comes into view.",
+        "At the outline, the gradient of the image of distances towards the code against the true one: cosine and "
+        "scale are 1 and the error is 0 where it is exact.",
+        question="Does what comes into view have a gradient?",
+        verdict=_verdict_visible(told),
+        remarks=VISIBLE_NOTES,
+        data=told.drop(columns=["name", "preset"]),
+        table=to_table(COLUMNS_VISIBLE, _lines(told)),
+        figure=draw_visibility(told),
+    )
+
+
+def _identity(runs: Runs) -> pd.DataFrame:
+    """A line per run, with its readable name, where it did not end ok with its status."""
+    data = to_data(IDENTITY, runs.records)
+    return data.assign(name=[record["name"] for record in runs.named()])
+
+
+def _by_band(runs: Runs) -> pd.DataFrame:
+    """A line per run and band."""
+    identity = _identity(runs)
+    bands = [{"band": band} | {name: runs.number(f"{band}.{name}") for name in NUMBERS} for band in BANDS]
+    return pd.concat([identity.assign(**band) for band in bands]).sort_index(kind="stable", ignore_index=True)
+
+
+def _by_blur(runs: Runs) -> pd.DataFrame:
+    """A line per run and blur of which it has numbers, the least first; nan where a renderer has no blur."""
+    lines = [(place, blur) for place, record in enumerate(runs.records) for blur in _blurs(record)]
+    bands = [(runs.records[place], f"{OUTLINE}_{blur}" if blur else OUTLINE) for place, blur in lines]
+    identity = _identity(runs).assign(preset=list(runs.frame.preset)).iloc[[place for place, _ in lines]]
+    numbers = {name: [measured(record, f"{band}.{name}") for record, band in bands] for name in VISIBLE}
+    blurs = [float(blur) if blur else math.nan for _, blur in lines]
+    return identity.assign(blur=blurs, **numbers).astype(dict.fromkeys(VISIBLE, float)).reset_index(drop=True)
+
+
+def _blurs(record: Record) -> Iterator[str]:
+    keys = {key.partition(".")[0] for key in record["metrics"] if key.startswith(f"{OUTLINE}_")}
+    yield from sorted((key.removeprefix(f"{OUTLINE}_") for key in keys), key=float) or [""]
+
+
+def _lines(data: pd.DataFrame) -> list[dict]:
+    """The lines of a table, None where a number is missing."""
+    return data.astype(object).where(data.notna(), None).to_dict("records")
+
+
+def _verdict(data: pd.DataFrame) -> str:
+    """How many renderers have a pooled cosine of 0.99 in every band of hits."""
+    hits = data[data["band"].isin(ANGLES)]
+    cosine = hits["code_pooled_cosine"].where(hits["status"] == "ok").fillna(-1.0)
+    least = cosine.groupby(hits["name"], sort=False).min()
+    worst = least.idxmin()
+    rest = f"the least is {least[worst]:.2f}, of {worst}" if least[worst] >= 0 else f"{worst} has none"
+    return (
+        f"*{int((least >= 0.99).sum())} of {len(least)}* renderers have a pooled cosine of at least 0.99 with the true "
+        f"gradient in every band of hits; {rest} (n = one shape)."
+    )
+
+
+def _verdict_visible(data: pd.DataFrame) -> str:
+    """The best cosine at the outline, and the best of the renderers that differentiate hits alone."""
+    known = data[(data["status"] == "ok") & data["image_cosine"].notna()]
+    blurred, sharp = known[known["blur"].notna()], known[known["blur"].isna()]
+    said = []
+    if len(blurred):
+        best = blurred.loc[blurred["image_cosine"].idxmax()]
+        said.append(
+            f"{best['name']} has a cosine of *{best['image_cosine']:.2f}* and a scale of {best['image_scale']:.2f} at "
+            f"a blur of {best['blur']:g} scene units"
+        )
+    if len(sharp):
+        most = sharp[[*OF_IMAGE]].max()
+        said.append(f"renderers that differentiate hits alone have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+    return f"{'; '.join(said)} (n = one shape)." if said else ""
+
+
+@style.styled
+def draw(data: pd.DataFrame) -> Figure:
+    """Draws a line per renderer: the median errors of each band for code and camera, and the silhouette's numbers."""
+    names = list(dict.fromkeys(data["name"]))
+    figure, (axes,) = chart.sheet(0.2 * len(names) + 1.3, 1, 3, sharey=True)
+    places = data["name"].map(names.index)
+    for axis, of in zip(axes[:2], ("code", "camera"), strict=True):
+        for band, colour in ANGLES.items():
+            some = data["band"] == band
+            axis.plot(style.finite(data[f"{of}_median_error"][some]), places[some], "o", color=colour, label=band)
+        style.log_axis(axis, "x", data[f"{of}_median_error"][data["band"].isin(ANGLES)])
+        axis.set(title=f"gradient for the {of}", xlabel="median relative error (ratio)")
+    outline = data["band"] == OUTLINE
+    for name, marker in zip(OF_IMAGE, "DP", strict=True):
+        label = name.replace("image_", "")
+        axes[2].plot(
+            style.finite(data[name][outline]), places[outline], marker, color="#444444", label=label, ls="none"
+        )
+    axes[2].axvline(1.0, color="#555555", lw=0.8, ls=":")
+    axes[2].set(title=OUTLINE, xlabel="cosine and scale (exact: 1)", ylim=(len(names) - 0.5, -0.5))
+    status = dict(zip(data["name"], data["status"], strict=True))
+    axes[0].set_yticks(range(len(names)), [n if status[n] == "ok" else f"{n} ({status[n]})" for n in names])
+    style.legend_of(figure, style.labelled(axes[0], axes[2]), columns=5)
+    return figure
+
+
+@style.styled
+def draw_visibility(data: pd.DataFrame) -> Figure:
+    """Draws the error and the noise over the blur, and the error over the cost; a line per renderer."""
+    figure, (axes,) = chart.sheet(2.8, 1, 3)
+    by_blur, noise, by_cost = axes
+    for name, rows in data.groupby("name", sort=False):
+        preset, status = rows[["preset", "status"]].iloc[0]
+        look = style.look(preset)
+        chart.line(by_cost, preset, *_known(rows, "values_per_ray", "image_error"), label=_titled(str(name), status))
+        for axis, metric in ((by_blur, "image_error"), (noise, "image_spread")):
+            chart.line(axis, preset, *_known(rows, "blur", metric))
+            for value in rows.loc[rows["blur"].isna(), metric].dropna():
+                axis.axhline(value, color=look.colour, ls=look.line, lw=0.8)
+    _dress(by_blur, "blur (scene units)", "relative error of the gradient")
+    _dress(noise, "blur (scene units)", "noise of one ray (relative)")
+    _dress(by_cost, "field values per ray", "relative error of the gradient")
+    style.legend_below(figure, by_cost, columns=4)
+    return figure
+
+
+def _titled(name: str, status: str) -> str:
+    return name if status == "ok" else f"{name} ({status})"
+
+
+def _dress(axis: Axes, across: str, up: str) -> None:
+    axis.set(xlabel=across, ylabel=up)
+    if not any(np.size(line.get_xdata()) for line in axis.lines if line.get_marker() != "None"):
+        chart.say(axis, "no numbers", va="baseline", color="#777777")
+        return
+    style.log_axis(axis, "x", [x for line in axis.lines if line.get_marker() != "None" for x in line.get_xdata()])
+    style.log_axis(axis, "y", [y for line in axis.lines for y in line.get_ydata()])
+
+
+def _known(rows: pd.DataFrame, *names: str) -> list[list[float]]:
+    """The values of two columns, where both are finite and above 0, so that logarithmic axes can show them."""
+    some = rows[[*names]]
+    some = some[((some > 0) & np.isfinite(some)).all(axis=1)]
+    return [some[name].tolist() for name in names]
+
+
+def _cosine(value: float | None) -> str:
+    """A cosine with five decimals, to show small differences from 1."""
+    return format.number(value) if value is None else f"{value:.5f}"
+
+
+def _column(name: str) -> Column:
+    show = whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
+    return Column(name, name.replace("_", " ").capitalize(), show=show)
+
+
+COLUMNS = (text("name", "Renderer"), text("band", "Band"), *map(_column, NUMBERS), text("status", "Status"))
+COLUMNS_VISIBLE = (
+    *(text("name", "Renderer"), Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}")),
+    *(Column(name, heading) for name, heading in VISIBLE.items()),
+    text("status", "Status"),
+)
+
+PAGES = {"gradients": make, "gradients_visibility": make_visibility}

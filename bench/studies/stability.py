@@ -1,0 +1,344 @@
+"""The breakdown of each renderer on each axis of the stress test: as an atlas, over cost, and as curves."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.pictures import style
+from bench.records import format
+from bench.records.read import curve_lines
+from bench.report.data.records import Record, Row, measured, median_of_known, row_of, setting
+from bench.report.data.runs import Runs, Selection
+from bench.report.data.statistics import clopper_pearson, rank
+from bench.report.write import chart
+from bench.report.write.chart import panel_data, series
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, Column, defined, text, to_data, to_table
+
+PLACE = 120
+READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
+FAILED = "failed_"  # beginning of the metrics that count failed trials by kind
+ENDS = ("mild", "severe")  # of a sweep
+COST_AXES = ("field values per ray at the mild end, median over axes", "mean rank over axes (1 is best)")
+NOTES = (
+    "The adaptive search makes {share:.0f} % of a full grid's trials, and every renderer gets the same trials at a "
+    "severity; renderings have {resolution}×{resolution} pixels.",
+    "“At once”: breaks at the mildest severity; “none”: does not break at the severest; both with the failed trials "
+    "there and the interval of their share (Clopper and Pearson); – is a renderer without that setting.",
+    "“Rises”: more trials succeed at the severest than at the mildest severity, so that none is a breakdown; “one "
+    "trial”: repeats could not differ, and the breakdown lies between two neighbouring severities.",
+    "Where a disturbance moves the surface, renderers are judged by the moved surface; the CSV has how far, and the "
+    "kinds of failed trials.",
+    "Success: {hits:g} of the true hits within the pixel's footprint and false hits of at most {false_hits:g} of them; "
+    "a gradient whose cosine is at least {cosine:g} and whose relative length is within {scale:g} of 1; a fit within "
+    "{surface_error:g} scene units of the surface.",
+)
+COST_NOTES = (
+    "Axes are those that evaluate renderings and that every renderer supports; rank 1 is the best, and equal "
+    "breakdowns share their mean rank.",
+    "A run that did not end ok, or is missing, has the worst rank.",
+    "At once: axes on which it breaks at the mildest severity; none: on which it does not break at the severest.",
+)
+CURVE_NOTES = (
+    "The CSV has the number of trials and successes at each severity, and the interval of their share (Clopper and "
+    "Pearson), where repeats could differ.",
+    "A cell of the page's atlas opens the curves of its axis.",
+)
+CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
+SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
+COSTS = (
+    *(text("row", "Renderer"), Column("axes"), Column("rank", "Mean rank", show=defined)),
+    *(text("at_once", "At once"), text("never", "None"), Column("cost", "Field values per ray"), text("preset")),
+)
+
+
+def make(runs: Runs) -> Result:
+    """A line per axis and a column per renderer."""
+    runs = runs.of_newest_scene()
+    cells = cells_of(runs)
+    axes, rows = axes_of(cells), list(cells["row"].unique())
+    task, trials = runs.requested().get("task"), cells["trials"].sum()
+    about = {name: float(setting(task, "criteria", name) or math.nan) for name in CRITERIA}
+    about |= {"resolution": setting(task, "resolution"), "share": 100 * trials / max(cells["grid_trials"].sum(), 1)}
+    table = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
+    table.insert(0, "Axis", [title(axis) for axis in axes.index])
+    table.insert(1, "Unit", list(axes["unit"]))
+    return Result(
+        runs,
+        "The severity at which each renderer breaks.",
+        "The severity at which half of the trials succeed.",
+        question="Where does each renderer break?",
+        verdict=_verdict(cells),
+        n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
+        interval="95 % credible intervals, the milder end first",
+        remarks=[note.format(**about) for note in NOTES],
+        data=_data(runs, cells, axes),
+        table=table,
+        figure=draw(cells, axes),
+        atlas=_atlas(cells, axes),
+    )
+
+
+def make_cost(runs: Runs) -> Result:
+    """A line and a point per renderer: its mean rank over the axes, and its field values per ray."""
+    runs = runs.of_newest_scene()
+    cells = cells_of(runs)
+    rendered = cells[cells["measure"] == "rendering"]
+    lacking = set(rendered.loc[rendered["status"] == "unsupported", "axis"])
+    shared = rendered[~rendered["axis"].isin(lacking)]
+    # A run that did not end ok, or is missing, has no shade, so it ranks last.
+    shades = shared.pivot(index="axis", columns="row", values="shade").reindex(columns=cells["row"].unique())
+    ranks = rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
+    lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
+    lines["preset"] = list(cells.drop_duplicates("row")["preset"])
+    return Result(
+        runs,
+        "Robustness over cost.",
+        "Mean rank of the breakdowns over the median, over axes, of the field values per ray at the mild end.",
+        question="Is a robust renderer an expensive one?",
+        verdict=_verdict_cost(lines, len(shades)),
+        n=f"{len(shades)} axes and {len(lines)} renderers",
+        remarks=COST_NOTES,
+        data=lines[[column.key for column in COSTS]],
+        table=to_table(COSTS, lines.to_dict("records")),
+        figure=draw_cost(lines),
+        chart=_chart_cost(lines),
+    )
+
+
+def make_curves(runs: Runs) -> Result:
+    """The shares of successes at each severity, a panel of the page's atlas per axis."""
+    runs = runs.of_newest_scene()
+    cells = cells_of(runs)
+    shares = [_shares(runs, record, cell) for record, cell in zip(runs.records, cells.to_dict("records"), strict=True)]
+    data = pd.concat(shares, ignore_index=True)
+    panels = []
+    for axis, found in data.groupby("axis", sort=False):
+        lines = []
+        for (row, preset), own in found.groupby(["row", "preset"], sort=False):
+            told = [
+                f"{s.successes:.0f} of {s.trials:.0f} succeed at {format.number(s.severity)}" for s in own.itertuples()
+            ]
+            lines.append(series(row, preset, own["severity"], 100 * own["share"], dash="-", size=5, text=told))
+        panels.append(panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
+    return Result(
+        runs,
+        "Probability of success over severity.",
+        "In the CSV and on the page, the share of successful trials at each severity.",
+        n=f"{cells['axis'].nunique()} axes and {cells['row'].nunique()} renderers",
+        interval="95 % intervals (Clopper and Pearson)",
+        remarks=CURVE_NOTES,
+        data=data,
+        chart={"panels": panels},
+    )
+
+
+def title(axis: str) -> str:
+    """An axis's name, in words."""
+    return axis.replace("_", " ")
+
+
+def cells_of(runs: Runs) -> pd.DataFrame:
+    """A line per run: its axis and row, whether its search finished, its breakdown as a number, shade and words."""
+    return pd.DataFrame([_cell(record, row_of(record)) for record in runs.records])
+
+
+def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
+    """The axes as index, with the group, the measure and the unit of each; groups in the order of their runs."""
+    axes = cells.drop_duplicates("axis").set_index("axis")
+    groups = list(axes["group"].unique())
+    return axes.iloc[np.argsort([groups.index(group) for group in axes["group"]], kind="stable")]
+
+
+def _cell(record: Record, row: Row) -> dict[str, Any]:
+    """A level is 0 at the mild end of the sweep and 1 at the severe one; the shade is the level clipped to these."""
+    stress = setting(record["config"], "task", "stress")
+    level = measured(record, "level")
+    known = record["status"] == "ok" and level is not None and isinstance(setting(stress, "sweep"), dict)
+    cell = {"axis": record["dataset"], "row": row.name, "preset": row.preset, "known": known, "level": level}
+    cell |= {key: record[key] for key in ("status", "reason", "folder")}
+    cell |= {key: str(setting(stress, key)) for key in ("group", "measure")}
+    cell |= {"unit": str(setting(stress, "sweep", "unit")), "one_trial": setting(stress, "repeats") == 1}
+    cell |= {key: measured(record, key) or 0 for key in ("trials", "grid_trials")}
+    cell |= {"cost": measured(record, "evaluations_per_ray")}
+    cell |= {"at_once": known and level < 0, "never": known and level > 1}
+    cell |= {"shade": min(max(level, 0.0), 1.0) if known else math.nan}
+    breakdown = [measured(record, f"breakdown{end}") for end in ("", "_low", "_high")]
+    ends = {end: [int(measured(record, f"{end}_{n}") or 0) for n in ("successes", "trials")] for end in ENDS}
+    words = {name: _full(cell, breakdown, ends, unit) for name, unit in (("words", ""), ("full", f" {cell['unit']}"))}
+    return cell | {"short": _short(cell, breakdown[0], ends)} | words
+
+
+def _short(cell: dict[str, Any], breakdown: float | None, ends: dict[str, list[int]]) -> str:
+    """The breakdown in a few characters."""
+    if not cell["known"]:
+        return format.MISSING if cell["status"] == "unsupported" else cell["status"]
+    mild, severe = (successes / trials if trials else 0.0 for successes, trials in ends.values())
+    if severe > mild:
+        return "rises"
+    return "at once" if cell["at_once"] else "none" if cell["never"] else format.number(breakdown)
+
+
+def _full(cell: dict[str, Any], breakdown: list[float | None], ends: dict[str, list[int]], unit: str) -> str:
+    """The breakdown in its unit with its interval, or the failures at an end of the sweep."""
+    short, (_, low, high) = _short(cell, breakdown[0], ends), breakdown
+    mild, severe = (_failures(*ends[end], one_trial=cell["one_trial"]) for end in ENDS)
+    if not cell["known"]:
+        return short
+    if short == "rises":
+        return f"success rises with severity (mild: {mild}; severe: {severe})"
+    if cell["at_once"]:
+        return f"at once ({mild}{'' if high is None else f', up to {format.number(high)}{unit}'})"
+    if cell["never"]:
+        return f"none ({severe}{'' if low is None else f', from {format.number(low)}{unit}'})"
+    if cell["one_trial"]:
+        return f"{short}{unit} (one trial)"
+    return f"{short}{unit} ({' to '.join('beyond' if end is None else format.number(end) for end in (low, high))})"
+
+
+def _failures(successes: int, trials: int, *, one_trial: bool) -> str:
+    """The number of failed trials; where there are repeats, the interval of their share."""
+    if not trials:
+        return "not tried"
+    rate = clopper_pearson(1 - successes / trials, trials)
+    share = "" if one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
+    return f"{trials - successes} of {trials} failed{share}"
+
+
+def _grid(cells: pd.DataFrame, axes: pd.DataFrame, values: str) -> pd.DataFrame:
+    """A column of the cells as a table of axes and rows, missing where a row was not run."""
+    return cells.pivot(index="axis", columns="row", values=values).reindex(axes.index, columns=cells["row"].unique())
+
+
+def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
+    """A line per axis and renderer with all metrics, axis by axis."""
+    names = dict.fromkeys(name for record in runs.records for name in record["metrics"])
+    metrics = {name: [record["metrics"].get(name) for record in runs.records] for name in names if FAILED not in name}
+    kinds = [
+        "; ".join(
+            f"{n:.0f} {name.removeprefix(FAILED).replace('_', ' ')}"
+            for name, n in record["metrics"].items()
+            if name.startswith(FAILED)
+        )
+        for record in runs.records
+    ]
+    about, rows = cells[["axis", "group", "unit", "short", "full"]], list(cells["row"].unique())
+    data = pd.concat([about, to_data(IDENTITY, runs.records)], axis=1).assign(**metrics, failures=kinds)
+    order = np.lexsort((cells["row"].map(rows.index), cells["axis"].map(axes.index.get_loc)))
+    return data.iloc[order].reset_index(drop=True)
+
+
+def _verdict(cells: pd.DataFrame) -> str:
+    """On how many axes the renderers break that break most and least often."""
+    counts = cells.groupby("row", sort=False)[["never", "known"]].sum()
+    best, least = ((counts.index[i], *counts.iloc[i]) for i in (counts.never.argmax(), counts.never.argmin()))
+    return (
+        f"{best[0]} does not break on *{best[1]} of {best[2]}* axes, {least[0]} on {least[1]} of {least[2]} "
+        f"(n = {cells['trials'].sum():.0f} trials)."
+    )
+
+
+def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
+    """The grid for the page: axes, rows, and of each cell its breakdown as text, its shade and its run."""
+    rows = list(cells["row"].unique())
+    told = cells[["short", "full", "status", "reason", "shade", "folder"]].astype({"shade": object})
+    told["shade"] = told["shade"].where(told["shade"].notna(), None)
+    found = dict(zip(zip(cells["axis"], cells["row"], strict=True), told.to_dict("records"), strict=True))
+    return {
+        "axes": [
+            {"axis": a.Index, "title": title(a.Index), "group": a.group, "unit": a.unit} for a in axes.itertuples()
+        ],
+        "rows": rows,
+        "cells": [[found.get((axis, row)) for row in rows] for axis in axes.index],
+    }
+
+
+@style.styled
+def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
+    """Draws the heat map: red where a renderer breaks at a mild severity, blue where it does not break."""
+    shades, words = (_grid(cells, axes, name) for name in ("shade", "short"))
+    rows, n = list(shades.columns), len(axes)
+    width = max(style.WIDTH, 0.39 * len(rows) + 2.2)  # inches: a number has room in its cell
+    figure, ((panel,),) = chart.sheet(0.19 * n + 1.7, width=width)
+    image = panel.imshow(np.ma.masked_invalid(shades.to_numpy(float)), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
+    panel.set_facecolor("#f2f2f2")
+    for line, place in np.argwhere(words.notna().to_numpy()):
+        told, shade = words.iloc[line, place], shades.iloc[line, place]
+        how = {"color": "white" if shade < 0.1 or shade > 0.9 else "black", "fontsize": 5.5 if len(told) < 8 else 4.5}
+        panel.text(place, line, told, ha="center", va="center", **how)
+    panel.set_xticks(range(len(rows)), rows, rotation=35, ha="left", rotation_mode="anchor")
+    panel.xaxis.tick_top()
+    panel.set_yticks(range(n), [f"{title(axis.Index)} ({axis.unit})" for axis in axes.itertuples()])
+    panel.tick_params(length=0, labelsize=6)
+    panel.grid(False)
+    for line in np.flatnonzero(axes["group"].to_numpy()[1:] != axes["group"].to_numpy()[:-1]):
+        panel.axhline(line + 0.5, color="#222222", lw=0.8)
+    bar = figure.colorbar(image, ax=panel, location="bottom", shrink=0.5, aspect=40, pad=0.02)
+    bar.set_ticks([0, 1], labels=["breaks at the mildest", "not at the severest"])
+    return figure
+
+
+def _cost(cells: pd.DataFrame, row: str, mean: float) -> dict[str, Any]:
+    """The line of a renderer on the shared axes; where it breaks at once it may be cheap but find nothing."""
+    cost = median_of_known(cells.loc[~cells["at_once"], "cost"].dropna())
+    ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
+    return {"row": row, "axes": len(cells), "rank": mean, **ends, "cost": math.nan if cost is None else cost}
+
+
+def _verdict_cost(lines: pd.DataFrame, axes: int) -> str:
+    """The most robust renderer and the cheapest; empty where no rank or no cost is known."""
+    known = lines.dropna(subset=["rank", "cost"])
+    if known.empty:
+        return ""
+    best, cheap = (known.loc[known[name].idxmin()] for name in ("rank", "cost"))
+    number = format.number
+    rest = f"{cheap['row']} is the cheapest: rank {number(cheap['rank'])} for {number(cheap['cost'])}"
+    return (
+        f"{best['row']} has the best mean rank, *{number(best['rank'])}* of {len(known)}, for {number(best['cost'])} "
+        f"field values per ray; {'no renderer is cheaper' if best['row'] == cheap['row'] else rest} (n = {axes} axes)."
+    )
+
+
+@style.styled
+def draw_cost(lines: pd.DataFrame) -> Figure:
+    """Draws the mean rank over the field values per ray; later ones of equal points are smaller: none is hidden."""
+    figure, ((axes,),) = chart.sheet(max(3.2, 0.17 * len(lines)))
+    for line, before in zip(lines.itertuples(), lines.groupby(["cost", "rank"]).cumcount(), strict=True):
+        chart.points(axes, line.preset, line.cost, line.rank, label=line.row, ms=7 / (1 + 0.4 * before))
+    style.log_axis(axes, "x", lines["cost"])
+    axes.set(xlabel=COST_AXES[0], ylabel=COST_AXES[1], ylim=(max(1.0, lines["rank"].max()) + 0.5, 0.5))
+    figure.legend(loc="outside right upper")
+    return figure
+
+
+def _chart_cost(lines: pd.DataFrame) -> dict[str, Any]:
+    points = [
+        series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * before))
+        for line, before in zip(lines.itertuples(), lines.groupby(["cost", "rank"]).cumcount(), strict=True)
+        if not math.isnan(line.cost + line.rank)
+    ]
+    panel = panel_data("", *COST_AXES, points, height=420)
+    panel["y"]["reversed"] = True
+    return {"panels": [panel]}
+
+
+def _shares(runs: Runs, record: Record, cell: dict[str, Any]) -> pd.DataFrame:
+    """Successes, trials, their share and its interval for each level that a finished search tried, mild to severe."""
+    lines = curve_lines(runs.folder(record)) if cell["known"] else None
+    tried = pd.DataFrame(lines or [], columns=["level", "severity", "success"])
+    numbers = tried[["level", "severity"]].apply(pd.to_numeric, errors="coerce").astype(float)
+    tried = numbers.assign(success=tried["success"].eq(True))
+    levels = tried[np.isfinite(tried["level"] + tried["severity"])].groupby("level", as_index=False)
+    found = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
+    rates = [clopper_pearson(k / n, n) for k, n in zip(found["successes"], found["trials"], strict=True)]
+    ends = {end: [math.nan if cell["one_trial"] else getattr(rate, end) for rate in rates] for end in ("low", "high")}
+    found = found.assign(
+        axis=cell["axis"], row=cell["row"], preset=cell["preset"], share=[rate.value for rate in rates]
+    )
+    return found.assign(**ends)[["axis", "row", "preset", *SHARES]]
+
+
+PAGES = {"stability": make, "stability_cost": make_cost, "stability_curves": make_curves}

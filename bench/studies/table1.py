@@ -1,0 +1,141 @@
+"""Table 1 of DIST: the cost of each strategy of sphere tracing, measured and published."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+
+from bench.records import format
+from bench.report.data.records import Record, measured, repeated, row_of, setting
+from bench.report.data.runs import Runs, Selection
+from bench.report.write.result import Result
+from bench.report.write.table import IDENTITY, configured, shown, to_data, to_table, together, whole
+
+PLACE = 10
+READS = (Selection("table1", alike=("dataset", "view", "prior", "task")),)
+# DIST (Liu et al. 2020), Table 1: size, steps, queries, time; on a GTX 1080Ti. In the paper's order.
+PUBLISHED = {
+    "naive_serial": (512, 50, "N/A", "N/A"),
+    "naive_practical": (512, 50, "6.06M", "1.6h"),
+    "naive_practical_parallel": (512, 50, "6.06M", "3.39s"),
+    "dist_dynamic": (512, 50, "1.99M", "1.23s"),
+    "dist_aggressive": (512, 50, "1.43M", "1.08s"),
+    "dist_coarse_to_fine": (512, 50, "887K", "0.99s"),
+    "dist_coarse_to_fine_100": (512, 100, "898K", "1.24s"),
+}
+NOTES = (
+    "Forward is one rendering without gradient, backward the backward pass of a step, and a step both and the loss; in "
+    "brackets the least and the largest.",
+    "Queries are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
+    "decide nothing.",
+    "Peak memory is the largest growth of the memory of the process (CPU) or of PyTorch (GPU) in a step.",
+    "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
+    "hit.",
+    "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
+)
+_TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
+# Metrics of the CSV: at the requested size, and at a smaller one where that alone was finished.
+MEASURED = (
+    *("queries", "coarse_queries", "step_queries", "step_coarse_queries", "step_gradients", *_TIMES),
+    *(f"{time}_{end}" for time in _TIMES for end in ("low", "high")),
+    *("repeats", "forward_gemm", "step_gemm", "rays", "peak_memory_bytes", "hits", "lost", "false", "wrong"),
+    *("depth_error_p99", "depth_error_max", "depth_error_median"),
+)
+FINISHED = ("size", "queries", "peak_memory_bytes", "hits", "lost", "false", "wrong", *_TIMES)
+
+
+def make(runs: Runs) -> Result:
+    """A line per strategy: the paper's in its order, then others in the order of their runs."""
+    place = {preset: number for number, preset in enumerate(PUBLISHED)}
+    presets = [row_of(record).preset for record in runs.records]
+    order = sorted(range(len(presets)), key=lambda i: place.get(presets[i], len(place)))
+    runs = replace(runs, records=[runs.records[i] for i in order])
+    data, times = _data(runs), repeated(runs.records)
+    return Result(
+        runs,
+        "The cost of each strategy of sphere tracing.",
+        "Computed field values (queries), times, peak memory and errors of one rendering and its gradient"
+        + (f", times as medians of {times} repeats." if times else "."),
+        question="What does one rendering and its gradient cost, and what does each strategy save?",
+        verdict=_verdict(data),
+        remarks=NOTES,
+        data=data,
+        table=to_table(COLUMNS, runs.named()),
+    )
+
+
+def _data(runs: Runs) -> pd.DataFrame:
+    """A line per run: what was measured at the requested size, what was published, what was finished at a smaller."""
+    requested, steps = runs.number("config.view.resolution"), runs.number("config.renderer.steps")
+    number = {
+        name: pd.Series([measured(r, name) for r in runs.records], dtype=float) for name in {*MEASURED, *FINISHED}
+    }
+    done = number["size"] == requested
+    full = {_key(name): number[name].where(done) for name in MEASURED}
+    paper = pd.DataFrame([PUBLISHED.get(preset, (None,) * 4) for preset in runs.frame.preset], dtype=object)
+    said = {f"published_{name}": paper[at] for at, name in enumerate(("size", "steps", "queries", "time"))}
+    smaller = {f"finished_{_key(name)}": number[name].where(~done) for name in FINISHED}
+    return to_data(IDENTITY, runs.records).assign(size=requested, steps=steps, **full, **said, **smaller)
+
+
+def _key(metric: str) -> str:
+    """The column of the CSV with a metric."""
+    return metric.replace("_seconds", "_s")
+
+
+def _verdict(data: pd.DataFrame) -> str:
+    """Which strategy costs least, of those that finish; empty where fewer than two do."""
+    found = data[(data["status"] == "ok") & data["step_s"].notna()].sort_values("step_s")
+    if len(found) < 2:
+        return ""
+    first, last = ((format.seconds(found["step_s"].iloc[i]), found["row"].iloc[i]) for i in (0, -1))
+    return (
+        f"A step takes *{first[0]}* with {first[1]} and {last[0]} with {last[1]}; {len(data) - len(found)} of "
+        f"{len(data)} rows reach a limit at this size (n = one shape)."
+    )
+
+
+def _size(record: Record) -> str:
+    """The size at which the row was measured, with the requested size and the status where these differ."""
+    size, requested = measured(record, "size"), setting(record["config"], "view", "resolution")
+    status = "" if record["status"] == "ok" else record["status"]
+    if size is not None and size == requested:
+        return f"{requested} ({status})" if status else str(requested)
+    return f"{whole(size)} ({requested}: {record['status']})" if requested else f"{whole(size)} ({record['status']})"
+
+
+def _step(record: Record) -> str:
+    """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
+    spread = [measured(record, f"step_seconds{end}") for end in ("", "_low", "_high")]
+    texts = [format.seconds(x) for x in spread]
+    if None in spread:
+        return texts[0]
+    same = len({time.split()[-1] for time in texts}) == 1
+    return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
+
+
+def _metric(name: str, show: Callable[[Any], str]) -> Callable[[Record], str]:
+    """The text of a metric at the largest size that was finished."""
+    return lambda record: show(measured(record, name))
+
+
+def _published(part: int) -> Callable[[Record], str]:
+    return lambda record: str(PUBLISHED.get(row_of(record).preset, ("",) * 4)[part])
+
+
+COLUMNS = (  # of a record, for readers
+    shown("Strategy", lambda record: record["name"]),
+    *(shown("Size", _size), configured("", "renderer", "steps", heading="Steps")),
+    shown("Queries", lambda r: format.queries(measured(r, "queries"), measured(r, "coarse_queries"))),
+    shown("Forward", _metric("forward_seconds", format.seconds)),
+    shown("Backward", _metric("backward_seconds", format.seconds)),
+    shown("Step", _step),
+    shown("Peak memory", _metric("peak_memory_bytes", format.size)),
+    shown("Hits", _metric("hits", whole)),
+    shown("Missed / spurious / wrong depth", together(measured, whole, "lost", "false", "wrong")),
+    shown("Depth error median / max", together(measured, format.number, "depth_error_median", "depth_error_max")),
+    *(shown("Published queries", _published(2)), shown("Published time", _published(3))),
+)
+
+PAGES = {"table1": make}
