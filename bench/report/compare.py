@@ -248,18 +248,21 @@ class Compared:
         counts = self.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
         return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
-    def best(self, least: str) -> str:
-        """The row with the least mean error and that with the least cost, as a verdict; empty where there is none."""
+    def best(self, least_of: str) -> str:
+        """The row with the least mean error and the quickest one, as a verdict; empty where there is none.
+
+        Rows that lack a shape of another row are left out: they are not of the same shapes.
+        """
         known = [line for line in self.pooled if math.isfinite(line["error"].value) and line["seconds"] is not None]
-        if not known:
-            return ""
-        best, quick = (min(known, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         n = max((len(line["error"].points) for line in known), default=0)
-        return (
-            f"The least {least} is *{format.number(best['error'].value)}* ({best['row']}, "
-            f"{format.seconds(best['seconds'])}); the quickest row has {format.number(quick['error'].value)} "
-            f"({quick['row']}, {format.seconds(quick['seconds'])}); n = {n} shape{'s' if n != 1 else ''}."
-        )
+        whole = [line for line in known if len(line["error"].points) == n]
+        if not whole:
+            return ""
+        best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
+        told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
+        least, other = (format.number(line["error"].value) for line in (best, quick))
+        shapes = f"n = {n} shape{'s' if n != 1 else ''}"
+        return f"The least {least_of} is *{least}* {told[0]}; the quickest row has {other} {told[1]}; {shapes}."
 
     @style.styled
     def draw_front(self, columns: int = 3) -> Figure:

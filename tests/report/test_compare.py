@@ -89,8 +89,12 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean(tmp_path):
     lacking = ("newton_mask", 5, "100")
     cells = [(r["method"], r["config"]["index"], r["config"]["task"]["points"]) for r in runs.records]
     kept = [record for record, cell in zip(runs.records, cells, strict=True) if cell != lacking]
-    newton = line(one_loss.make(type(runs)(runs.selection, tmp_path, kept)), "newton with mask", "sofa")
+    result = one_loss.make(type(runs)(runs.selection, tmp_path, kept))
+    newton = line(result, "newton with mask", "sofa")
     assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11"
+    kept = [record for record in runs.records if record["method"] != "newton_mask" or record["config"]["index"] == 0]
+    verdict = one_loss.make(type(runs)(runs.selection, tmp_path, kept)).verdict  # of one shape, the easiest
+    assert "The least error × 1000 is" in verdict and "(neus with mask" in verdict.partition(";")[0]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from bench.records.files import leads_out, write_text
 from bench.records.read import PLAN
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.caption import SMOKE
-from bench.report.write.legacy import legacy
 from bench.report.write.result import Result, Shown, markdown, read_shown, write
 
 FOLDER = "paper"
@@ -58,9 +57,7 @@ class Study:
 def studies() -> tuple[Study, ...]:
     """All files of `bench/studies`, in the order of their places."""
     files = [import_module(f"bench.studies.{file.name}") for file in iter_modules([str(STUDIES)])]
-    known = [Study(f.PLACE, f.READS, f.PAGES) for f in files]
-    known += [Study(*of_before) for of_before in legacy()]
-    return tuple(sorted(known, key=lambda study: study.place))
+    return tuple(sorted((Study(f.PLACE, f.READS, f.PAGES) for f in files), key=lambda study: study.place))
 
 
 def write_paper(records: list[dict[str, Any]], results_dir: Path, into: Path | None = None) -> list[Path]:

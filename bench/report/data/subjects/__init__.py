@@ -1,1 +1,0 @@
-"""What single pages and their neighbours read of records: by the question that they answer."""
