@@ -265,18 +265,23 @@ class Compared:
         return f"The least {least_of} is *{least}* {told[0]}; the quickest row has {other} {told[1]}; {shapes}."
 
     @style.styled
-    def draw_front(self, columns: int = 3) -> Figure:
-        """Draws the mean error of each row over each cost, over all families; points on a front are filled."""
+    def draw_front(self, filled: Callable[[str], bool] | None = None) -> Figure:
+        """Draws the mean error of each row over each cost, over all families.
+
+        Args:
+            filled: whether the points of a preset are filled; by default those are that no row beats at less cost.
+        """
         figure, (axes,) = chart.sheet(3.2, 1, len(COSTS), sharey=True)
         for axis, (cost, label) in zip(axes, COSTS.items(), strict=True):
             known = [line for line in self.pooled if line[cost] is not None]
             rows, errors = [(line["preset"], line["row"]) for line in known], [line["error"] for line in known]
-            chart.front(axis, rows, [line[cost] for line in known], errors, [line[f"front_{cost}"] for line in known])
+            on = [filled(line["preset"]) if filled else line[f"front_{cost}"] for line in known]
+            chart.front(axis, rows, [line[cost] for line in known], errors, on)
             style.log_axis(axis, "x", [line[cost] for line in known])
             axis.set_xlabel(label)
         axes[0].set_ylabel(self.of.label)
         style.log_axis(axes[0], "y", [v for line in self.pooled for v in (line["error"].low, line["error"].value)])
-        style.legend_below(figure, axes[0], columns=columns)
+        style.legend_below(figure, axes[0], columns=3)
         return figure
 
     @style.styled

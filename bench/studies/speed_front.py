@@ -43,6 +43,10 @@ NOTES = (
 POINT = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
 Line = dict[str, Any]  # of a setting
 Value = Callable[[Record], float | None]
+NAMES = {  # of renderers' classes, in the legend
+    **{"dist": "DIST", "dvr": "DVR", "idr": "IDR", "neus": "NeuS", "volsdf": "VolSDF", "unisurf": "UNISURF"},
+    **{"relaxedboundary": "Relaxed boundary", "rangeanalysis": "Range analysis", "meshproxy": "Mesh proxy"},
+}
 
 
 @dataclass(frozen=True)
@@ -211,7 +215,7 @@ def draw(panels: dict[Trial, list[Line]]) -> Figure:
         axis.legend(handles=names, **below, handlelength=0, handletextpad=0, fontsize=6)
     looks = {point["renderer"]: style.look(point["renderer"]) for panel in panels.values() for point in panel}
     handles = {name: Line2D([], [], color=look.colour, marker=look.marker, ls="none") for name, look in looks.items()}
-    style.legend_of(figure, handles, columns=5)
+    style.legend_of(figure, {NAMES.get(name, name.capitalize()): drawn for name, drawn in handles.items()}, columns=5)
     for axis, panel in zip(axes, panels.values(), strict=True):
         _number(axis, [(point["x"], point["y"]) for point in _front(panel)])
     return figure
