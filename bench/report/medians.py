@@ -93,7 +93,7 @@ def best(
 def draw_runs(
     runs: Runs, panels: Mapping[str, pd.Series], starts: pd.Series | None = None, *, log: bool = True
 ) -> Figure:
-    """Draws a panel per measure, with a line per row: a point per run, and a bar at their median.
+    """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
         runs: of the rows.
@@ -107,7 +107,7 @@ def draw_runs(
         for place, row in enumerate(rows):
             mine = ((runs.frame.row == row.name) & (runs.frame.preset == row.preset)).to_numpy() & values.notna()
             if starts is not None:
-                axis.plot(starts[mine], _spread(place, mine.sum()), ".", color="#b0b0b0", ms=3)
+                axis.plot(starts[mine], _spread(place, mine.sum()), ".", color="#b0b0b0", ms=3, label="start")
             _points(axis, place, row.preset, values[mine].to_numpy(float))
         shown = values if starts is None else pd.concat([values, starts[values.notna()]])
         if log and style.needs_log(shown, 5.0):
@@ -125,7 +125,7 @@ def _points(axis: Axes, place: int, preset: str, values: np.ndarray) -> None:
     chart.points(axis, preset, values[known], where[known], ms=3.5, alpha=0.8)
     lost = where[~known]
     chart.points(axis, preset, [0.99] * len(lost), lost, marker="x", transform=axis.get_yaxis_transform())
-    middle = float(median(values)) if len(values) else np.inf
+    middle = float(median(values)) if len(values) > 1 else np.inf
     if np.isfinite(middle):
         axis.plot([middle, middle], [place - 0.38, place + 0.38], color="#222222", lw=1.2)
 

@@ -134,8 +134,9 @@ def draw(runs: Runs, oracle: dict[str, float]) -> Figure:
     starts, ends = _errors(runs)
     labels = {name: f"{name}: Chamfer, truth to\nprediction × 1000 (scene units²)" for name in runs.families()}
     panels = {label: ends.where(runs.frame.family == name) for name, label in labels.items()}
-    figure = draw_runs(runs, panels, starts)
-    for axis, name in zip(figure.axes, labels, strict=True):
+    figure = draw_runs(runs, panels, starts, log=False)
+    for axis, (name, label) in zip(figure.axes, labels.items(), strict=True):
+        style.log_axis(axis, "x", [*panels[label].dropna(), *starts[panels[label].notna()]])
         if name in oracle:
             chart.reference(axis.axvline, oracle[name], 3, "oracle")
     style.legend_below(figure, *figure.axes)
