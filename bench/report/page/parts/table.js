@@ -47,7 +47,8 @@
     const arrow = element("span.arrow", {"aria-hidden": "true"}, own ? (down ? "▼" : "▲") : "");
     const button = () => element("button.sort", {type: "button", "data-key": key, click: () => press(key)}, label, arrow);
     const order = own ? (down ? "descending" : "ascending") : null;
-    return element(`th.${kind || "words"}`, {scope: "col", "aria-sort": order}, get ? button() : label, unit && element("small", null, unit));
+    const small = unit && element("small", null, unit);
+    return element(`th.${kind || "words"}`, {scope: "col", "aria-sort": order}, get ? button() : label, small);
   }
 
   const cell = ({label, kind, head, cell: show}, item) =>

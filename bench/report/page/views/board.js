@@ -59,7 +59,8 @@
     if (state[column] && !known.some(([value]) => value === state[column])) known.push([state[column], 0]);
     const options = known.map(([value, n]) => element("option", {value}, `${value} (${n.toLocaleString("en")})`));
     const pick = ({target}) => change({[column]: target.value});
-    const select = element("select", {"data-column": column, "aria-label": FILTERS[column], change: pick}, element("option", {value: ""}, "all"), options);
+    const all = element("option", {value: ""}, "all");
+    const select = element("select", {"data-column": column, "aria-label": FILTERS[column], change: pick}, all, options);
     select.value = state[column] || "";
     return known.length > 1 || state[column] ? element("label.pick", null, FILTERS[column], select) : null;
   }
@@ -67,8 +68,11 @@
   /* The filters that are set, each with a button that takes it away. */
   function chipsOf(state, change) {
     const set = [...LINKED, ...Object.keys(FILTERS), "q"].filter((column) => state[column]);
-    const chip = (column) =>
-      element("button.chip", {type: "button", "aria-label": `Remove the filter ${state[column]}`, click: () => change({[column]: ""})}, `${state[column]} ×`);
+    const chip = (column) => {
+      const label = `Remove the filter ${state[column]}`;
+      const click = () => change({[column]: ""});
+      return element("button.chip", {type: "button", "aria-label": label, click}, `${state[column]} ×`);
+    };
     const clear = () => change(Object.fromEntries(set.map((column) => [column, ""])));
     return [set.map(chip), set.length > 1 && element("button.chip.plain", {type: "button", click: clear}, "Clear all")];
   }
@@ -84,7 +88,8 @@
     const metrics = (task ? task.metrics : []).filter(known).slice(0, MOST_METRICS);
     const shown = state.view === "methods" ? ofMethods(state, places, metrics) : ofRuns(state, places, metrics);
     const table = bench.table(shown.columns, shown.items, {...shown, caption: said, state, changed, cards: true});
-    return [element("p.count", {"aria-live": "polite"}, said, shown.said || "."), machines(places), Object.assign(table, {id: "board-list"})];
+    table.id = "board-list";
+    return [element("p.count", {"aria-live": "polite"}, said, shown.said || "."), machines(places), table];
   }
 
   function ofMethods(state, places, metrics) {
@@ -106,6 +111,7 @@
 
   function methodColumns(state, metrics) {
     const runsOf = (name) => bench.address.to(["runs"], {...asked(state), view: "runs", name, sort: "", order: "", page: ""});
+    const linked = ({name}) => element("a", {href: runsOf(name)}, name);
     const share = (row) => element(`span${row.failed ? ".failed" : ".soft"}`, null, `${row.failed} of ${row.runs}`);
     const measured = (key) => {
       const {label: name, factor, better} = bench.runs.metrics[key];
@@ -114,7 +120,7 @@
     };
     return [
       {key: "rank", label: "#", kind: "rank", cell: (row) => row.rank || soft(MISSING)},
-      {key: "name", label: "Method", head: true, get: ({name}) => name.toLowerCase(), cell: ({name}) => element("a", {href: runsOf(name)}, name)},
+      {key: "name", label: "Method", head: true, get: ({name}) => name.toLowerCase(), cell: linked},
       ...metrics.map(measured),
       numeric("failed", "Failed", (row) => row.failed / row.runs, (value, row) => share(row)),
       numeric("covered", "Scenes", (row) => row.covered, String, {down: true}),
@@ -132,11 +138,12 @@
       return numeric(key, label(name), ok, show, {unit: before && "start below", down: better === "higher"});
     };
     const text = (key, name, cell) => ({key, label: name, get: (place) => runs.text(place, key).toLowerCase(), cell});
+    const reused = (place) => runs.reused(place) && element("small", null, "reused");
     const columns = [
       {key: "pick", label: "Compare", kind: "pick", cell: bench.pick},
       {key: "picture", label: "Picture", kind: "thumb", cell: thumb},
       {...text("name", "Run", (place) => named(place, state)), head: true},
-      text("status", "Status", (place) => [bench.badge(runs.text(place, "status")), runs.reused(place) && element("small", null, "reused")]),
+      text("status", "Status", (place) => [bench.badge(runs.text(place, "status")), reused(place)]),
       ...metrics.map(measured),
       ...costs((place, key) => runs.number(place, key), "in all below"),
       numeric("started", "Started", (place) => runs.number(place, "started"), (value) => soft(date(value)), {unit: "UTC", down: true}),
@@ -145,7 +152,8 @@
   }
 
   const costs = (get, unit) => [
-    numeric("loop", "Optimisation", (item) => get(item, "loop"), (value, item) => [seconds(value), element("small", null, seconds(get(item, "total")))], {unit}),
+    numeric("loop", "Optimisation", (item) => get(item, "loop"),
+      (value, item) => [seconds(value), element("small", null, seconds(get(item, "total")))], {unit}),
     numeric("values", "Field values", (item) => get(item, "values"), count),
   ];
 
@@ -159,7 +167,9 @@
 
   function named(place, state) {
     const {runs} = bench;
-    const about = [state.task ? "" : runs.text(place, "task"), runs.text(place, "scene"), `seed ${runs.number(place, "seed") ?? MISSING}`, runs.text(place, "experiment")];
+    const seed = `seed ${runs.number(place, "seed") ?? MISSING}`;
+    const [task, scene, experiment] = ["task", "scene", "experiment"].map((key) => runs.text(place, key));
+    const about = [state.task ? "" : task, scene, seed, experiment];
     const reason = runs.reason(place);
     return [
       element("a", {href: runs.link(place)}, runs.text(place, "name")),

@@ -81,7 +81,8 @@
     };
     const name = (key) => (shown.has(key) ? label(shown.get(key).label) : code(key));
     const cell = (key, n) => number(value(key, n), shown.has(key) ? shown.get(key).factor : 1);
-    return table("Metric", [...new Set([...shown.keys(), ...found])], name, cell, "number", ratio(value), {label: "Better", cell: better});
+    const rows = [...new Set([...shown.keys(), ...found])];
+    return table("Metric", rows, name, cell, "number", ratio(value), {label: "Better", cell: better});
   }
 
   function costs(places, details) {

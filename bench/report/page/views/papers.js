@@ -50,6 +50,7 @@
   function parts(known, data) {
     const image = () => element("img.figure", {src: data.shown || data.picture, alt: data.caption || known.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
+    const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
     const table = data.rows.length > 0 && bench.written(data.header, data.rows);
     return [
       data.atlas && bench.atlas(data.atlas),
@@ -58,7 +59,7 @@
       element("p.caption", null, data.caption),
       table && data.atlas ? details("The table, with intervals", table) : table,
       data.notes.length > 0 && details(`Notes and definitions (${data.notes.length})`, list(data.notes)),
-      element("p.files", null, "Files: ", Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "])),
+      links.length > 0 && element("p.files", null, "Files: ", links),
     ];
   }
 

@@ -85,7 +85,8 @@
       {label: "After", kind: "number", cell: (row) => shown(row[2])},
       {label: "Definition", kind: "words.defined", cell: (row) => row[3] || soft("No definition recorded.")},
     ];
-    return [element("p.soft", null, "Unscaled, in scene units: a shape lies in a sphere of radius 1."), bench.table(columns, metrics, {caption: "All metrics"})];
+    const said = "Unscaled, in scene units: a shape lies in a sphere of radius 1.";
+    return [element("p.soft", null, said), bench.table(columns, metrics, {caption: "All metrics"})];
   }
 
   function picture([name, src, alt]) {
@@ -102,7 +103,8 @@
     const bars = known.map(([name, each, own]) => {
       const bar = element(`span.bar${own ? ".own" : ""}`, {"aria-hidden": "true"});
       bar.style.width = `${Math.max(0.5, (100 * each) / most)}%`;
-      return element("div.phase", null, element("span", null, name), element("span.track", null, bar), element("span.number", null, seconds(each)));
+      const time = element("span.number", null, seconds(each));
+      return element("div.phase", null, element("span", null, name), element("span.track", null, bar), time);
     });
     const plain = ["per_ray", "work_over_bound"]; // no counts
     const counts = [
