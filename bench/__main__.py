@@ -2,8 +2,7 @@
 
 import sys
 
-from omegaconf import DictConfig
-
+from bench.records.folder import Identity
 from bench.run.command import FAILED, command_line
 from bench.run.sweep import Sweep
 
@@ -12,10 +11,10 @@ def main() -> int:
     """Runs the command line; 0 if every run ended ok."""
     statuses: list[str] = []
 
-    def one(config: DictConfig) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
+    def one(run: Identity) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
         from bench.run.run import run_cell
 
-        statuses.append(run_cell(config))
+        statuses.append(run_cell(run))
 
     code = command_line(one)
     if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there

@@ -1,8 +1,7 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
 from inspect import Parameter, signature
@@ -133,24 +132,28 @@ def register(*folders: Path) -> None:
     register_resolvers()
 
 
-def check_label(config: DictConfig, overrides: Sequence[str]) -> None:
+def check_label(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Raises ValueError where a renderer takes the place of a method's, whose label the run would keep."""
     given = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
     if config.get("label") and {"renderer", "method"} <= given.keys() and "label" not in given:
         raise ValueError(
             f"renderer={given['renderer']} beside +method={given['method']} would run under the name "
-            f"{config.label!r}: add label=NAME, in a sweep 'label=\\${{renderer._label_}}'"
+            f"{config['label']!r}: add label=NAME, in a sweep 'label=\\${{renderer._label_}}'"
         )
 
 
-def check_names(config: DictConfig) -> None:
+def check_draw(config: DictConfig) -> None:
+    """Raises ValueError where a draw is set that no value asks for; the configuration is not resolved yet."""
+    if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
+        raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
+
+
+def check_names(config: Mapping[str, Any]) -> None:
     """Raises ValueError for a key of the top level that there is not, and for a choice that nothing reads."""
     names = [item.name for item in fields(Config)]
     for key in map(str, config):
         if key not in names:
             raise ValueError(f"unknown key {key!r}{nearest(key, names)}")
-    if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
-        raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
     loss, task = config.get("silhouette") or {}, config.get("task") or {}
     if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {
         *task,
@@ -164,32 +167,35 @@ def check_names(config: DictConfig) -> None:
         )
 
 
-def check_top_level(config: DictConfig) -> None:
+def check_top_level(config: Mapping[str, Any]) -> None:
     """Raises ValueError for a value of the top level that no part checks by itself."""
-    if config.split not in list(Split):
-        raise ValueError(f"split must be one of {', '.join(Split)}, not {config.split!r}")
-    if not config.evaluation.fscore_threshold > 0:
-        raise ValueError(f"evaluation.fscore_threshold must be positive, not {config.evaluation.fscore_threshold}")
-    if isinstance(config.evaluation.every, str) and config.evaluation.every != DOUBLING:
-        raise ValueError(f"evaluation.every must be {DOUBLING}, a number or null, not {config.evaluation.every!r}")
-    if config.evaluation.film not in (None, "gif", "webp"):
-        raise ValueError(f"evaluation.film must be gif, webp or null, not {config.evaluation.film!r}")
-    if config.stress is not None and "stress" not in config.task:
+    evaluation = config["evaluation"]
+    if config["split"] not in list(Split):
+        raise ValueError(f"split must be one of {', '.join(Split)}, not {config['split']!r}")
+    if not evaluation["fscore_threshold"] > 0:
+        raise ValueError(f"evaluation.fscore_threshold must be positive, not {evaluation['fscore_threshold']}")
+    if isinstance(evaluation["every"], str) and evaluation["every"] != DOUBLING:
+        raise ValueError(f"evaluation.every must be {DOUBLING}, a number or null, not {evaluation['every']!r}")
+    if evaluation["film"] not in (None, "gif", "webp"):
+        raise ValueError(f"evaluation.film must be gif, webp or null, not {evaluation['film']!r}")
+    if not config["results_dir"].strip():
+        raise ValueError("results_dir must name a folder, and is empty: results_dir=results")
+    if config["stress"] is not None and "stress" not in config["task"]:
         raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
-    if config.evaluation.film is not None and config.evaluation.picture is None:
+    if evaluation["film"] is not None and evaluation["picture"] is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
-    if config.index >= SPLIT_STRIDE:
-        raise ValueError(f"index must be at most {SPLIT_STRIDE - 1}, not {config.index}: a split has no more shapes")
+    if config["index"] >= SPLIT_STRIDE:
+        raise ValueError(f"index must be at most {SPLIT_STRIDE - 1}, not {config['index']}: a split has no more shapes")
     for name, least in LEAST.items():
-        value = OmegaConf.select(config, name)
+        value = (evaluation if "." in name else config)[name.rpartition(".")[2]]
         if isinstance(value, int) and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
 
 
 def build(
-    node: DictConfig,
+    node: Mapping[Any, Any],
     name: str,
-    packages: tuple[str, ...] | list[str] = (),
+    packages: Sequence[str] = (),
     target: str = "",
     *,
     role: type | None = None,
@@ -206,46 +212,18 @@ def build(
     Raises:
         ValueError: for an unknown package, a class that may not be used, an unknown key or a value of the wrong type.
     """
-    if _made is None or "." in name:
-        return _build(node, name, packages, target, role)
-    key = (id(node), name, *packages)
-    if key not in _made:
-        try:
-            _made[key] = node, _build(node, name, packages, target, role), None
-        except ValueError as error:
-            _made[key] = node, None, error
-    _, made, error = _made[key]
-    if error is not None:
-        raise error
-    return made
-
-
-_made: dict[tuple[Any, ...], tuple[DictConfig, Any, ValueError | None]] | None = None  # within `built_once`
-
-
-@contextmanager
-def built_once() -> Iterator[None]:
-    """Within it, a node is built once, whatever asks for it again; for checks, since a run's objects are its own."""
-    global _made
-    _made = {}
-    try:
-        yield
-    finally:
-        _made = None
-
-
-def _build(node: DictConfig, name: str, packages: tuple[str, ...] | list[str], target: str, role: type | None) -> Any:
-    if OmegaConf.is_missing(node, "_target_"):
-        raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
+    if isinstance(node, DictConfig):
+        node = cast(dict[Any, Any], OmegaConf.to_container(node, resolve=True, throw_on_missing=False))
     if role is None and target:
         role = find_class(target, name, packages, object)
-    path = node.get("_target_", target)
+    for key in ("_target_", *node):
+        if node.get(key) == MISSING:
+            raise ValueError(
+                f"{name}.{key} must be given: set {name}.{key}={'PACKAGE.CLASS' if key[0] == '_' else '...'}"
+            )
     leave = [str(node[LEAVE])] if name == "renderer" and LEAVE in node else []
-    cls = find_class(path, name, [*packages, *leave], role)
-    for key in node:
-        if OmegaConf.is_missing(node, key):
-            raise ValueError(f"{name}.{key} must be given: set {name}.{key}=...")
-    arguments = {str(key): node[key] for key in node if key not in RESERVED}
+    cls = find_class(node.get("_target_", target), name, [*packages, *leave], role)
+    arguments = {str(key): value for key, value in node.items() if key not in RESERVED}
     names = _argument_names(cls)
     for key in arguments:
         if names is not None and key not in names:
@@ -275,7 +253,8 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     if name not in names(group):
         raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
     node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
-    node.pop(LEAVE, None)
+    for key in RESERVED[1:]:
+        node.pop(key, None)
     return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # who names a class in Python trusts it
 
 
@@ -286,16 +265,16 @@ def _with_defaults(group: str, name: str) -> DictConfig:
     return cast(DictConfig, OmegaConf.merge(*(node if base == SELF else _with_defaults(group, base) for base in bases)))
 
 
-def _typed(cls: type, arguments: dict, name: str, packages: tuple[str, ...] | list[str]) -> Any:
+def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[str]) -> Any:
     """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
     types = get_type_hints(cls)
     protocols = [key for key in arguments if getattr(types[key], "_is_protocol", False)]
     for key in protocols:
-        if not OmegaConf.is_dict(arguments[key]):
+        if not isinstance(arguments[key], dict):
             raise ValueError(
                 f"{name}.{key} must have a _target_, not be {arguments[key]!r}: write {key}=NAME, without {name}"
             )
-    nested = {key: _node_class(types[key]) for key, value in arguments.items() if OmegaConf.is_dict(value)}
+    nested = {key: _node_class(types[key]) for key, value in arguments.items() if isinstance(value, dict)}
     nested = {key: found for key, found in nested.items() if found or key in protocols}
     given = {key: value for key, value in arguments.items() if key not in nested}
     schema = OmegaConf.structured(make_dataclass(cls.__name__, [(key, types[key]) for key in given]))

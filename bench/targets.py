@@ -5,7 +5,8 @@ where it is what its place in the configuration asks for. A YAML grants no leave
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -13,7 +14,6 @@ from typing import Any, Protocol
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Sweep
-from omegaconf import DictConfig, OmegaConf
 
 OURS = ("renderers", "datasets", "bench")
 LEAVE = "_package_"  # of the node `renderer`: one more package, that of the class typed for renderer=custom
@@ -62,18 +62,24 @@ def check_package(path: Any, name: str, packages: Sequence[str]) -> None:
         raise ValueError(f"{name}._target_ names {path!r}: {_remedy(parts[0])}")
 
 
-def check_targets(config: DictConfig, typed: Sequence[str], renderer: str) -> None:
+@cache
+def parsed(override: str) -> Override:
+    """An override of the command line, as Hydra reads it."""
+    return OverridesParser.create().parse_override(override)
+
+
+def check_targets(config: Mapping[str, Any], typed: Sequence[str], renderer: str) -> None:
     """Checks every `_target_` of a configuration by its package, before anything is imported.
 
     Args:
-        config: the configuration, without Hydra's own node.
+        config: the resolved configuration, without Hydra's own node.
         typed: the overrides of the command line, by which alone packages are named.
         renderer: the choice of the group `renderer`.
 
     Raises:
         ValueError: for a package that the command line does not name.
     """
-    told = [override for override in OverridesParser.create().parse_overrides(list(typed)) if not override.is_delete()]
+    told = [override for override in map(parsed, typed) if not override.is_delete()]
     named = {str(package) for package in _flat(_values_of(told, "packages"))}
     for package in map(str, config.get("packages") or []):
         if package not in named:
@@ -81,7 +87,7 @@ def check_targets(config: DictConfig, typed: Sequence[str], renderer: str) -> No
         if package in sys.stdlib_module_names:
             raise ValueError(f"packages names {package!r}: {_remedy(package)}")
     classes = [str(target) for target in _flat(_values_of(told, "renderer._target_"))] if renderer == OWN else []
-    for name, node in _nodes(OmegaConf.to_container(config, resolve=True, throw_on_missing=False)):
+    for name, node in _nodes(config):
         target, leave = node.get("_target_"), node.get(LEAVE)
         first = str(target).split(".")[0]
         own = name == "renderer" and target in (*classes, MISSING) and leave in (first, None, NO_CLASS)
@@ -108,7 +114,7 @@ def _flat(values: list[Any]) -> Iterator[Any]:
 
 def _nodes(node: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
     """Every node below a plain one, with its dotted name."""
-    for key, child in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+    for key, child in node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ():
         here = f"{name}.{key}" if name else str(key)
         if isinstance(child, dict):
             yield here, child

@@ -122,7 +122,6 @@ def asked_once() -> Iterator[None]:
         # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
         loaded = [*process.preloaded(), "pytest", "tests.run.spared"]
         patch.setattr(process, "preloaded", lambda: loaded)
-        patch.setattr("bench.run.run.needed", lambda config: [])
         yield
 
 

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import DictConfig, OmegaConf
 
 from bench.config import EvaluationSettings
 from bench.records.record import Record
+from bench.run.cell import Cell, cell_of
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior.autodecoder import Prior
@@ -49,6 +51,16 @@ def phases_of(run: RunContext, task: Any) -> list[str]:
     phases: dict[str, None] = {}
     task.execute(replace(run, progress=lambda phase, done, total, loss=None: phases.setdefault(phase)))
     return list(phases)
+
+
+def plain(config: DictConfig) -> Any:
+    """A composed configuration as plain data, resolved."""
+    return OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+
+
+def cell_from(config: DictConfig) -> Cell:
+    """The cell of a composed configuration."""
+    return cell_of(plain(config))
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:

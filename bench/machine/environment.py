@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 
-from bench.machine.processor import cpu_name
 from bench.records.record import Record
 from renderers.fields.bfloat16 import multiplies_faster
 
@@ -62,6 +61,15 @@ def describe(device: torch.device) -> dict[str, Any]:
         "gemm_peak_flops": gemm_peak(device),
         "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if multiplies_faster(device) else None,
     }
+
+
+def cpu_name() -> str:
+    """The name of this machine's processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 @contextmanager

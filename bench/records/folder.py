@@ -30,8 +30,8 @@ PASSIVE = (
         "bench/progress.py",
     ),
     *(f"bench/{name}.py" for name in ("merge", "tune", "train", "photos", "turntable")),
-    *(f"bench/run/{name}.py" for name in ("check", "library", "plan", "summary", "sweep")),
-    *(f"bench/records/{name}.py" for name in ("expected", "format", "metrics", "names", "read", "statuses")),
+    *(f"bench/run/{name}.py" for name in ("check", "compose", "library", "plan", "summary", "sweep")),
+    *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read", "statuses")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"

@@ -50,7 +50,7 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-@dataclass
+@dataclass(repr=False)
 class Record:
     """The content of `record.json`. A new record has the status killed, which holds until its run ends."""
 
@@ -82,6 +82,10 @@ class Record:
     ended: str = ""  # empty while it is under way, and where it was killed before it could write this
     log: list[str] = field(default_factory=list)  # the last lines of log.txt, where the run failed
     overrides: list[str] = field(default_factory=list)  # what the command line set, as KEY=VALUE
+
+    def __repr__(self) -> str:
+        """What was run, how it ended, and where it is."""
+        return f"<run {self.outcome}{f' ({self.reason})' if self.reason else ''}; {self.id}>"
 
     @property
     def name(self) -> str:

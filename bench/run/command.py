@@ -16,26 +16,40 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, check_label, check_names, register
+from bench.config import CONF, register
 from bench.hints import nearest
-from bench.run.check import check_apart
+from bench.records.folder import Identity
+from bench.rows import register_resolvers
+from bench.run.check import identified
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.tables import names
-from bench.targets import check_targets
 from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
+GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")  # that `list` shows
+HELP = """
+    python -m bench task=completion renderer=dist                          one run
+    python -m bench -m renderer=dist,dvr,newton seed=0,1,2 dataset=sofa,plane     a sweep: every combination
+    python -m bench -m +experiment=table1 scale=smoke                      all runs of a table, in seconds each
+    python -m bench -m renderer=dist,dvr plan=true                         what would run, and for how long
+    python -m bench dataset=mesh dataset.path=chair.obj                    your own mesh
+    python -m bench renderer=custom renderer._target_=mypkg.Mine           your own renderer
+    python -m bench list                                                   the tasks, renderers, datasets, experiments
+    python -m bench.report                                                 tables, figures and results/index.html
+
+Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
+--cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML; --hydra-help is Hydra's own."""
 USAGE = 2  # exit status of a command line that asks for what there is not
 FAILED = 1
 EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
-def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int:
-    """Composes the configuration of the command line and gives it to `job`, once, or in a sweep once a cell.
+def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
+    """Composes the configuration of the command line and gives what it describes to `job`, in a sweep once a cell.
 
     Args:
         job: what the command does; where its cells are no runs, `plan=true` is its to read.
@@ -51,12 +65,13 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
     def guarded(config: DictConfig) -> None:
         begun.append(config)
         try:
-            _check(config)
-            job(config)
+            job(_identified(config))
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
             raised.append(error)
 
+    if (told := _told(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
+        return _print(told)
     catch_signals()
     Sweep.other = None if runs else job
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
@@ -69,10 +84,11 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
     except KeyboardInterrupt as error:
         before = "" if begun or Sweep.plan is not None else "; nothing was run"
         return _tell(stopped_by(error) + before, INTERRUPTED)
-    except OverrideParseException as error:
-        return _tell(_unreadable(error.override), USAGE)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         return _tell(_explain(error), USAGE)
+    except BrokenPipeError:  # `| head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return FAILED
     except OSError as error:
         return _tell(unwritten(error))
     except Exception as error:
@@ -84,6 +100,27 @@ def command_line(job: Callable[[DictConfig], None], *, runs: bool = True) -> int
         return _tell(f"cannot compose {' '.join(sys.argv[1:])!r}: {what}", USAGE)  # Hydra, at a value of an odd type
     finally:
         forget_signals()
+    return 0
+
+
+def _told(arguments: list[str], about: str) -> str | None:
+    """The text that a command line asks for in place of a run; None where it asks for none."""
+    if {"--help", "-h", "help"} & {*arguments}:
+        chosen = "\n".join(
+            f"{group}: {', '.join(_choices(group))}" for group in ("task", "renderer", "dataset", "scale")
+        )
+        return f"{about.strip()}\n{HELP}\n\n{chosen}"
+    if "list" in arguments:
+        return "\n".join(f"{group}: {', '.join(_choices(group))}" for group in GROUPS)
+    return None
+
+
+def _print(text: str) -> int:
+    """Prints a text, of which `| head` may read a part; gives the exit status."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
 
 
@@ -116,21 +153,21 @@ def own_folders(arguments: list[str]) -> list[Path]:
     return [Path(folder)] if folder else []
 
 
-def unwritten(error: OSError) -> str:
-    """One line on what could not be written, and what to do."""
-    path = Path(error.filename) if error.filename else None
+def unwritten(error: OSError, results_dir: str | None = None) -> str:
+    """One line on what could not be written, and what to do; `results_dir` is named where the error names no file."""
+    path = Path(named) if (named := error.filename or results_dir) else None
     file = next((above for above in path.parents if above.is_file()), path) if path else None
     where = f" ({file})" if file else ""
     return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
 
 
-def _check(config: DictConfig) -> None:
-    """Raises ValueError for what can be told of a configuration without torch."""
-    check_names(config)
-    chosen = HydraConfig.get()
-    check_label(config, chosen.overrides.task)
-    check_targets(config, chosen.overrides.task, chosen.runtime.choices.get("renderer", ""))
-    check_apart(config)
+def _identified(config: DictConfig) -> Identity:
+    """The run that a configuration describes; raises ValueError for what can be told of it without torch."""
+    register_resolvers()  # again, since a launcher's worker has not read the command line
+    hydra = HydraConfig.get()
+    if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
+        config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
+    return identified(config, hydra.runtime, hydra.overrides.task, hydra.overrides.task)
 
 
 def _call(program: Callable[[], None]) -> None:
@@ -144,7 +181,7 @@ def _call(program: Callable[[], None]) -> None:
         if stopped := stopped_by(error):
             raise KeyboardInterrupt(stopped) from error
         if isinstance(error, Refused):
-            raise error.why from None
+            raise error.why from error.why.__cause__
         raise
 
 
@@ -157,6 +194,8 @@ def _tell(message: str, code: int = FAILED) -> int:
 
 def _explain(error: Exception) -> str:
     """One line that names what is wrong and, for an unknown name, the nearest known one."""
+    if isinstance(error, OverrideParseException):
+        return _unreadable(error.override)
     chain = [error, error.__cause__, error.__context__]
     for cause in chain:
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
@@ -170,6 +209,10 @@ def _explain(error: Exception) -> str:
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
             return what + nearest(name, known) + (own if "/" in name or "." in name else "")
     message = " ".join(str(error).split())
+    if found := re.match(r"Ambiguous value for argument '(.*?)=(.*)' 1\.", message):
+        key, values = found.groups()
+        quoted = f"or quote it where it is one value: '{key}=\"{values}\"'"
+        return f"{key} has several values: add -m for a run of each, write {key}=[{values}] for a list, {quoted}"
     if isinstance(error, ConfigCompositionException):
         if found := re.search(r"Could not override '([^']+)'", message):
             if names(found[1]):
@@ -185,6 +228,10 @@ def _explain(error: Exception) -> str:
 
 def _unreadable(override: str) -> str:
     """One line on an override that Hydra cannot read."""
+    for group in GROUPS:
+        if override in _choices(group):
+            plus = "+" if group in ("method", "experiment") else ""
+            return f"{override!r} is no setting: write {plus}{group}={override}"
     if COMMA.search(override):
         return f"{override!r} has a comma without a value beside it: write key=a,b"
     return f"cannot read {override!r}: write key=value, and quote a value with special characters as 'key=\"value\"'"

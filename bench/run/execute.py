@@ -13,18 +13,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
 
-from bench.config import build, check_top_level
 from bench.machine import environment
 from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
-from bench.rows import register_resolvers
-from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
-from bench.setup.inputs import RunContext, RunInputs, set_up
+from bench.run.cell import Cell, cell_of
+from bench.run.messages import Ended, Job, Notice, Started, Step, reason_of
+from bench.setup.inputs import RunContext
 from bench.solve.problem import Unsupported
-from bench.tasks.task import Checks, TakesField, Task
 from renderers.checks import BadInput
 
 INTERVAL = 0.05  # least seconds between two messages on progress
@@ -34,7 +31,7 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     """Runs a job to its end in the process of a run; its output goes to the job's log.
 
     Args:
-        job: the configuration, the folder and the record.
+        job: the folder and the record.
         channel: where messages are sent to.
         parent: the reading end of a pipe that only the parent holds open, and never writes to.
     """
@@ -42,11 +39,10 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     signal.signal(signal.SIGTERM, _stop)
     _die_with(parent)
     _print_to(job.folder / "log.txt")
-    register_resolvers()  # the configuration may have to be resolved here
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
-        execute(job.config, job.folder, job.record, progress=_Progress(channel), checkpoint=channel.send)
+        execute(job, progress=_Progress(channel), checkpoint=channel.send)
     except KeyboardInterrupt:
         channel.send(job.record)  # what is known; then it ends by SIGTERM, as its exit code should say
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -55,30 +51,28 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     channel.send(Ended())
 
 
-def execute(
-    config: DictConfig, folder: Path, record: Record, *, progress: Report, checkpoint: Callable[[Record], None]
-) -> None:
-    """Runs a configuration and fills its record.
+def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
+    """Runs a job, whose record gets a status, and a reason where that is not ok.
 
     Args:
-        config: configuration of the run.
-        folder: for the run's files.
-        record: gets a status, and a reason where that is not ok.
+        job: its record has the configuration.
         progress: receives the progress.
         checkpoint: receives the record as soon as the machine is known.
 
     Raises:
         KeyboardInterrupt: where the run was stopped; the record has what is known.
     """
+    folder, record = job.folder, job.record
     log = _open_log(folder)
     contention = Contention()
     try:
-        task, inputs = built(config, progress)
+        cell = _built(record)
+        inputs = cell.start(progress)
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         checkpoint(record)
         try:
-            task.execute(RunContext(inputs, folder, record, progress))
+            cell.task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
@@ -90,7 +84,8 @@ def execute(
         record.status, record.reason = RunStatus.OOM, reason_of(error)
     except Exception as error:  # noqa: BLE001 - every failure of a run is recorded
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
-        record.status, record.reason = RunStatus.OOM if out_of_memory else RunStatus.CRASHED, reason_of(error)
+        record.status = RunStatus.OOM if out_of_memory else RunStatus.CRASHED
+        record.reason = reason_of(error, folder)
         log.error(traceback.format_exc())
     finally:
         record.environment |= contention.measured()
@@ -99,25 +94,12 @@ def execute(
         _close_log(log)
 
 
-def built(config: DictConfig, progress: Report) -> tuple[Task, RunInputs]:
-    """The task and its inputs, before anything slow.
-
-    Raises:
-        BadInput: for anything invalid in the configuration.
-    """
+def _built(record: Record) -> Cell:
+    """The cell of a record's configuration; raises BadInput for anything invalid in it."""
     try:
-        check_top_level(config)
-        task = build(config.task, "task", list(config.packages))
-        if not isinstance(task, Task):
-            raise ValueError(f"task {type(task).__name__} lacks execute: see bench/tasks/task.py")
-        inputs = set_up(config, progress)
-        if not inputs.field.of_prior and not isinstance(task, TakesField):
-            raise ValueError(f"the task {type(task).__name__} does not take field={config.field}: leave it out")
-        if isinstance(task, Checks):
-            task.check(inputs)
+        return cell_of(record.config)
     except (ValueError, OSError) as error:
         raise BadInput(reason_of(error)) from error
-    return task, inputs
 
 
 class _Progress:

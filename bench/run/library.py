@@ -46,6 +46,11 @@ def run_once(overrides: Sequence[str], choices: Mapping[str, Any]) -> Record:
         ValueError: for what no run can be made of, with the line that the command prints.
         OSError: where no record could be written.
     """
+    if isinstance(overrides, str):
+        raise ValueError(
+            f"bench.run takes a list of overrides, not {overrides!r}: bench.run(['task=completion']), "
+            "or bench.run(task='completion')"
+        )
     done = _command([*(_override(key, value) for key, value in choices.items()), *overrides])
     last = Path(done.out.rstrip("\n").rpartition("\n")[2] or ".")
     if (last / "record.json").is_file():

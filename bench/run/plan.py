@@ -1,58 +1,105 @@
-"""`plan=true`: lists what would run, with the time and the memory that like runs took; runs nothing, writes nothing."""
+"""What runs will take, by like runs: `plan=true`, which lists them and runs nothing, and the time left of a sweep."""
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from statistics import median
+from typing import Any
 
-from bench.machine.processor import cpu_name
-from bench.records.expected import Expected, Model, Remaining
-from bench.records.format import seconds, size
+from bench.records.format import seconds
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
 
-BUSY = 0.05  # share of the time that like runs waited, above which it is told
-
-
-@dataclass(frozen=True)
-class Words:
-    """What a plan says of what it lists: what would be done, that it was done before, what no estimate is from."""
-
-    noun: str
-    verb: str
-    done: str
-    like: str
-
-
-RUNS = Words("run", "run", "reused", "like run")
+# Statuses of runs that did not take their whole time.
+UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 
 
 class Shown(BaseException):
     """A plan was shown in place of a sweep. Not an Exception, which Hydra would turn into a warning."""
 
 
-def model_of(results_dir: Path) -> Model:
-    """The model of a results folder's records; it knows nothing where there is no such folder."""
-    records = read_records(results_dir)[0] if results_dir.is_dir() else []
-    return Model(records, cpu_name())
+class Estimates:
+    """The seconds of runs; like runs have the same task, renderer, method and scale."""
+
+    def __init__(self, records: Iterable[dict[str, Any]] = ()) -> None:
+        self.known: dict[Any, list[float]] = defaultdict(list)
+        for record in records:
+            self.add(record)
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Learns from a run that took its whole time."""
+        total = record["seconds"].get("total")
+        if record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf"):
+            self.known[_kind(record)].append(total)
+
+    def of(self, planned: dict[str, Any]) -> list[float]:
+        """The seconds that like runs took."""
+        return self.known.get(_kind(planned), [])
+
+
+def _kind(record: dict[str, Any]) -> Any:
+    scale = record["config"].get("scale")
+    name = str(scale.get("name")) if isinstance(scale, dict) else None
+    return record["task"], record["renderer"], record.get("method", ""), name
+
+
+@dataclass
+class Remaining:
+    """What is left of a sweep.
+
+    Args:
+        cells: those that are not reused, by their ids.
+        estimates: of the results folder; they learn from each cell that ends.
+        workers: how many cells run at a time.
+        latest: when a cell ended last, in seconds since the sweep began.
+    """
+
+    cells: dict[str, dict[str, Any]]
+    estimates: Estimates = field(default_factory=Estimates)
+    workers: int = 1
+    latest: float = 0.0
+
+    def ended(self, cell: str, record: dict[str, Any], elapsed: float) -> None:
+        """Notes that a cell has ended."""
+        if self.cells.pop(cell, None) is not None:
+            self.latest = elapsed
+            if not record.get("reused"):  # another command ran it meanwhile
+                self.estimates.add(record)
+
+    def left(self, elapsed: float) -> float | None:
+        """Seconds left, `elapsed` seconds after the sweep began; None where no like run says anything."""
+        known = [median(like) for cell in self.cells.values() if (like := self.estimates.of(cell))]
+        if not known and self.cells:
+            return None
+        whole = sum(known) / max(len(known), 1) * len(self.cells) / self.workers  # the others take what these take
+        return max(whole - (elapsed - self.latest), 0.0)
 
 
 def remaining(plan: Plan, reused: set[str], workers: int) -> Remaining:
-    """The time left of a sweep, as it is before its first cell."""
-    model = model_of(plan.results_dir)
-    cells = {c.id: model.of(asdict(c)) for c in plan.cells if c.id not in reused}
-    return Remaining(cells, max(1, min(workers, len(cells))))
+    """What a sweep has to do, as it is before its first cell."""
+    records = read_records(plan.results_dir)[0] if plan.results_dir.is_dir() else []
+    cells = {cell.id: asdict(cell) for cell in plan.cells if cell.id not in reused}
+    return Remaining(cells, Estimates(records), max(1, min(workers, len(cells))))
 
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     """Prints a line for each cell, and one for the whole plan."""
     left = remaining(plan, reused, workers)
+    taken = {name: left.estimates.of(cell) for name, cell in left.cells.items()}
     for number, cell in enumerate(plan.cells, 1):
-        about = "reused" if cell.id in reused else told(left.cells[cell.id])
+        about = "reused" if cell.id in reused else told(taken[cell.id])
         print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
-    print(total(len(plan.cells), left))
-    known = [expected for expected in left.cells.values() if expected is not None]
-    if (whole := sum(e.seconds for e in known)) and (waited := sum(e.waited * e.seconds for e in known) / whole) > BUSY:
-        free = seconds(whole * (1 - waited) / left.workers)
-        print(f"note: like runs waited {waited:.0%} of their time for a processor; alone on it, it is about {free}")
+    parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]
+    if reused:
+        parts.append(f"{len(reused)} reused")
+    if unknown := sum(not like for like in taken.values()):
+        parts.append(f"{unknown} without a like run")
+    text = ", ".join(parts) + ("" if taken else "; nothing is left to do")
+    if known := [median(like) for like in taken.values() if like]:
+        text += f"; about {seconds(sum(known) / left.workers)}, {left.workers} at a time"
+        text += f", and what the {unknown} take" if unknown else ""
+        text += "; a prior that has to be trained first comes on top"
+    print(text)
 
 
 def named(cell: PlannedCell) -> str:
@@ -60,32 +107,6 @@ def named(cell: PlannedCell) -> str:
     return ", ".join((cell.task, row_name(cell.config, cell.renderer), cell.dataset))
 
 
-def told(expected: Expected | None, words: Words = RUNS) -> str:
+def told(like: list[float]) -> str:
     """What a run will take, in words."""
-    if expected is None:
-        return f"no {words.like}"
-    spread = "" if expected.n == 1 else f", {seconds(expected.low)} to {seconds(expected.high)}"
-    memory = "" if expected.memory is None else f", +{size(expected.memory)}"
-    runs = expected.like.replace(f"{words.noun}s", words.noun) if expected.n == 1 else expected.like
-    return f"about {seconds(expected.seconds)} ({expected.n} {runs}{spread}){memory}"
-
-
-def total(planned: int, left: Remaining, words: Words = RUNS) -> str:
-    """The sum over all that is planned, in a line."""
-    known = [expected for expected in left.cells.values() if expected is not None]
-    parts = [f"{planned} planned: {len(left.cells)} to {words.verb}"]
-    if done := planned - len(left.cells):
-        parts.append(f"{done} {words.done}")
-    if unknown := len(left.cells) - len(known):
-        parts.append(f"{unknown} without a {words.like}")
-    text = ", ".join(parts)
-    if not known:
-        return text + ("" if left.cells else "; nothing is left to do")
-    low, high = (sum(getattr(e, end) for e in known) / left.workers for end in ("low", "high"))
-    whole = sum(expected.seconds for expected in known) / left.workers
-    spread = f" ({seconds(low)} to {seconds(high)})" if any(e.n > 1 for e in known) else " (n = 1 each)"
-    text += f"; about {seconds(whole)}{spread}, {left.workers} at a time"
-    if unknown:
-        text += f", and what the {unknown} take"
-    memory = [expected.memory for expected in known if expected.memory is not None]
-    return text + (f"; the largest took +{size(max(memory))} of memory" if memory else "")
+    return f"about {seconds(median(like))} ({len(like)} like run{'s' * (len(like) > 1)})" if like else "no like run"

@@ -1,25 +1,26 @@
-"""The process of a run, seen from its parent: the job, the messages, the limits, how it ends, and signals."""
+"""The process of a run, seen from its parent: its limits, how it ends, and signals."""
 
-import errno
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from pkgutil import iter_modules
+from typing import Any
 
 import psutil
-from omegaconf import DictConfig
 
 import bench.tasks
 import datasets
-from bench.records.record import Record, RunStatus
+from bench.records.record import RunStatus
+from bench.run.messages import Ended, Job, Message, Started, Step
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -30,50 +31,6 @@ EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal
 # Signals are noted as well as raised: an interrupted library may swallow or replace the exception.
 _stopped = ""  # by which signal, in words
 _delayed = False  # within `signals_delayed`
-
-
-@dataclass(frozen=True)
-class Job:
-    """A run for a child process: the configuration, the folder for its files, and the record that it fills."""
-
-    config: DictConfig
-    folder: Path
-    record: Record
-
-
-@dataclass(frozen=True)
-class Step:
-    """Progress within a phase; see `bench.progress.Report`."""
-
-    phase: str
-    done: int
-    total: int
-    loss: float | None
-
-    @property
-    def when(self) -> str:
-        """The phase and the step for the reason of a failure: `while optimising (3 of 20)`."""
-        return f"{'while' if self.done < self.total else 'after'} {self.phase} ({self.done} of {self.total})"
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A message for the user."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Started:
-    """The child is ready: the time limit counts from now on."""
-
-
-@dataclass(frozen=True)
-class Ended:
-    """The child has sent its final record."""
-
-
-Message = Started | Step | Notice | Record | Ended
 
 
 @dataclass(frozen=True)
@@ -94,6 +51,11 @@ class RunLimits:
         if self.memory is not None and not self.memory > 0:
             raise ValueError(f"memory_limit must be positive, not {self.memory}: 8 is 8 GiB, null all but a tenth")
 
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> "RunLimits":
+        """The limits that a configuration sets."""
+        return cls(config["time_limit"], config["memory_limit"])
+
     @property
     def bytes(self) -> float:
         return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
@@ -105,13 +67,6 @@ class Ending:
 
     status: RunStatus
     reason: str
-
-
-def reason_of(error: BaseException) -> str:
-    """An error as the reason of a failure: in one line, with the remedy where the disk is full."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return f"{text}: free space, or set results_dir to a folder on another disk" if full else text
 
 
 def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> Ending | None:
@@ -147,16 +102,18 @@ def preloaded() -> list[str]:
     return ["bench", "open3d", "bench.run.execute", *named]
 
 
-def fork_server(modules: Sequence[str] = ()) -> ForkServerContext:
-    """The context of processes that branch off from a server, which has imported what is slow, once for all of them.
-
-    Args:
-        modules: that the server imports before its first process, where it is not there yet; none are all that runs
-            import, which is best for a sweep.
-    """
+def fork_server() -> ForkServerContext:
+    """The context of processes that branch off from a server, which has imported what is slow, once for all of them."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*modules] or preloaded())
+    context.set_forkserver_preload(preloaded())
     return context
+
+
+def warm_up() -> None:
+    """Starts the server of processes, which loads what is slow while this process does something else."""
+    fork_server()
+    with signals_delayed():  # a request that breaks off would end the server
+        forkserver.ensure_running()
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:

@@ -1,4 +1,4 @@
-"""Runs one configuration: claims its folder, runs it in a child process, and always writes its record."""
+"""One run: claims its folder, runs it in a child process, and always writes its record."""
 
 import shutil
 import sys
@@ -9,30 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from bench.config import Isolation, build
+from bench.config import Isolation
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
-from bench.records.folder import Claim, Identity, claimed, identify, release, reusable
-from bench.records.read import Plan, PlannedCell
+from bench.records.folder import Claim, Identity, claimed, release, reusable
+from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record
-from bench.rows import register_resolvers
-from bench.run.check import needed, refusals, warm_up
+from bench.run.check import refusal, tracker_of
 from bench.run.command import unwritten
+from bench.run.compose import planned
+from bench.run.messages import Job, Message, Notice, Started, Step, reason_of
 from bench.run.plan import show_plan
-from bench.run.process import (
-    Job,
-    Message,
-    Notice,
-    RunLimits,
-    Started,
-    Step,
-    reason_of,
-    run_isolated,
-    signals_delayed,
-    stopped_by,
-)
+from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by, warm_up
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
 
@@ -48,8 +38,8 @@ class Interrupted(KeyboardInterrupt):
         self.folder, self.record = folder, record
 
 
-def run_cell(config: DictConfig) -> str:
-    """Runs a composed configuration and gives its status.
+def run_cell(identity: Identity) -> str:
+    """Runs what a configuration describes and gives its status.
 
     The summary of a single run is printed here; a sweep's driver prints a line per run.
 
@@ -57,25 +47,24 @@ def run_cell(config: DictConfig) -> str:
         Interrupted: after Ctrl-C or SIGTERM.
         ValueError: where a single run's configuration cannot be run; its folder is removed.
     """
-    register_resolvers()  # again, since a launcher's worker has not read the command line
-    _stay_in_place(config)
-    single = OmegaConf.is_missing(HydraConfig.get().job, "num")
-    if single and (config.plan or config.isolation == Isolation.process):  # a sweep's cells were checked before
-        _check(config)
-    if single and HydraConfig.get().sweeper.get("params"):
+    config, hydra = identity.config, HydraConfig.get()
+    single = OmegaConf.is_missing(hydra.job, "num")
+    if single and (config["plan"] or config["isolation"] == Isolation.process):  # a sweep's cells were checked before
+        _check(identity)
+    if single and hydra.sweeper.get("params"):
         notice("note: this is one run; with -m in the command it is all runs of the table")
-    if config.plan:
+    if config["plan"]:
         return RunStatus.OK
     try:
-        folder, record = run(config)
+        folder, record = run(identity)
     except Interrupted as error:
         if single:
             show(error.folder, error.record)
         raise
     except OSError as error:
-        print(f"error: {unwritten(error)}", file=sys.stderr, flush=True)
+        print(f"error: {unwritten(error, config['results_dir'])}", file=sys.stderr, flush=True)
         return LOST
-    if config.verbose:
+    if config["verbose"]:
         print("\n".join(record.log), file=sys.stderr, flush=True)
     if single and record.status == RunStatus.REFUSED:
         shutil.rmtree(folder)
@@ -85,44 +74,36 @@ def run_cell(config: DictConfig) -> str:
     return record.status
 
 
-def _check(config: DictConfig) -> None:
+def _check(identity: Identity) -> None:
     """Checks a run that is not there yet, before it has a folder; with plan=true, says what it will take.
 
     Raises:
         ValueError: where it would be refused.
     """
-    identity = identify(config, HydraConfig.get().runtime)
-    results_dir = Path(config.results_dir)
-    reused = reusable(results_dir / "runs" / identity.name, identity, config.rerun) is not None
-    if not reused and config.isolation == Isolation.process:
-        warm_up(needed(identity.config))
-    if not reused and (reason := refusals([identity.config], config.isolation)[0]):
+    config = identity.config
+    results_dir = Path(config["results_dir"])
+    reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
+    if not reused and not config["plan"]:
+        warm_up()  # the server of processes loads what runs take, while this process loads what the check takes
+    if not reused and (reason := refusal(config)):
         raise ValueError(reason)
-    if config.plan:
-        cell = PlannedCell(identity.name, [], **identity.choices, seed=identity.config["seed"], config=identity.config)
+    if config["plan"]:
+        cell = planned(identity, [])
         show_plan(Plan("", results_dir, [cell]), {cell.id} if reused else set(), 1)
 
 
-def _stay_in_place(config: DictConfig) -> None:
-    """Makes `results_dir` relative to the driver's working directory where a launcher's worker has another."""
-    driver = Path(HydraConfig.get().runtime.cwd)
-    if driver != Path.cwd():
-        config.results_dir = str(driver / config.results_dir)
-
-
-def run(config: DictConfig) -> tuple[Path, Record]:
-    """Runs a configuration in its folder, or reuses the finished run there; gives the folder and the record.
+def run(identity: Identity) -> tuple[Path, Record]:
+    """Makes a run in its folder, or reuses the finished run there; gives the folder and the record.
 
     Raises:
         OSError: where the results folder cannot be written.
         Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
-    identity = identify(config, HydraConfig.get().runtime)
-    with claimed(Path(config.results_dir), identity, config.rerun) as claim:
+    with claimed(Path(identity.config["results_dir"]), identity, identity.config["rerun"]) as claim:
         if claim.finished is not None:
             return claim.folder, _reuse(claim.folder, claim.finished)
         record = _new_record(identity, claim)
-        return claim.folder, _run_anew(config, claim.folder, record)
+        return claim.folder, _run_anew(Job(claim.folder, record))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
@@ -134,8 +115,9 @@ def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
     return record
 
 
-def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
-    """Runs a configuration; its record says that it is under way, and at the end how it ended."""
+def _run_anew(job: Job) -> Record:
+    """Does a job; its record says that it is under way, and at the end how it ended."""
+    folder, record = job.folder, job.record
     started, stopped, tracker = time.perf_counter(), "", None
 
     def ready() -> None:
@@ -144,14 +126,13 @@ def _run_anew(config: DictConfig, folder: Path, record: Record) -> Record:
 
     try:
         record.write(folder)  # in here, since a signal may come just after it
-        limits = RunLimits(config.time_limit, config.memory_limit)
-        tracker = build(config.tracker, "tracker", list(config.packages))
+        limits, tracker = RunLimits.of(record.config), tracker_of(record.config)
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
         with run_progress(record.name) as progress:
-            _carry_out(Job(config, folder, record), limits, progress, ready)
+            _carry_out(job, limits, progress, ready)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit
         stopped = stopped_by(error)
-        record.status, record.reason = RunStatus.CRASHED, reason_of(error)
+        record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
         if stopped:
             record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:
@@ -178,10 +159,10 @@ def _carry_out(job: Job, limits: RunLimits, progress: Report, ready: Callable[[]
         progress: is told of each step.
         ready: is called when the child has imported what it needs.
     """
-    if job.config.isolation == Isolation.off:
-        from bench.run.execute import execute  # it imports torch, which otherwise only the child does
+    if job.record.config["isolation"] == Isolation.off:
+        from bench.run.execute import execute  # it imports torch, which a launcher's worker does without
 
-        execute(job.config, job.folder, job.record, progress=progress, checkpoint=lambda r: r.write(job.folder))
+        execute(job, progress=progress, checkpoint=lambda record: record.write(job.folder))
         return
 
     def receive(message: Message) -> None:

@@ -8,34 +8,27 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from hydra._internal.config_repository import CachingConfigRepository
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import Isolation, Rerun, check_label, check_names
-from bench.progress import display, notice
-from bench.records.expected import Remaining
-from bench.records.files import digest
-from bench.records.folder import identify, reusable
+from bench.config import Isolation, Rerun
+from bench.progress import display
+from bench.records.folder import Identity, reusable
 from bench.records.format import number, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
-from bench.run.check import check_apart, check_plan, identity_of, warm_up
-from bench.run.plan import Shown, remaining, show_plan
-from bench.targets import check_targets
+from bench.run.check import check_plan
+from bench.run.compose import identity_of, make_plan
+from bench.run.plan import Remaining, Shown, remaining, show_plan
+from bench.run.process import warm_up
 
 IN_LINE = {  # metrics in the line of a cell
     "recommended_field": Metric("recommended"),
     **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
 }
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
-COMPOSED = 0.1  # seconds that composing a cell takes
-SILENT = 3.0  # seconds above which a sweep says how long it plans
 
 
 class Refused(BaseException):
@@ -46,13 +39,6 @@ class Refused(BaseException):
         self.why = why
 
 
-class ReadOnce(CachingConfigRepository):
-    """The files of the configuration, each read once for all cells; Hydra's own repository is copied for each cell."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ReadOnce":
-        return self
-
-
 class Sweep:
     """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs.
 
@@ -60,7 +46,7 @@ class Sweep:
     """
 
     plan: Plan | None = None
-    other: Callable[[DictConfig], None] | None = None
+    other: Callable[[Identity], None] | None = None
     shown = ExitStack()
 
     @classmethod
@@ -80,7 +66,7 @@ class Sweep:
 class Planner(Callback):
     """Hydra's callback that writes the plan before a sweep's first cell; see conf/config.yaml.
 
-    The plan composes every cell, which takes `COMPOSED` each; Hydra's own check would do so once more.
+    The plan composes every cell; Hydra's own check, which would do so once more, is left out.
     """
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
@@ -103,11 +89,11 @@ class Planner(Callback):
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
 
-    def list_others(self, config: DictConfig, tell: Callable[[DictConfig], None]) -> None:
+    def list_others(self, config: DictConfig, tell: Callable[[Identity], None]) -> None:
         """Lists the cells of a sweep that are no runs, in this process."""
         try:
             for cell in make_plan(config).cells:
-                tell(OmegaConf.create(cell.config))
+                tell(identity_of(cell))
         except Exception as error:
             raise Refused(error) from error
         raise Shown
@@ -116,43 +102,6 @@ class Planner(Callback):
         """Gives Hydra its own check back."""
         if Sweep.other is None:
             Sweeper.validate_batch_is_legal = self.check
-
-
-def make_plan(config: DictConfig) -> Plan:
-    """All cells of the sweep that the command line describes.
-
-    Raises:
-        HydraException, OmegaConfBaseException: where a cell cannot be composed.
-        ValueError: where the sweep has no cell.
-    """
-    loader: Any = GlobalHydra.instance().config_loader()
-    loader.repository = ReadOnce(loader.repository)
-    params = OmegaConf.select(config, "hydra.sweeper.params") or {}
-    typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
-    cells: list[PlannedCell] = []
-    swept = combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task])
-    if len(swept) * COMPOSED > SILENT:
-        notice(f"planning {len(swept)} cells, about {seconds(len(swept) * COMPOSED)}")
-    for cell in swept:
-        composed = loader.load_sweep_config(config, cell)
-        plain = _without_hydra(composed)
-        check_names(plain)
-        check_label(plain, cell)
-        by_hand = [override for override in cell if _key(override) in typed]
-        check_targets(plain, by_hand, composed.hydra.runtime.choices.get("renderer", ""))
-        try:
-            check_apart(plain)
-        except ValueError as error:
-            raise ValueError(f"cell {len(cells) + 1} ({' '.join(cell)}): {error}; nothing was run") from error
-        identity = identify(plain, composed.hydra.runtime)
-        cells.append(
-            PlannedCell(identity.name, cell, **identity.choices, seed=identity.config["seed"], config=identity.config)
-        )
-    if not cells:
-        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
-    first = cells[0].config
-    name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
-    return Plan(name, Path(first["results_dir"]), cells)
 
 
 def is_reused(plan: Plan, cell: PlannedCell) -> bool:
@@ -167,26 +116,6 @@ def workers_of(config: DictConfig) -> int:
         if (count := OmegaConf.select(config, f"hydra.launcher.{key}")) is not None:
             return max(int(count), 1) if count > 0 else os.cpu_count() or 1
     return 1
-
-
-def combinations(texts: list[str]) -> list[list[str]]:
-    """The overrides of each cell, from those of a sweep, such as `seed=0,1`, in the order in which Hydra runs them.
-
-    Together with `Planner` and `ReadOnce` it is all that uses what is internal to Hydra's sweeps.
-    """
-    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-    return BasicSweeper.split_arguments(parser.parse_overrides(texts), None)[0]
-
-
-def _key(override: str) -> str:
-    return override.partition("=")[0].lstrip("+~")
-
-
-def _without_hydra(config: DictConfig) -> DictConfig:
-    plain = config.copy()
-    OmegaConf.set_struct(plain, False)
-    del plain["hydra"]
-    return plain
 
 
 @contextmanager

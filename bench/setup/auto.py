@@ -4,18 +4,17 @@ Each follows by an equation from the view and the renderer's other settings: `re
 samples per ray follows from the shape and changes during an optimisation: see `renderers.adaptive_samples`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil, inf, isnan, log, radians, sin
-from typing import Any, cast
-
-from omegaconf import DictConfig, OmegaConf
+from typing import Any
 
 from datasets.views import ViewSampler
 from renderers.adaptive_samples import samples
 from renderers.checks import check_positive, check_share
 
 AUTO = "auto"
+Node = Mapping[str, Any]  # of the renderer
 RADIUS = 1.0  # of the unit sphere, which holds every shape
 
 
@@ -43,7 +42,7 @@ class AutoSettings:
             raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
 
 
-def epsilon(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> float:
+def epsilon(view: ViewSampler, renderer: Node, settings: AutoSettings) -> float:
     """Half a pixel (`footprint`), but no more than adds a given share of spurious hits.
 
     Rays that pass by within epsilon are hits, so that an outline grows by epsilon: by epsilon * perimeter / area of the
@@ -68,7 +67,7 @@ def half_pixel(focal_length: float, depth: float) -> float:
     return depth / (2 * focal_length)
 
 
-def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+def steps(view: ViewSampler, renderer: Node, settings: AutoSettings) -> int:
     """Steps from a unit away to a surface that is met at the grazing angle or any larger one (DIST, Eq. 8).
 
     A step leaves |1 - alpha sin(theta)| of the distance; for alpha > 1 that grows again towards normal incidence.
@@ -78,7 +77,7 @@ def steps(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> in
     """
     if "epsilon" not in renderer:
         raise ValueError("renderer.steps=auto needs renderer.epsilon, which this renderer does not have: give a number")
-    alpha, epsilon = float(renderer.get("alpha", 1.0)), float(renderer.epsilon)
+    alpha, epsilon = float(renderer.get("alpha", 1.0)), float(renderer["epsilon"])
     check_positive("renderer.epsilon", epsilon, "renderer.epsilon=auto is a pixel's precision")
     left = max(abs(1 - alpha * sin(radians(settings.grazing))), alpha - 1)
     if left >= 1:
@@ -101,12 +100,12 @@ def rays_share(least: float, footprint: float, error: float) -> float:
     return min(max((footprint / max(error, footprint)) ** 2, least), 1.0)
 
 
-def first_samples(view: ViewSampler, renderer: DictConfig, settings: AutoSettings) -> int:
+def first_samples(view: ViewSampler, renderer: Node, settings: AutoSettings) -> int:
     """The number of samples per ray before any part of the shape has been seen."""
     return samples(inf, RADIUS)
 
 
-FORMULAS: dict[str, Callable[[ViewSampler, DictConfig, AutoSettings], Any]] = {
+FORMULAS: dict[str, Callable[[ViewSampler, Node, AutoSettings], Any]] = {
     "epsilon": epsilon,
     "steps": steps,
     "n_ray_samples": first_samples,
@@ -120,21 +119,18 @@ LIMITED = {  # what a value holds for
 CHANGING = {"n_ray_samples": ("begins with", "and follows the thinnest part that is seen")}  # during an optimisation
 
 
-def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) -> tuple[DictConfig, list[str]]:
+def resolved(renderer: Node, view: ViewSampler, settings: AutoSettings) -> tuple[Node, list[str]]:
     """The renderer's node with a number for each `auto`, in the order of `FORMULAS`, and a note on each.
 
     Raises:
         ValueError: for `auto` where there is no equation.
     """
-    values: Any = OmegaConf.to_container(renderer, resolve=True)
-    requested = [name for name, value in values.items() if value == AUTO]
-    if not requested:
-        return renderer, []
+    requested = [name for name, value in renderer.items() if value == AUTO]
     for name in requested:
         if name not in FORMULAS:
             known = ", ".join(FORMULAS)
             raise ValueError(f"renderer.{name}=auto has no equation: only {known} have one; give a number")
-    node, notes = OmegaConf.create(values), []
+    node, notes = dict(renderer), []
     for name in [name for name in FORMULAS if name in requested]:
         node[name] = FORMULAS[name](view, node, settings)
         seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
@@ -144,7 +140,7 @@ def resolved(renderer: DictConfig, view: ViewSampler, settings: AutoSettings) ->
     return node, notes
 
 
-def at_pixel_precision(renderer: DictConfig) -> DictConfig:
+def at_pixel_precision(renderer: Node) -> Node:
     """The renderer's node with `auto` for its settings in `PIXEL_PRECISION`; unchanged where it has no epsilon."""
     names = [name for name in PIXEL_PRECISION if name in renderer and "epsilon" in renderer]
-    return cast(DictConfig, OmegaConf.merge(renderer, dict.fromkeys(names, AUTO)))
+    return {**renderer, **dict.fromkeys(names, AUTO)}

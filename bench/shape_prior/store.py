@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from bench.config import build
 from bench.machine.environment import describe
 from bench.progress import Report, notice
 from bench.records.files import digest, file_lock, to_json, write_text
@@ -24,11 +22,6 @@ from renderers.fields.mlp import Decoder
 SHIPPED = Path(__file__).resolve().parents[2] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
 HELD_OUT = 8  # validation shapes on which a new prior is evaluated
-
-
-def prior_settings(config: DictConfig) -> PriorSettings:
-    """The `prior` node."""
-    return build(config.prior, "prior", target="bench.shape_prior.autodecoder.PriorSettings")
 
 
 def prior_for(

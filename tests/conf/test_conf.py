@@ -10,11 +10,11 @@ import yaml
 from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, build, check_names, load
+from bench.config import CONF, build, check_draw, check_names, load
 from bench.hints import nearest
 from bench.pictures import style
 from bench.pictures.style import look
-from bench.run.sweep import combinations
+from bench.run.compose import combinations
 from bench.tables import GROUPS, choice, names, read_yaml
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
@@ -514,8 +514,8 @@ def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
 
 def test_a_draw_is_refused_where_no_setting_is_drawn(compose_config):
     with pytest.raises(ValueError, match=r"draw is read by a method of method/space alone: add \+method=space/NAME"):
-        check_names(compose_config("renderer=dist", "draw=3"))
-    check_names(compose_config("+method=space/dist_mask", "draw=3"))
+        check_draw(compose_config("renderer=dist", "draw=3"))
+    check_draw(compose_config("+method=space/dist_mask", "draw=3"))
 
 
 def test_a_name_of_a_folder_is_compared_with_the_names_there():

@@ -9,14 +9,14 @@ import torch
 from bench.config import load
 from bench.records.record import Record
 from bench.run.execute import execute
+from bench.run.messages import Job
 from bench.setup.auto import samples
-from bench.setup.inputs import set_up
 from renderers.adaptive_samples import Following, Seen, at_max_samples, follow, thickness, thinnest
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Observed, Renderer, Scheduled, Status, at_iteration, final_notes, fresh
 from tests.renderers.analytic_cases import vector
-from tests.tiny import camera_of, silent
+from tests.tiny import camera_of, cell_from, plain, silent
 
 DVR = load("renderer", "dvr", doublings=[])
 PLATE = box((0.5, 0.5, 0.025))
@@ -150,19 +150,19 @@ def test_other_samples_and_many_optimisations_are_refused(compose_config):
     for name in ("dist", "naive"):
         config = compose_config(f"renderer={name}", "+renderer.n_ray_samples=auto")
         with pytest.raises(ValueError, match=r"renderer has no key 'n_ray_samples': did you mean n_gradient_samples"):
-            set_up(config, silent)
+            cell_from(config)
         with pytest.raises(
             ValueError, match=r"renderer\.n_gradient_samples=auto has no equation: only epsilon, steps, n_ray"
         ):
-            set_up(compose_config(f"renderer={name}", "renderer.n_gradient_samples=auto"), silent)
+            cell_from(compose_config(f"renderer={name}", "renderer.n_gradient_samples=auto"))
         with pytest.raises(ValueError, match=r"for samples spaced along the ray .* has no with_samples that sets them"):
             follow(load("renderer", name))
     with pytest.raises(ValueError, match=r"follows one optimisation, and a stress has many trials"):
-        set_up(compose_config(*RUN, "task=stability", "stress=thin_plate"), silent)
+        cell_from(compose_config(*RUN, "task=stability", "stress=thin_plate"))
 
 
 def test_a_number_is_left_as_it_is(compose_config):
-    stage = set_up(compose_config("renderer=dvr"), silent)
+    stage = cell_from(compose_config("renderer=dvr")).inputs()
     assert (type(stage.renderer), stage.notes, stage.last_notes) == (type(DVR), (), [])
 
 
@@ -171,8 +171,8 @@ def test_a_run_notes_the_first_and_the_final_number(compose_config, tmp_path):
         *RUN, "task=pose", "task.shape=formula", "task.optimiser.iterations=3", "view.resolution=16",
         "evaluation.picture=null", "device=cpu",
     )  # fmt: skip
-    record = Record("id", "pose", "dvr", "sphere", 0, {"label": None})
-    execute(config, tmp_path, record, progress=silent, checkpoint=lambda record: None)
+    record = Record("id", "pose", "dvr", "sphere", 0, plain(config))
+    execute(Job(tmp_path, record), progress=silent, checkpoint=lambda record: None)
     assert record.status in ("ok", "not_reached"), record.reason
     first, last = (note for note in record.notes if note.startswith("renderer.n_ray_samples=auto"))
     assert first == "renderer.n_ray_samples=auto begins with 16, and follows the thinnest part that is seen"

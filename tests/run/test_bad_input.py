@@ -11,13 +11,18 @@ from pathlib import Path
 import pytest
 import torch
 import trimesh
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from bench.__main__ import main
+from bench.config import CONF, register
 from bench.records import folder as run_folder
-from bench.run.command import options_first
-from bench.setup import inputs as stage
-from tests.report.page_data import Page
+from bench.run import cell
+from bench.run.check import identified, refusal
+from bench.run.command import _explain, options_first
 from tests.run.driving import PATIENCE, ROOT, Outcome, driver, lines_of_curves, wait_for
 
 TINY = ("scale=smoke", "view.resolution=16", "task.points=20", "evaluation.grid=16", "evaluation.points=100")
@@ -49,7 +54,7 @@ def no_prior(monkeypatch):
     def slow(*_):
         raise AssertionError("the slow steps began")
 
-    monkeypatch.setattr(stage, "prior_for", slow)
+    monkeypatch.setattr(cell, "prior_for", slow)
 
 
 def assert_one_line(err: str, *words: str) -> None:
@@ -98,12 +103,60 @@ def assert_one_line(err: str, *words: str) -> None:
         ("--multi", ("unknown option '--multi'", "did you mean --multirun")),
     ],
 )
-def test_a_command_line_that_cannot_be_is_told_with_the_nearest_name(bench, tmp_path, argument, words):
+def test_a_command_line_that_cannot_be_is_told_with_the_nearest_name(monkeypatch, argument, words):
+    assert_one_line(explained(monkeypatch, argument), *words)
+
+
+def explained(monkeypatch, *arguments: str) -> str:
+    """What is said of a command line that cannot be; empty where it can."""
+    monkeypatch.setattr(sys, "argv", ["bench", *arguments])
+    GlobalHydra.instance().clear()
+    register()
+    try:
+        overrides = options_first([*arguments])
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", overrides, return_hydra_config=True)
+        runtime = config.hydra.runtime
+        OmegaConf.set_struct(config, False)
+        del config["hydra"]
+        return refusal(identified(config, runtime, overrides, overrides).config)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        return _explain(error)
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("renderer=dits", ("unknown renderer 'dits'", "did you mean dist")),
+        ("renderer.alhpa=1", ("unknown key 'renderer.alhpa'", "did you mean renderer.alpha")),
+        ("seed=x", ("seed", "'x'", "Integer")),
+        ("renderer=dist,,dvr", ("'renderer=dist,,dvr' has a comma without a value beside it",)),
+        ("renderer=dist,dvr", ("renderer has several values: add -m for a run of each, write renderer=[dist,dvr]",)),
+        ("newton", ("'newton' is no setting: write renderer=newton",)),
+        ("--multi", ("unknown option '--multi'", "did you mean --multirun")),
+        ("renderer.steps=0", ("steps must be at least 1, not 0",)),
+    ],
+)
+def test_the_command_says_so_in_a_line_and_leaves_nothing(bench, tmp_path, no_prior, argument, words):
     code, out, err = bench(argument)
-    assert code == 2
+    assert (code, out) == (2, "")
     assert_one_line(err, "error: ", *words)
-    assert out == ""
-    assert not (tmp_path / "r").exists()
+    assert not list((tmp_path / "r" / "runs").glob("*"))
+
+
+def test_a_results_folder_without_a_name_is_told(bench, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = bench("results_dir=")
+    assert code == 2 and not list(tmp_path.iterdir())
+    assert_one_line(err, "results_dir must name a folder")
+
+
+@pytest.mark.parametrize("word", ["list", "help", "--help"])
+def test_a_word_lists_what_there_is(bench, word):
+    code, out, err = bench(word)
+    assert (code, err) == (0, "")
+    for name in ("completion", "newton", "sofa", *(["table1", "dist_mask"] if word == "list" else ["-m +experiment="])):
+        assert name in out
 
 
 @pytest.mark.parametrize(
@@ -127,7 +180,7 @@ def test_options_may_stand_anywhere(given, arranged):
 def test_a_mask_loss_that_no_task_reads_is_told_before_any_run(bench, tmp_path, multirun):
     code, _, err = bench(*multirun, "task=gradients", "silhouette=hinge,own" if multirun else "silhouette=hinge")
     assert code == 2
-    assert_one_line(err, "error: silhouette is read by task=completion")
+    assert_one_line(err, "cell 1 of 2 (silhouette=hinge): " if multirun else "error: ", "silhouette is read by")
     assert not (tmp_path / "r" / "runs").exists()
 
 
@@ -175,12 +228,8 @@ def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior, optio
         ("dataset=mesh", ("dataset.path must be given: set dataset.path=",)),
     ],
 )
-def test_a_value_that_cannot_be_is_told_before_anything_slow(bench, tmp_path, no_prior, argument, words):
-    code, out, err = bench(argument)
-    assert code == 2
-    assert_one_line(err, "error: ", *words)
-    assert out == ""
-    assert not list((tmp_path / "r" / "runs").glob("*"))
+def test_a_value_that_cannot_be_is_told_before_anything_slow(monkeypatch, no_prior, argument, words):
+    assert_one_line(explained(monkeypatch, argument), *words)
 
 
 def test_more_points_than_pixels_are_told(bench):
@@ -284,14 +333,14 @@ def test_a_results_folder_that_cannot_be_written_is_told(bench, tmp_path, where)
     assert_one_line(err, "error: ", told, "set results_dir to a folder you can write")
 
 
-def test_a_disk_that_is_full_from_the_start_is_told(bench, monkeypatch):
+def test_a_disk_that_is_full_from_the_start_is_told(bench, tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
     code, _, err = bench()
     assert code == 1
-    assert_one_line(err, "error: ", "No space left on device", "free space")
+    assert_one_line(err, "error: ", f"No space left on device ({tmp_path / 'r'})", "free space")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
@@ -306,8 +355,7 @@ def test_a_disk_that_fills_up_during_a_run_is_told(bench, monkeypatch):
     assert "Traceback" not in out + err
     assert_one_line(err, "No space left on device")
     record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
-    full = "[Errno 28] No space left on device: free space, or set results_dir to a folder on another disk"
-    assert (record["status"], record["reason"]) == ("crashed", full)
+    assert record["status"] == "crashed" and f"({Path(out.splitlines()[-1])}): free space" in record["reason"]
 
 
 @pytest.mark.parametrize(
@@ -361,6 +409,11 @@ def test_help_is_there_before_anything_slow_is_loaded():
         assert word in done.out
 
 
+def test_help_may_be_read_in_part():
+    done = subprocess.run(f"{sys.executable} -m bench --help | head -n 1", shell=True, cwd=ROOT, capture_output=True)
+    assert done.returncode == 0 and done.stdout.startswith(b"`python -m bench") and done.stderr == b""
+
+
 def test_a_real_process_that_is_refused_ends_with_one_line_and_no_folder(tmp_path):
     with driver(tmp_path / "output", "view.resolution=-3", f"results_dir={tmp_path}") as running:
         done = running.ended()
@@ -392,7 +445,6 @@ def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path, name):
         counted = record["evaluations"]["iterations"]  # an iteration counts just before its line is written
         assert counted in (len(lines), len(lines) + 1)
         assert record["metrics_start"]
-        assert folder.name in Page(tmp_path).folders
     else:
         assert stopped.code == -signal.SIGKILL
         assert "killed before it could say why" in record["reason"]

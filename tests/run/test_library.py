@@ -10,6 +10,7 @@ import pytest
 
 import bench
 from bench.report.data import frame
+from bench.report.write.html import write_index
 from bench.run import library
 from tests.report.page_data import Page
 from tests.run.driving import ROOT, Outcome, command
@@ -91,16 +92,22 @@ def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, co
         bench.run(renderer="dits")
 
 
+def test_a_text_in_place_of_a_list_is_told():
+    with pytest.raises(ValueError, match=r"takes a list of overrides, not 'completion': bench.run\(\['task=comp"):
+        bench.run("completion")
+
+
 def test_a_run_that_failed_is_a_record(within):
     record = bench.run(["+renderer.how=raise"], renderer="custom", scale="smoke", **{
         "renderer._target_": "tests.failing.Failing"
     })  # fmt: skip
-    assert record.status == "crashed" and record.reason
+    assert record.status == "crashed" and record.reason in str(record) and len(str(record)) < 300
     assert record.folder.parent == within / "results" / "runs"
 
 
 def test_the_lines_of_the_page_open_the_run_and_make_it_again(within):
     made = bench.run(scale="smoke", renderer="newton", seed=3)
+    write_index(within / "results")
     shown = Page(within / "results").run(made.id)
     opened: dict = {}
     exec(shown["python"], opened)

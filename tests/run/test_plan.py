@@ -1,44 +1,49 @@
 """plan=true lists what would run, with the time that like runs took, and leaves nothing behind."""
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from bench.machine.processor import cpu_name
+from bench.prior import main as prior_main
 from bench.records.record import Record, RunStatus
+from bench.run import compose, sweep
 from bench.run import run as run_module
-from bench.run import sweep
-from bench.run.plan import told
-from tests.records.test_expected import expected
+from bench.run.plan import Estimates, Remaining
+from bench.shape_prior import store as priors
+from bench.single_view import store as networks
+from bench.train import main as train_main
 from tests.run.driving import command
 
 SWEEP = ("-m", "scale=smoke", "isolation=off", "threads=1", "renderer=dist,dvr", "seed=0,1")
+SMALL = ("scale=smoke", "threads=1", "device=cpu")
+OF_PRIOR = (prior_main, *SMALL)
+OF_NETWORK = (train_main, "+method=single_view", "task.training.steps=7", "task.shapes=3", *SMALL)
 
 
 @pytest.fixture
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusals", lambda configs, isolation: [""])
+    monkeypatch.setattr(run_module, "refusal", lambda config: "")
     return tmp_path / "r"
 
 
-def planned(results: Path) -> list[sweep.PlannedCell]:
+def planned(results: Path, *arguments: str) -> list[sweep.PlannedCell]:
     plans = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep, "show_plan", lambda plan, *_: plans.append(plan))
-        assert command(*SWEEP, "plan=true", f"results_dir={results}").code == 0
+        assert command(*(arguments or SWEEP), "plan=true", f"results_dir={results}").code == 0
     return plans[0].cells
 
 
-def write(results: Path, cell: sweep.PlannedCell, seconds: float, waited: float = 0.0) -> None:
+def write(results: Path, cell: sweep.PlannedCell, seconds: float) -> None:
     names = ("id", "task", "renderer", "dataset", "seed", "config")
     record = Record(**{name: value for name, value in asdict(cell).items() if name in names}, status=RunStatus.OK)
     record.ended, record.seconds = record.started, {"total": seconds}
-    record.environment = {"cpu": cpu_name(), "waited_share": waited}
-    identity = sweep.identity_of(cell)
+    identity = compose.identity_of(cell)
     record.config_hash, record.code = identity.config_hash, identity.code
     (results / "runs" / cell.id).mkdir(parents=True)
     record.write(results / "runs" / cell.id)
@@ -54,39 +59,48 @@ def test_a_sweep_is_listed_and_nothing_is_left(results):
     assert not results.exists()
 
 
-def test_what_is_there_is_reused_and_tells_of_the_others(results):
+def test_what_is_there_is_reused_and_tells_of_like_runs(results):
     cells = planned(results)
     write(results, cells[0], 30.0)
     before = sorted(results.rglob("*"))
     *lines, whole = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
-    assert [line.split("  ")[-1] for line in lines] == [
-        "reused", "about 30.0 s (1 like run)", *["about 30.0 s (1 run of other renderers)"] * 2
-    ]  # fmt: skip
-    assert whole == "4 planned: 3 to run, 1 reused; about 90.0 s (n = 1 each), 1 at a time"
+    assert [line.split("  ")[-1] for line in lines] == ["reused", "about 30.0 s (1 like run)", *["no like run"] * 2]
+    assert whole == (
+        "4 planned: 3 to run, 1 reused, 2 without a like run; about 30.0 s, 1 at a time, and what the 2 take; "
+        "a prior that has to be trained first comes on top"
+    )
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
-    assert again.splitlines()[-1] == "4 planned: 4 to run; about 60.0 s (n = 1 each), 2 at a time"
+    assert "; about 30.0 s, 2 at a time, and" in again.splitlines()[-1]
 
 
-def test_only_several_like_runs_give_a_range(results):
-    for cell, seconds in zip(planned(results)[:2], (20.0, 40.0), strict=True):
-        write(results, cell, seconds)
-    *_, whole = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
-    assert whole == "4 planned: 2 to run, 2 reused; about 60.0 s (40.0 s to 80.0 s), 1 at a time"
+@pytest.mark.parametrize("arguments", [
+    ("-m", "scale=smoke", "renderer.alpha=1.5,2,null", "seed=range(0,3)", "label=a,'b c','${renderer._label_}'"),
+    ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3", "split=test,train"),
+    ("-m", "renderer=dist,dvr", "++task.points=20,30", "index=0,1", "evaluation={grid:9}", "evaluation.points=4,5"),
+])  # fmt: skip
+def test_a_cell_is_what_hydra_makes_of_it(results, monkeypatch, arguments):
+    quick = planned(results, *arguments)
+    monkeypatch.setattr(compose.Composer, "_sets_a_value", lambda *_: False)
+    monkeypatch.setattr(compose, "ReadOnce", lambda repository: repository)
+    assert planned(results, *arguments) == quick
+    assert len({cell.id for cell in quick}) == len(quick)
 
 
-def test_files_that_are_read_once_give_the_same_cells(results, monkeypatch):
-    once = planned(results)
-    monkeypatch.setattr(sweep, "ReadOnce", lambda repository: repository)
-    assert planned(results) == once
-    assert len({cell.id for cell in once}) == 4
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("seed=0,1,x",), "Value 'x' of type 'str' could not be converted to Integer"),
+    (("renderer.steps=3", "renderer.stebs=1,2"), "unknown key 'renderer.stebs'"),
+])  # fmt: skip
+def test_a_value_that_cannot_be_set_is_told_as_hydra_tells_it(results, arguments, words):
+    done = command("-m", *arguments, "plan=true", f"results_dir={results}")
+    assert done.code == 2 and words in done.err and len(done.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("silent", [0.0, 100.0])
 def test_a_sweep_that_is_planned_for_long_says_so(results, monkeypatch, silent):
-    monkeypatch.setattr(sweep, "SILENT", silent)
+    monkeypatch.setattr(compose, "SILENT", silent)
     done = command(*SWEEP, "plan=true", f"results_dir={results}")
-    assert done.err.splitlines() == (["planning 4 cells, about 400 ms"] if silent == 0 else [])
+    assert done.err.startswith("planning 4 cells, about ") is (silent == 0)
 
 
 def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(results, monkeypatch):
@@ -120,13 +134,98 @@ def test_that_it_was_planned_does_not_change_a_run(results):
     assert "reused" in command(*SWEEP, "plan=true", f"results_dir={results}").out
 
 
-def test_an_estimate_says_how_sure_it_is():
-    assert told(None) == "no like run"
-    assert told(next(iter(expected(10.0).values()))) == "about 10.0 s (1 like run), +1.00 kB"
+def run(total=10.0, *, status="ok", renderer="dist", task="completion", scale="smoke", **more):
+    return {
+        "task": task, "renderer": renderer, "method": "", "status": status, "seconds": {"total": total},
+        "config": {"scale": {"name": scale}},
+    } | more  # fmt: skip
 
 
-def test_an_estimate_from_a_loaded_machine_says_so(results):
-    write(results, planned(results)[0], 30.0, waited=0.6)
-    *_, whole, note = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
-    assert "about 90.0 s" in whole
-    assert note == "note: like runs waited 60% of their time for a processor; alone on it, it is about 36.0 s"
+def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_time():
+    unlike = [run(1.0, task="pose"), run(1.0, renderer="dvr"), run(1.0, scale="desk"), run(1.0, method="dist_mask")]
+    broken = [run(1.0, status=status) for status in ("crashed", "killed", "oom", "refused", "not_run")]
+    odd = [run(float("inf")), run(None), run(0.0), run(1.0, config={"scale": 3}), run(1.0, config={"scale": None})]
+    assert Estimates([*unlike, *broken, *odd]).of(run()) == []
+    assert Estimates([*unlike, run(2.0), run(3.0, status="timeout")]).of(run()) == [2.0, 3.0]
+
+
+def left_of(cells: int, *took: float, workers: int = 1) -> Remaining:
+    return Remaining({str(n): run() for n in range(cells)}, Estimates([run(seconds) for seconds in took]), workers)
+
+
+def test_the_time_left_is_the_median_of_like_runs_for_each_cell_and_learns_from_those_that_end():
+    assert left_of(3).left(5.0) is None
+    assert left_of(6, 10.0, 20.0, 90.0, workers=2).left(0.0) == pytest.approx(60.0)
+    left = left_of(4, 10.0)
+    left.cells["3"] = run(renderer="dvr")  # without a like run: it takes what the others take
+    assert left.left(0.0) == pytest.approx(40.0)
+    left.ended("0", run(30.0), 30.0)
+    left.ended("1", run(30.0), 60.0)
+    assert [left.left(60.0), left.left(70.0), left.left(999.0)] == pytest.approx([60.0, 50.0, 0.0])
+
+
+@pytest.mark.parametrize("ended", [{"status": "crashed"}, {"status": "killed"}, {"reused": True}])
+def test_a_cell_that_did_not_take_its_whole_time_does_not_stand_for_the_others(ended):
+    left = left_of(3, 10.0)
+    left.ended("0", run(0.1) | ended, 0.1)
+    left.ended("a reused one", run(0.1), 0.1)
+    assert left.left(0.1) == pytest.approx(20.0)
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch, capsys):
+    """The exit status and the outputs of a command with plan=true, in which nothing can be trained."""
+
+    def never(*_, **__):
+        raise AssertionError("it trains")
+
+    monkeypatch.setattr(priors, "train", never)
+    monkeypatch.setattr(priors, "distance_samples", never)
+    monkeypatch.setattr(networks, "train", never)
+    monkeypatch.setattr(networks.Imaging, "images", never)
+
+    def run(main, *arguments: str) -> tuple[int, list[str], str]:
+        monkeypatch.setattr(sys, "argv", ["bench", "plan=true", f"results_dir={tmp_path / 'r'}", *arguments])
+        code = main()
+        done = capsys.readouterr()
+        return code, done.out.splitlines(), done.err
+
+    return run
+
+
+@pytest.mark.parametrize(("command", "what"), [
+    (OF_PRIOR, "prior of sphere: shapes 24, steps 500"),
+    (OF_NETWORK, "network of sphere: shapes 3, images of each 24, steps 7"),
+])  # fmt: skip
+def test_it_says_what_would_be_trained_and_leaves_nothing(trained, tmp_path, command, what):
+    assert trained(*command, "dataset=sphere") == (0, [f"{what}  to be trained"], "")
+    assert not (tmp_path / "r").exists()
+
+
+def test_what_is_there_is_not_trained(trained):
+    assert "there already: " in trained(prior_main, "dataset=sofa")[1][0]
+    assert "there already: " in trained(train_main, "+method=single_view", "dataset=sofa")[1][0]
+
+
+def test_a_stopped_training_goes_on(trained, monkeypatch):
+    known = []
+    monkeypatch.setattr(networks.Recipe, "find", lambda self, cache: known.append((self, cache)))
+    trained(*OF_NETWORK, "dataset=sphere")
+    (recipe, cache), *_ = known
+    cache.mkdir(parents=True)
+    (cache / f"{recipe.stem}.state").write_text("")
+    assert trained(*OF_NETWORK, "dataset=sphere")[1][0].endswith("  was stopped, and goes on where it was")
+
+
+def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
+    where = f"results_dir={tmp_path / 'r'}"
+    monkeypatch.setattr(sys, "argv", ["bench", "-m", "dataset=sofa,plane", where])
+    assert prior_main() == 0
+    assert [Path(line).name.split("-")[0] for line in capsys.readouterr().out.splitlines()] == ["sofa", "plane"]
+    assert not list((tmp_path / "r").rglob("plan.json"))
+
+
+@pytest.mark.parametrize("command", [OF_PRIOR, OF_NETWORK])
+def test_what_cannot_be_is_told(trained, command):
+    code, out, err = trained(*command, "dataset=mesh", "dataset.path=none.ply")
+    assert (code, out) == (2, []) and "none.ply" in err and len(err.splitlines()) == 1

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 import pytest
 
 from bench.run import process
-from bench.run.process import RunLimits, Started, Step, _watch
+from bench.run.messages import Started, Step
+from bench.run.process import RunLimits, _watch
 from tests.run.driving import FAILING, ROOT, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds

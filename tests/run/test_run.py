@@ -21,8 +21,9 @@ from bench.config import EvaluationSettings
 from bench.evaluate.evaluate import Evaluation
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus
+from bench.report.write.html import write_index
+from bench.run import cell as cell_module
 from bench.run import execute
-from bench.setup import inputs as stage_module
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
 from bench.solve.optimise import History
@@ -31,7 +32,7 @@ from datasets.scene import Scene
 from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome, command
 from tests.solve.test_optimise import POINTS, Toy
-from tests.tiny import ball_prior, silent
+from tests.tiny import ball_prior, cell_from, silent
 
 TINY = (
     "scale=smoke", "task.optimiser.iterations=6", "view.resolution=16", "task.points=20",
@@ -102,7 +103,7 @@ def test_it_ends_well_and_its_last_line_is_its_folder(finished):
 
 
 def test_its_summary_has_its_metrics_and_the_command_for_the_page_which_it_leaves_alone(finished):
-    assert f"page and tables: python -m bench.report results_dir={finished.results}" in finished.stdout.splitlines()
+    assert f"page and tables: python -m bench.report results_dir='{finished.results}'" in finished.stdout.splitlines()
     assert not (finished.results / "index.html").exists()
     assert "Chamfer" in finished.stdout
 
@@ -233,6 +234,7 @@ def test_the_record_has_what_the_command_line_set(finished):
 
 
 def test_the_report_has_the_run(finished):
+    write_index(finished.results)
     page = Page(finished.results)
     assert page.folders == [finished.folder.name] and page.text("thumb") == ["summary.png"]
     assert page.run(finished.folder.name)["files"]["mesh.ply"] == f"runs/{finished.folder.name}/mesh.ply"
@@ -287,11 +289,11 @@ def test_the_same_command_run_again_gives_the_same_numbers_and_sets_the_first_as
 def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, error, status, code):
     meanwhile = []
 
-    def fail(config, progress):
+    def fail(config):
         meanwhile.extend(json.loads(path.read_text()) for path in (tmp_path / "results").glob("runs/*/record.json"))
         raise error
 
-    monkeypatch.setattr(execute, "set_up", fail)
+    monkeypatch.setattr(execute, "cell_of", fail)
     found, out, err, folder = bench()
     record = json.loads((folder / "record.json").read_text())
     assert found == code
@@ -303,7 +305,6 @@ def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, 
     assert "Traceback" not in out + err
     assert len(err.strip().splitlines()) == 1
     assert record["reason"] in err
-    assert folder.name in Page(tmp_path / "results").folders
     assert status in (folder / "log.txt").read_text()
     assert ("Traceback" in (folder / "log.txt").read_text()) is isinstance(error, RuntimeError)
 
@@ -408,19 +409,23 @@ def test_a_run_that_looks_on_the_way_ends_as_one_that_does_not(bench):
 def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(compose_config, monkeypatch):
     """DVR draws points: a prior that is trained first uses up random numbers of its own."""
     prior, drawn = ball_prior(), []
-    monkeypatch.setattr(stage_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
+    monkeypatch.setattr(cell_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
     for used in (0, 1000):
-        monkeypatch.setattr(stage_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
-        stage = stage_module.set_up(compose_config("threads=1", "seed=3"), silent)
+        monkeypatch.setattr(cell_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
+        stage = cell_from(compose_config("threads=1", "seed=3")).start(silent)
         assert stage.prior is stage.prior is prior  # made once
         drawn.append(torch.rand(4).tolist())
     assert drawn[0] == drawn[1]
-    stage_module.set_up(compose_config("threads=1", "seed=4"), silent)
+    cell_from(compose_config("threads=1", "seed=4")).start(silent)
     assert torch.rand(4).tolist() != drawn[0]
 
 
 def test_a_task_that_is_none_is_told(bench, monkeypatch):
-    monkeypatch.setattr(execute, "build", lambda *_, **__: Mock(spec=["problem"]))
+    build = cell_module.build
+    none = Mock(spec=["problem"])
+    monkeypatch.setattr(
+        cell_module, "build", lambda node, name, *more: none if name == "task" else build(node, name, *more)
+    )
     code, out, err, _ = bench()
     assert (code, out) == (2, "")
     assert "lacks execute: see bench/tasks/task.py" in err

@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.records.record import read_record
-from bench.trackers import curve, settings, values
-from bench.trackers.mlflow import MLflow
-from bench.trackers.tensorboard import TensorBoard
+from bench.trackers import MLflow, TensorBoard, curve, settings, values
 from datasets.extras import install
 from tests.run.driving import FAILING, record_of
 

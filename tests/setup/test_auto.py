@@ -4,18 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from bench.config import load
 from bench.setup.auto import AutoSettings, epsilon, footprint, resolved, steps
-from bench.setup.inputs import set_up
 from datasets.dataset import Split
 from datasets.views import ViewSampler
 from renderers import Meter
 from renderers.field import Field
 from renderers.fields.analytic import box, sphere
-from tests.tiny import silent
+from tests.tiny import cell_from
 
 VIEW = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 128)
 TEN = AutoSettings(10.0, spurious=0.01, area_over_perimeter=0.07)
@@ -26,13 +24,13 @@ def test_epsilon_is_that_of_the_papers_example():
     # DIST, A.2: f = 60 mm, S = 32 mm, d = 100 mm, R = 512: about 0.05 mm. In scene units, with d = 1 from 2 away:
     field_of_view = 2 * torch.rad2deg(torch.atan(torch.tensor(16 / 60))).item()
     view = ViewSampler(2.0, field_of_view, (0.0, 0.0), (0.0, 0.0), 512)
-    assert epsilon(view, OmegaConf.create({}), TEN) * 100 == pytest.approx(0.0521, rel=1e-3)
+    assert epsilon(view, {}, TEN) * 100 == pytest.approx(0.0521, rel=1e-3)
 
 
 def test_steps_are_those_of_the_papers_example():
     # DIST, A.1: 52 steps at alpha 1 and 33 at 1.5, at 10 degrees and epsilon 5e-5.
-    assert steps(VIEW, OmegaConf.create({"epsilon": 5e-5, "alpha": 1.0}), TEN) == 52
-    assert steps(VIEW, OmegaConf.create({"epsilon": 5e-5, "alpha": 1.5}), TEN) == 33
+    assert steps(VIEW, {"epsilon": 5e-5, "alpha": 1.0}, TEN) == 52
+    assert steps(VIEW, {"epsilon": 5e-5, "alpha": 1.5}, TEN) == 33
 
 
 @pytest.mark.parametrize(
@@ -40,23 +38,23 @@ def test_steps_are_those_of_the_papers_example():
     [(1.5, 30.0, 15), (1.5, 41.81, 15), (1.0, 90.0, 1), (1.0, 30.0, 15), (0.5, 90.0, 15), (1.0, 89.9, 1)],
 )
 def test_steps_reach_every_surface_that_is_met_at_the_angle_or_above(alpha, grazing, expected):
-    node = OmegaConf.create({"epsilon": 5e-5, "alpha": alpha})
+    node = {"epsilon": 5e-5, "alpha": alpha}
     assert steps(VIEW, node, replace(TEN, grazing=grazing)) == expected
 
 
 def test_steps_that_cannot_be_computed_are_errors():
     with pytest.raises(ValueError, match=r"alpha must lie between 0 and 2, not 2"):
-        steps(VIEW, OmegaConf.create({"epsilon": 5e-5, "alpha": 2.0}), TEN)
+        steps(VIEW, {"epsilon": 5e-5, "alpha": 2.0}, TEN)
     with pytest.raises(ValueError, match=r"which this renderer does not have: give a number"):
-        steps(VIEW, OmegaConf.create({"steps": "auto"}), TEN)
+        steps(VIEW, {"steps": "auto"}, TEN)
 
 
 def test_epsilon_and_steps_are_resolved_in_order_with_notes():
-    node, notes = resolved(OmegaConf.create({"epsilon": "auto", "steps": "auto", "alpha": 1.5}), VIEW, TEN)
-    assert node.epsilon == pytest.approx(7e-4)
-    assert node.steps == steps(VIEW, node, TEN) < 33
+    node, notes = resolved({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW, TEN)
+    assert node["epsilon"] == pytest.approx(7e-4)
+    assert node["steps"] == steps(VIEW, node, TEN) < 33
     seen = "for 128 pixels from 2.5 away (view)"
-    numbers = {"epsilon": f"{node.epsilon:.4g}", "steps": str(node.steps)}
+    numbers = {"epsilon": f"{node['epsilon']:.4g}", "steps": str(node["steps"])}
     angle = {
         "epsilon": ", with at most 1% spurious hits around outlines (auto.spurious) of true distances whose area over "
         "perimeter is 0.07 or more (auto.area_over_perimeter)",
@@ -67,16 +65,16 @@ def test_epsilon_and_steps_are_resolved_in_order_with_notes():
 
 def test_auto_without_an_equation_is_an_error():
     with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps, n_ray_samples"):
-        resolved(OmegaConf.create({"alpha": "auto"}), VIEW, TEN)
+        resolved({"alpha": "auto"}, VIEW, TEN)
     with pytest.raises(ValueError, match=r"view\.distance - 1 must be positive.*outside of the unit sphere"):
-        epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), OmegaConf.create({}), TEN)
+        epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), {}, TEN)
     with pytest.raises(ValueError, match=r"auto\.grazing must be positive"):
         replace(TEN, grazing=0.0)
 
 
 def test_a_run_has_the_resolved_number_and_a_note(compose_config):
     config = compose_config("renderer.epsilon=auto", "renderer.steps=auto", "view.resolution=128", "dataset=sphere")
-    inputs = set_up(config, silent)
+    inputs = cell_from(config).inputs()
     assert inputs.renderer.epsilon == pytest.approx(7e-4)
     assert inputs.notes[0].startswith("renderer.epsilon=auto is 0.0007, for 128 pixels")
 
@@ -93,7 +91,7 @@ def hits(name: str, shape: Field, resolution: int, **settings: float) -> tuple[T
 @pytest.mark.parametrize("shape", [sphere(0.6), box((0.4, 0.3, 0.5))], ids=["sphere", "box"])
 def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name, shape, resolution):
     fine, values = hits(name, shape, resolution)
-    auto = epsilon(replace(VIEW, resolution=resolution), OmegaConf.create({}), TEN)
+    auto = epsilon(replace(VIEW, resolution=resolution), {}, TEN)
     found, fewer = hits(name, shape, resolution, epsilon=auto)
     exact, _ = hits("idr", shape, resolution, steps=300)
     assert int((fine & ~found).sum()) == 0
@@ -106,7 +104,7 @@ def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name
 def test_epsilon_auto_holds_on_the_families(family):
     shape = load("dataset", family).formula(Split.VALIDATION, 0)
     exact, _ = hits("idr", shape, 64, steps=300)
-    found, _ = hits("dist", shape, 64, epsilon=epsilon(replace(VIEW, resolution=64), OmegaConf.create({}), TEN))
+    found, _ = hits("dist", shape, 64, epsilon=epsilon(replace(VIEW, resolution=64), {}, TEN))
     own, _ = hits("dist", shape, 64)
     assert int((own & ~found).sum()) == 0
     assert int((found & ~exact).sum()) <= 0.01 * int(exact.sum())
@@ -118,4 +116,4 @@ def test_epsilon_auto_holds_on_the_families(family):
 
 def test_no_more_precision_than_a_pixel():
     far = replace(VIEW, resolution=4096)
-    assert epsilon(far, OmegaConf.create({}), TEN) == footprint(far.focal_length, far.distance) < 7e-4
+    assert epsilon(far, {}, TEN) == footprint(far.focal_length, far.distance) < 7e-4

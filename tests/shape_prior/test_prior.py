@@ -10,8 +10,7 @@ import trimesh
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from bench.config import CONF, build, register
-from bench.setup.inputs import prior_settings
+from bench.config import CONF, register
 from bench.shape_prior import store as prior_store
 from bench.shape_prior.autodecoder import NetworkSettings, PriorSettings, distance_samples, fit_error, train
 from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe
@@ -19,6 +18,7 @@ from datasets.dataset import Split
 from datasets.extract import extract
 from datasets.families import FAMILIES
 from datasets.mesh import Mesh
+from tests.tiny import cell_from
 
 CPU = torch.device("cpu")
 SETTINGS = PriorSettings(
@@ -217,8 +217,9 @@ def shipped(request):
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         desk, smoke = (compose("config", [f"dataset={request.param}", f"scale={scale}"]) for scale in ("desk", "smoke"))
-    assert prior_settings(desk) == prior_settings(smoke)
-    dataset, settings = build(desk.dataset, "dataset"), prior_settings(desk)
+    cell = cell_from(desk)
+    dataset, settings = cell.dataset, cell.prior
+    assert settings == cell_from(smoke).prior
     records = [record for record in shipped_records() if record["dataset"]["name"] == request.param]
     assert len(records) == 1, f"{request.param} has {len(records)} shipped priors"
     return dataset, settings, records[0]

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from bench.config import CONF, build, register
-from bench.setup.inputs import set_up
+from bench.config import CONF, register
 from bench.single_view.store import SHIPPED, overlap
 from datasets.dataset import Split
-from tests.tiny import CPU, silent
+from tests.tiny import CPU, cell_from, plain
 
 NETWORKS = sorted(SHIPPED.glob("*.safetensors"))
 LEAST_IOU = {"car": 0.6, "sofa": 0.6, "plane": 0.5, "table": 0.4}  # planes and tables are thin
@@ -25,11 +23,8 @@ def shipped(request, tmp_path):
     name = request.param.stem.split("-")[1]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", ["+method=single_view", f"dataset={name}", f"results_dir={tmp_path}"])
-    threads = torch.get_num_threads()
-    inputs = set_up(config, silent)
-    torch.set_num_threads(threads)
-    plain = OmegaConf.to_container(config, resolve=True)
-    return request.param, build(config.task, "task").recipe(inputs, plain), inputs.cache
+    cell = cell_from(config)
+    return request.param, cell.task.recipe(cell.inputs(), plain(config)), cell.cache
 
 
 def test_families_have_one():

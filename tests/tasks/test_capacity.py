@@ -17,6 +17,7 @@ from bench.models.model import Evidence, Size
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus, read_record
 from bench.run.execute import execute
+from bench.run.messages import Job
 from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.solve.problem import Unsupported
@@ -24,7 +25,7 @@ from bench.tasks.capacity import Capacity, saved
 from bench.tasks.photographs import photographic_error, split_pairs
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
-from tests.tiny import Blind, ball_prior, camera_of, run_of, silent
+from tests.tiny import Blind, ball_prior, camera_of, plain, run_of, silent
 
 TINY = (
     "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
@@ -39,8 +40,8 @@ BETTER = ("task.optimiser.iterations=20", "models.candidates=[sphere,box,union_2
 def run(folder, compose_config, *overrides: str) -> Record:
     """The record of a run in this process, and its files in the folder."""
     config = compose_config(*TINY, *overrides)
-    record = Record("id", "task", "dist", config.dataset.name, 0, {"label": None})
-    execute(config, folder, record, progress=silent, checkpoint=lambda record: None)
+    record = Record("id", "task", "dist", config.dataset.name, 0, plain(config))
+    execute(Job(folder, record), progress=silent, checkpoint=lambda record: None)
     return record
 
 
@@ -88,7 +89,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
     record.write(tmp_path)
     assert read_record(tmp_path)["metrics"]["recommended_field"] == "rounded_box"
-    show(tmp_path, record, tmp_path)
+    show(tmp_path, record)
     shown = capsys.readouterr().out
     assert re.search(r"=> +rounded box +10 +10 +40 ", shown)
     assert "half a pixel is" in shown

@@ -1,0 +1,73 @@
+"""A configuration becomes objects in one place: each node once, whatever asks for it; and a run takes its threads."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from bench.machine.environment import using_threads
+from bench.run import cell as cell_module
+from bench.run.cell import ALL_THREADS, cell_of, threads_for
+from tests.tiny import cell_from, plain, silent
+
+
+@pytest.fixture(autouse=True)
+def as_before():
+    with using_threads(torch.get_num_threads()):
+        yield
+
+
+@pytest.fixture
+def built(monkeypatch) -> Counter[str]:
+    """How often each part was built."""
+    counts: Counter[str] = Counter()
+    build = cell_module.build
+
+    def counted(node, name, *rest):
+        counts[name] += 1
+        return build(node, name, *rest)
+
+    monkeypatch.setattr(cell_module, "build", counted)
+    return counts
+
+
+def test_a_run_builds_each_part_once(compose_config, built):
+    cell_of(plain(compose_config("scale=smoke")))
+    assert set(built.values()) == {1}
+    assert {"task", "renderer", "view", "dataset", "evaluation", "prior", "models"} <= set(built)
+
+
+def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_config, built):
+    shared, reasons = {}, []
+    one = plain(compose_config("scale=smoke"))
+    wrong = one | {"renderer": one["renderer"] | {"steps": 0}}
+    for config in (one, wrong, one | {"index": 3}, wrong):
+        try:
+            cell_of(config, shared)
+        except ValueError as error:
+            reasons.append(str(error))
+    assert reasons == ["steps must be at least 1, not 0: the paper uses 50 to 100"] * 2
+    assert (built["renderer"], built["task"], built["dataset"], built["prior"]) == (2, 1, 1, 1)
+
+
+def test_a_narrow_network_takes_one_thread_and_a_wide_one_all():
+    assert threads_for(128) == 1
+    assert threads_for(512) == ALL_THREADS
+
+
+def test_the_threads_that_are_asked_for_are_taken_by_the_run_and_not_by_its_check(compose_config):
+    torch.set_num_threads(1)
+    cell = cell_from(compose_config("scale=smoke", "threads=2"))
+    assert torch.get_num_threads() == 1
+    cell.start(silent)
+    assert torch.get_num_threads() == 2
+    cell_from(compose_config("scale=smoke")).start(silent)
+    assert torch.get_num_threads() == 1
+
+
+def test_threads_are_as_before_behind_a_part_that_takes_others():
+    torch.set_num_threads(1)
+    with pytest.raises(ValueError), using_threads(2):
+        assert torch.get_num_threads() == 2
+        raise ValueError
+    assert torch.get_num_threads() == 1
