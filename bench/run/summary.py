@@ -86,14 +86,14 @@ def _candidates(record: Record) -> Table:
 
     candidates = Candidates.of(record.metrics)
     half_pixel = number(1000 * candidates.footprint)
-    title = f"{record.title}; half a pixel is {half_pixel} (x1000)"
+    title = f"{record.title}; errors x1000, half a pixel is {half_pixel}"
     table = Table(box=box.SIMPLE_HEAD, title=escape(title))
-    for heading in ("", "field", "stored", "free", "bytes", "FLOPs/query", "error (x1000)", "s.e.", "fit"):
+    for heading in ("", "field", "stored", "free", "FLOPs", "error", "s.e.", "fit"):  # at most 80 columns wide
         table.add_column(heading, justify="left" if heading in ("", "field") else "right", no_wrap=heading == "field")
     for candidate in candidates.results:
         numbers = candidate.numbers
         mark = "=>" if candidate is candidates.chosen else "best" if candidate is candidates.best else ""
-        size = *(f"{numbers[name]:,}" for name in ("stored", "free")), count(numbers["bytes"])
+        size = f"{numbers['stored']:,}", f"{numbers['free']:,}"
         error = number(numbers.get("error"), 1000), number(numbers.get("standard_error"), 1000)
         table.add_row(
             mark, candidate.label, *size, count(numbers["flops_per_query"]), *error, seconds(numbers["seconds"])

@@ -91,7 +91,8 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert read_record(tmp_path)["metrics"]["recommended_field"] == "rounded_box"
     show(tmp_path, record)
     shown = capsys.readouterr().out
-    assert re.search(r"=> +rounded box +10 +10 +40 ", shown)
+    assert re.search(r"field +stored +free +FLOPs +error +s\.e\. +fit\b", shown)  # not wrapped at 80 columns
+    assert re.search(r"=> +rounded box +10 +10 +", shown)
     assert "half a pixel is" in shown
 
 
