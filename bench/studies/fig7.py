@@ -31,7 +31,8 @@ def make(runs: Runs) -> Result:
     """A column of pictures and a point of the chart per epsilon, the largest first."""
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
-    found = gallery.compared(chosen, [*map(_title, chosen.records)], MOST_COLUMNS)
+    several = len({record["renderer"] for record in chosen.records}) > 1
+    found = gallery.compared(chosen, [_title(record, several=several) for record in chosen.records], MOST_COLUMNS)
     data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, found.counts), strict=True))
     return Result(
         chosen,
@@ -68,12 +69,13 @@ def draw(found: gallery.Compared, data: pd.DataFrame) -> Figure:
 
 def _charts(figure: SubFigure, data: pd.DataFrame) -> None:
     shares, depth = figure.subplots(1, 2)
+    several = data["renderer"].nunique() > 1
     for name, rows in data.groupby("renderer", sort=False):
         epsilon = style.finite(rows["epsilon"])
         for key, colour, face, label in KINDS:
             percent = [100 * x for x in style.finite(rows[f"{key}_share"])]
             how = {"color": colour, "mfc": face, "clip_on": False, "zorder": 3}
-            chart.line(shares, str(name), epsilon, percent, label=f"{label}, {name}", **how)
+            chart.line(shares, str(name), epsilon, percent, label=f"{label}, {name}" if several else label, **how)
         chart.line(depth, str(name), epsilon, style.finite(rows["depth_error_median"]), label=name)
     for axis in (shares, depth):
         axis.set(xlabel="epsilon (scene units)")
@@ -104,11 +106,11 @@ def _epsilon(record: Record) -> float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-def _title(record: Record) -> str:
-    """The renderer and the epsilon of a picture."""
+def _title(record: Record, *, several: bool) -> str:
+    """The epsilon of a picture, with its renderer where there are several."""
     epsilon = _epsilon(record)
     words = "no epsilon" if epsilon is None else f"{epsilon:.0e}".replace("e-0", "e-")
-    return f"{record['renderer']}, {words}"
+    return f"{record['renderer']}, {words}" if several else words
 
 
 COLUMNS = (  # of a record and its counts

@@ -175,7 +175,7 @@ def draw(data: pd.DataFrame) -> Figure:
     axes[2].axvline(1.0, color="#555555", lw=0.8, ls=":")
     axes[2].set(title=OUTLINE, xlabel="cosine and scale (exact: 1)", ylim=(len(names) - 0.5, -0.5))
     status = dict(zip(data["name"], data["status"], strict=True))
-    axes[0].set_yticks(range(len(names)), [n if status[n] == "ok" else f"{n} ({status[n]})" for n in names])
+    axes[0].set_yticks(range(len(names)), [_titled(name, status[name]) for name in names])
     style.legend_of(figure, style.labelled(axes[0], axes[2]), columns=5)
     return figure
 
@@ -201,7 +201,7 @@ def draw_visibility(data: pd.DataFrame) -> Figure:
 
 
 def _titled(name: str, status: str) -> str:
-    return name if status == "ok" else f"{name} ({status})"
+    return name if status == "ok" else f"{name} ({status.replace('_', ' ')})"
 
 
 def _dress(axis: Axes, across: str, up: str) -> None:

@@ -201,7 +201,7 @@ def draw(panels: dict[Trial, list[Line]]) -> Figure:
         for point in panel:
             how = {"marker": "x"} if point["infinite"] else {"mfc": "none"} if point["dominated"] else {}
             chart.points(axis, point["renderer"], point["x"], point["y"], ms=5, **how)
-            if not point["middle"].known:
+            if not point["middle"].known and len(point["shapes"][0]) > 1:
                 shapes = map(style.finite, point["shapes"])
                 chart.points(axis, point["renderer"], *shapes, ms=2, alpha=0.5, zorder=1.5)
         how = {"where": "post", "color": "#999999", "lw": 0.8, "zorder": 0}
