@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
 from bench.evaluate.evaluate import DEFINITIONS, Surface, image_metrics, surface_metrics
+from tests.looped import each
 
 SURFACE = [
     "chamfer_l2",
@@ -96,7 +97,7 @@ def test_length_and_sign_of_normals_do_not_count_and_zero_scores_zero():
         assert measured["normal_consistency"] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("predicted", [None, surface([], [])])
+@each("predicted", [None, surface([], [])])
 def test_no_prediction_scores_worst(predicted):
     measured = surface_metrics(predicted, random_surface(0, 5), threshold=0.01)
     assert measured.pop("fscore") == measured.pop("normal_consistency") == 0
@@ -156,8 +157,8 @@ def test_every_metric_has_one_sentence():
         assert re.search(r"scene units|from 0 to 1", sentence)
 
 
-@pytest.mark.parametrize(
-    ("broken", "message"),
+@each(
+    "broken, message",
     [
         (lambda: Surface(np.zeros((4, 2)), np.zeros((4, 3))), r"points must have shape \[n, 3\], found \[4, 2\]"),
         (lambda: Surface(np.zeros((4, 3)), np.zeros((5, 3))), "normals must be one per point, found 5 for 4"),

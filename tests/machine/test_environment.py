@@ -10,6 +10,7 @@ import pytest
 from bench.machine import environment
 from bench.machine.environment import Contention
 from bench.records.record import Record
+from tests.looped import each
 
 HAS_COUNTS = environment._scheduled() is not None
 
@@ -22,8 +23,8 @@ def record(**changed) -> Record:
     return made
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
+@each(
+    "changed, words",
     [
         ({}, []),
         ({"share": 0.04, "load": 99.0, "gemm_fraction": 0.9}, []),

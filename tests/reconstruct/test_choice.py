@@ -17,6 +17,7 @@ from bench.solve.problem import OptimiserSettings
 from datasets.shot import Shot
 from renderers import IDR
 from renderers.field import Counts
+from tests.looped import each
 from tests.tiny import ball_prior, camera_of, run_of
 
 SETTINGS = OptimiserSettings(40, 0.1, "constant")
@@ -128,8 +129,8 @@ def test_tiles_cover_photographs_of_any_size(tmp_path):
     assert ASIDE == 8
 
 
-@pytest.mark.parametrize(
-    ("changed", "says"),
+@each(
+    "changed, says",
     [
         ({"candidates": ()}, "task.auto.candidates"),
         ({"candidates": ("network_1x8", "network_1x8")}, "must name each once"),

@@ -1,9 +1,8 @@
 """Runs are named by what differs among them, and by nothing else."""
 
-import pytest
-
 from bench.records.metrics import better
 from bench.records.names import differences
+from tests.looped import each
 
 
 def run(renderer: str = "dist", label: str = "DIST", **config) -> dict:
@@ -19,9 +18,7 @@ def own(path: str) -> dict:
     return run("custom", path.rpartition(".")[2], renderer___target_=path)
 
 
-@pytest.mark.parametrize(
-    ("records", "names"),
-    [
+@each("records, names", [
         ([run(), run("dvr", "DVR")], ["DIST", "DVR"]),
         ([run(seed=0), run(seed=1)], ["seed 0", "seed 1"]),
         ([run(), run("dvr", "DVR", index=1), run("dvr", "DVR")], ["DIST", "DVR, shape 1", "DVR, shape 0"]),
@@ -36,8 +33,7 @@ def own(path: str) -> dict:
         ([run(a__n=1, b__n=1), run(a__n=1, b__n=2), run(a__n=2, b__n=2)],
          ["n 1, b.n 1", "n 1, b.n 2", "n 2"]),
         ([run()], ["DIST"]),
-    ],
-)  # fmt: skip
+    ])  # fmt: skip
 def test_a_name_is_what_differs(records, names):
     assert differences(records).names == tuple(names)
 
@@ -62,8 +58,8 @@ def test_a_key_is_named_as_the_sweep_asked_for_it():
     assert differences(records, asked=asked).names == ("budget 8.0", "budget 1e1")
 
 
-@pytest.mark.parametrize(
-    ("name", "direction"),
+@each(
+    "name, direction",
     [("chamfer_l2", "lower"), ("own_psnr", "higher"), ("seen_fscore", "higher"), ("queries", ""), ("own_queries", "")],
 )
 def test_which_direction_of_a_metric_is_better(name, direction):

@@ -10,6 +10,7 @@ from bench.records import format
 from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.write.html import write_index
+from tests.looped import each
 from tests.report.page_data import Page, script
 
 ODD_NAME = "two words ünïcode 50% #1?"
@@ -248,8 +249,8 @@ def test_report_never_imports_torch():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
+@each(
+    "value, text",
     [
         (0.0123456, "0.0123"),
         (0.5, "0.500"),
@@ -275,9 +276,8 @@ def test_number_scales():
     assert format.number(None, 1000.0) == "–"
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0, "0"), (999, "999"), (999.6, "1.00k"), (1_430_000, "1.43M"), (999_999, "1.00M"), (3e12, "3.00T")],
+@each(
+    "value, text", [(0, "0"), (999, "999"), (999.6, "1.00k"), (1_430_000, "1.43M"), (999_999, "1.00M"), (3e12, "3.00T")]
 )
 def test_count(value, text):
     assert format.count(value) == text
@@ -287,13 +287,13 @@ def test_count_beyond_the_last_prefix_and_missing():
     assert (format.count(2e18), format.count(None), format.count(float("inf"))) == ("2000P", "–", "∞")
 
 
-@pytest.mark.parametrize(("value", "text"), [(512, "512 B"), (1_430_000_000, "1.43 GB"), (None, "–")])
+@each("value, text", [(512, "512 B"), (1_430_000_000, "1.43 GB"), (None, "–")])
 def test_size(value, text):
     assert format.size(value) == text
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
+@each(
+    "value, text",
     [
         (0, "0 s"),
         (0.0123, "12.3 ms"),

@@ -26,6 +26,7 @@ from bench.report.data.statistics import (
     share,
     wins,
 )
+from tests.looped import each
 
 INF = math.inf
 
@@ -52,7 +53,7 @@ def seen(statistic) -> tuple:
     return noting, noted
 
 
-@pytest.mark.parametrize(
+@each(
     "values, expected",
     [
         ([7], 7),
@@ -78,8 +79,8 @@ def test_interquartile_mean_is_a_trimmed_mean_and_reduces_the_last_axis():
     assert interquartile_mean(values[1, 2]) == pytest.approx(expected[1, 2])
 
 
-@pytest.mark.parametrize("values", [[], [1.0, math.nan], [1.0, -INF], np.zeros((3, 0))])
-@pytest.mark.parametrize("average", [interquartile_mean, median])
+@each("values", [[], [1.0, math.nan], [1.0, -INF], np.zeros((3, 0))])
+@each("average", [interquartile_mean, median])
 def test_averages_refuse_what_is_no_error(average, values):
     with pytest.raises(ValueError, match="values must be"):
         average(values)
@@ -96,7 +97,7 @@ def test_a_run_counted_as_failed_never_improves_an_average(errors, data):
         assert average(fewer) >= average(errors)
 
 
-@pytest.mark.parametrize("level", [0.8, 0.95])
+@each("level", [0.8, 0.95])
 def test_interval_of_a_mean_is_that_of_student(level):
     # A draw's mean varies by the shapes' variance (over n) and by the seeds' within a shape. With one seed the widening
     # makes it mean +- t s / sqrt(n), s with n - 1 in the denominator; a plain percentile would be narrower by 11 %.
@@ -113,7 +114,7 @@ def test_interval_of_a_mean_is_that_of_student(level):
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
 
-@pytest.mark.parametrize("n", [1, 4, 5])
+@each("n", [1, 4, 5])
 def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     groups = [np.array([i, i + 2.0]) for i in range(n)]
     for found in (
@@ -157,7 +158,7 @@ def test_the_seed_decides_the_draws():
     assert once == again != other and once.value == other.value
 
 
-@pytest.mark.parametrize("average", [interquartile_mean, median, mean])
+@each("average", [interquartile_mean, median, mean])
 def test_failures_make_infinite_ends(average):
     assert bootstrap(singles(*[INF] * 6), average, seed=0) == Interval(INF, INF, INF)
     half = bootstrap(singles(1, 2, 3, 4, 5, INF, INF, INF), average, seed=0)
@@ -185,7 +186,7 @@ def test_pairing_narrows_the_interval():
     assert 5 * math.log(paired.high / paired.low) < math.log(mixed.high / mixed.low)
 
 
-@pytest.mark.parametrize("second", [singles(1, 2), [np.ones(1), np.ones(2), np.ones(1)]])
+@each("second", [singles(1, 2), [np.ones(1), np.ones(2), np.ones(1)]])
 def test_pairing_needs_the_same_runs(second):
     with pytest.raises(ValueError, match="same shapes and seeds"):
         paired_bootstrap(singles(1, 2, 3), second, median, seed=0)
@@ -199,15 +200,15 @@ def test_bad_groups_and_levels():
         bootstrap(singles(*range(6)), median, seed=0, level=95)
 
 
-@pytest.mark.parametrize("successes, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
-@pytest.mark.parametrize("level", [0.9, 0.95])
+@each("successes, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
+@each("level", [0.9, 0.95])
 def test_clopper_pearson_is_the_exact_interval(successes, n, level):
     expected = stats.binomtest(successes, n).proportion_ci(level, method="exact")
     interval = clopper_pearson(successes / n, n, level=level)
     assert (interval.low, interval.value, interval.high) == pytest.approx((expected.low, successes / n, expected.high))
 
 
-@pytest.mark.parametrize("value, n", [(0.5, 0), (-0.1, 3), (1.1, 3)])
+@each("value, n", [(0.5, 0), (-0.1, 3), (1.1, 3)])
 def test_clopper_pearson_needs_trials(value, n):
     with pytest.raises(ValueError, match="count the trials"):
         clopper_pearson(value, n)
@@ -285,7 +286,7 @@ def test_kaplan_meier_where_none_or_all_reach():
     assert kaplan_meier([2.0], [False]).remaining.tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("times, reached", [([], []), ([1.0], [True, False]), ([INF], [False]), ([-1.0], [True])])
+@each("times, reached", [([], []), ([1.0], [True, False]), ([INF], [False]), ([-1.0], [True])])
 def test_kaplan_meier_needs_times(times, reached):
     with pytest.raises(ValueError, match="times"):
         kaplan_meier(times, reached)
@@ -300,7 +301,7 @@ def test_holm_worked_example():
         holm([0.1, math.nan])
 
 
-@pytest.mark.parametrize("n", [1, 5, 12, 40])
+@each("n", [1, 5, 12, 40])
 def test_compare_is_the_exact_signed_rank_test(n):
     generator = np.random.default_rng(n)
     first, second = generator.normal(0.4, 1, (n, 3)), generator.normal(size=(n, 3))

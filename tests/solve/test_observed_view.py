@@ -13,6 +13,7 @@ from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
 from renderers.silhouette import Own
+from tests.looped import each
 from tests.tiny import CPU, camera_of
 
 WEIGHTS = SimpleNamespace(depth_loss="depth", depth_weight=0.0, silhouette=Own(), silhouette_weight=0.0)
@@ -53,7 +54,7 @@ SOME = torch.arange(36).view(6, 6) % 3 == 0
 OTHER = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET).roll(1, 0)  # those of the pixels above
 
 
-@pytest.mark.parametrize("observed", [ALL, SOME], ids=["all", "some"])
+@each("observed", [ALL, SOME])
 def test_the_term_is_one_less_the_cosine_over_observed_pixels(observed):
     found = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET)
     expected = 2.0 * (1 - (found * OTHER).sum(-1))[observed].mean()
@@ -82,7 +83,7 @@ def test_rays_without_a_hit_have_no_part_and_none_at_all_costs_nothing():
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
+@each("renderer", RENDERERS)
 def test_the_gradient_is_that_of_differences(renderer):
     """Through the field's gradient at a point, and through the point, which moves along its ray."""
     seen = given(OTHER, SOME, renderer)

@@ -12,6 +12,7 @@ from bench.solve.optimise import DIVERGED, History, optimise
 from bench.solve.problem import OptimiserSettings
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
+from tests.looped import each
 
 CPU = torch.device("cpu")
 POINTS = 7  # evaluations that a toy's loss makes
@@ -169,7 +170,7 @@ def test_a_hundredfold_loss_has_diverged():
     assert DIVERGED == 100  # as bench/README.md says
 
 
-@pytest.mark.parametrize(("factor", "diverges"), [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
+@each("factor, diverges", [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
 def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
     history = go(Toy(spoil={3: factor}), 5, rate=1e-4)
     assert history.status is (RunStatus.DIVERGED if diverges else RunStatus.OK)
@@ -183,7 +184,7 @@ def test_the_warm_up_is_not_the_first_value():
     assert go(Toy(spoil={0: 1e-6})).status is RunStatus.OK
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+@each("error", [KeyboardInterrupt, OSError])
 def test_the_course_is_there_when_the_loop_is_cut_short(error):
     def stop(line):
         if line["iteration"] == 2:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.stress.search import Bisection, Search, SearchSettings
+from tests.looped import each
 
 DESK = SearchSettings(levels=33, repeats=5)
 
@@ -15,7 +16,7 @@ def searched(settings: SearchSettings, succeeds) -> Search:
     return search
 
 
-@pytest.mark.parametrize("middle", [0.05, 0.31, 0.5, 0.77, 0.95])
+@each("middle", [0.05, 0.31, 0.5, 0.77, 0.95])
 def test_a_sharp_breakdown_lies_in_a_short_interval(middle):
     search = searched(DESK, lambda level: level < middle)
     found = search.result()
@@ -25,7 +26,7 @@ def test_a_sharp_breakdown_lies_in_a_short_interval(middle):
     assert len(search.trials) < 25
 
 
-@pytest.mark.parametrize(("width", "least"), [(0.02, 0.9), (0.08, 0.8)])
+@each("width, least", [(0.02, 0.9), (0.08, 0.8)])
 def test_the_interval_of_a_noisy_breakdown_holds(width, least):
     generator = np.random.default_rng(1)
     holds = 0
@@ -47,7 +48,7 @@ def test_the_search_takes_half_of_the_grid_at_most():
     assert DESK.grid == 165
 
 
-@pytest.mark.parametrize(("succeeds", "end"), [(True, 32), (False, 0)])
+@each("succeeds, end", [(True, 32), (False, 0)])
 def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
     search = searched(DESK, lambda level: succeeds)
     found = search.result()
@@ -65,8 +66,8 @@ def bisected(succeeds, levels: int = 33) -> Bisection:
     return search
 
 
-@pytest.mark.parametrize("levels", [3, 9, 17, 33])
-@pytest.mark.parametrize("middle", [0.01, 0.31, 0.5, 0.77, 0.999])
+@each("levels", [3, 9, 17, 33])
+@each("middle", [0.01, 0.31, 0.5, 0.77, 0.999])
 def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interval(middle, levels):
     search = bisected(lambda level: level < middle, levels)
     found = search.result()
@@ -75,7 +76,7 @@ def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interv
     assert len(search.outcomes) <= search.most < levels + 1 == search.grid + 1
 
 
-@pytest.mark.parametrize(("succeeds", "level"), [(True, 1 + 0.5 / 32), (False, -0.5 / 32)])
+@each("succeeds, level", [(True, 1 + 0.5 / 32), (False, -0.5 / 32)])
 def test_without_repeats_an_end_is_tried_once(succeeds, level):
     search = bisected(lambda at: succeeds)
     assert search.result().level == pytest.approx(level)
