@@ -134,10 +134,10 @@ def test_every_choice_is_in_a_composition():
 
 
 @pytest.mark.parametrize("row", TOGETHER, ids=lambda row: " ".join(row.values()))
-def test_every_choice_composes_and_builds(compose_config, paths, row):
+def test_every_choice_composes_and_builds(paths, row):
     needed = [f"dataset.path={path}" for name, path in paths.items() if name == row["dataset"]]
     needed += CUSTOM if row["renderer"] == "custom" else ()
-    config = compose_config(*(f"{group}={name}" for group, name in row.items()), *needed)
+    config = composed(*(f"{group}={name}" for group, name in row.items()), *needed)
     builds(config)
     if row["stress"] != "none":
         assert build_part(config, "task").stress.scene == choice("stress", row["stress"])["scene"]
@@ -150,22 +150,25 @@ def test_every_choice_composes_and_builds(compose_config, paths, row):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_composes_and_builds(compose_config, name):
-    builds(compose_config(f"+method={name}", *(["draw=0"] if name.startswith("space/") else [])))
+def test_every_method_composes_and_builds(name):
+    builds(composed(f"+method={name}", *(["draw=0"] if name.startswith("space/") else [])))
 
 
 @pytest.mark.parametrize("place", [0, -1], ids=["first", "last"])
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_first_and_last_cell_of_an_experiment_compose_and_build(compose_config, paths, name, place):
+def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name, place):
+    """The first at desk scale; the last at the papers', and of a mesh where it is of no dataset of its own."""
     cell, asked = cells(name)[place], [f"dataset.path={paths[name]}"] if name in paths else []
-    if place and not any(text.startswith("dataset=") for text in cell):
-        asked = ["scale=paper", "dataset=mesh", f"dataset.path={paths['mesh']}"]
-    config = compose_config(*cell, f"+experiment={name}", *asked)
+    if place:
+        mesh = ["dataset=mesh", f"dataset.path={paths['mesh']}"]
+        asked = ["scale=paper", *(asked if any(text.startswith("dataset=") for text in cell) else mesh)]
+    config = composed(*cell, f"+experiment={name}", *asked)
     builds(config)
     assert config.experiment == (None if name in SINGLE else JOINED.get(name, name))
     for key, _, value in (text.removeprefix("+").partition("=") for text in cell):
         if key in ("renderer", "method"):
-            brings_its_own(compose_config, cell, config, key, value)
+            if not place:
+                brings_its_own(cell, config, key, value)
         elif key == "dataset":
             assert config.dataset.name == value
         elif key == "silhouette":
@@ -176,17 +179,16 @@ def test_the_first_and_last_cell_of_an_experiment_compose_and_build(compose_conf
             assert asked.items() <= dict(found).items() if isinstance(asked, dict) else found == type(found)(value)
 
 
-def brings_its_own(compose_config, cell: list[str], config: DictConfig, key: str, value: str) -> None:
+def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) -> None:
     """Asserts that an experiment changes nothing that a renderer or a method sets."""
-    default = compose_config()
+    default = composed()
     scaled = [f"scale.reconstruction.{name}" for name in ("iterations", "dvr_doublings")]  # schedules follow these
     sizes = [name for name in scaled if OmegaConf.select(config, name) != OmegaConf.select(default, name)]
     asked = [f"{name}={OmegaConf.select(config, name)}" for name in sizes]
-    asked += [f"scale={config.scale.name}"] if config.scale.name != "desk" else []
     if "fit" in config.task:  # of a stress
         asked += [f"task.optimiser.iterations={config.task.fit.iterations}"]
     draw = [text for text in cell if text.startswith("draw=")]
-    alone = compose_config(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *asked)
+    alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *asked)
     assert config.label == alone.label
     assert build_part(config, "renderer") == build_part(alone, "renderer")
     if key == "method":
