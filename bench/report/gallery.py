@@ -267,7 +267,7 @@ def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
     """
     style.bare(axis)
     wide, high = max(len(block.columns), 1), max(len(block.rows), 1)
-    axis.set(xlim=(0, wide * across), ylim=(high, 0))
+    axis.set(xlim=(0, wide * across), ylim=(high, 0), aspect="equal")
     axis.set_xticks([across * (place + 0.5) for place in range(len(block.columns))], block.columns)
     axis.set_yticks([line + 0.5 for line in range(len(block.rows))], [_wrapped(name, LETTERS) for name in block.rows])
     axis.tick_params(length=0, top=False, bottom=False, labeltop=True, labelbottom=False, labelsize=6)

@@ -79,9 +79,11 @@ def make(runs: Runs) -> Result:
 def draw(runs: Runs) -> Figure:
     """Draws a line per family: pairs of pictures, then the histogram."""
     families = runs.families()
-    figure, axes = chart.sheet(1.25 * len(families), len(families), 2, width_ratios=(4.7, 1))
+    wide = 1.6 * min(SHOWN, max(map(len, families.values())))  # inches of the pictures
+    how = {"width": wide + 2.2, "width_ratios": (wide + 0.6, 1.6)}
+    figure, axes = chart.sheet(1.2 * len(families), len(families), 2, **how)
     for (left, right), (name, records) in zip(axes, families.items(), strict=True):
-        gallery.fill(left, _block(runs, name, records[:SHOWN]), inches=0.87)
+        gallery.fill(left, _block(runs, name, records[:SHOWN]), inches=0.8)
         _histogram(right, runs, records)
     axes[0, -1].set_title("length of the gradient", fontsize=7)
     return figure
