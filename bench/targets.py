@@ -79,6 +79,7 @@ def check_targets(config: Mapping[str, Any], typed: Sequence[str], renderer: str
     Raises:
         ValueError: for a package that the command line does not name.
     """
+    assert isinstance(config, dict), "nodes of OmegaConf are no dictionaries, and would be passed over"
     told = [override for override in map(parsed, typed) if not override.is_delete()]
     named = {str(package) for package in _flat(_values_of(told, "packages"))}
     for package in map(str, config.get("packages") or []):

@@ -38,7 +38,7 @@ HELP = """
     python -m bench dataset=mesh dataset.path=chair.obj                    your own mesh
     python -m bench renderer=custom renderer._target_=mypkg.Mine           your own renderer
     python -m bench list                                                   the tasks, renderers, datasets, experiments
-    python -m bench.report                                                 tables, figures and results/index.html
+    python -m bench.report                                                 tables, figures and results/local/index.html
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML; --hydra-help is Hydra's own."""

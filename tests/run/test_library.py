@@ -102,13 +102,13 @@ def test_a_run_that_failed_is_a_record(within):
         "renderer._target_": "tests.failing.Failing"
     })  # fmt: skip
     assert record.status == "crashed" and record.reason in str(record) and len(str(record)) < 300
-    assert record.folder.parent == within / "results" / "runs"
+    assert record.folder.parent == within / "results" / "local" / "runs"
 
 
 def test_the_lines_of_the_page_open_the_run_and_make_it_again(within):
     made = bench.run(scale="smoke", renderer="newton", seed=3)
-    write_index(within / "results")
-    shown = Page(within / "results").run(made.id)
+    write_index(within / "results" / "local")
+    shown = Page(within / "results" / "local").run(made.id)
     opened: dict = {}
     exec(shown["python"], opened)
     assert opened["run"].status == "ok" and opened["run"].seed == 3 and len(opened["curve"]) == 8

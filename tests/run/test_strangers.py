@@ -4,9 +4,11 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trimesh
+from omegaconf import DictConfig, OmegaConf
 
 from bench.config import build, load
 from bench.merge import merge
@@ -89,18 +91,24 @@ SMUGGLED = {"a package smuggled in", "a package under another's name"}
 @pytest.mark.parametrize("how", attacks("", Path()))
 def test_nothing_runs_before_it_is_refused(compose_config, stranger, tmp_path, how):
     overrides = attacks(stranger, tmp_path / "made")[how]
-    config = compose_config(*overrides)
+    config = plain(compose_config(*overrides))
     first = refusals([lambda: check_targets(config, overrides, "custom" if "renderer=custom" in overrides else "dist")])
     assert bool(first) is (how not in BEHIND_OURS)
     if how in SMUGGLED:  # only the first guard knows the command line
         return
     parts = ("renderer", "task", "tracker", *PARTS)
-    second = refusals([lambda p=p: build(config[p], p, list(config.packages), PARTS.get(p, "")) for p in parts])
+    second = refusals([lambda p=p: build(config[p], p, config["packages"], PARTS.get(p, "")) for p in parts])
     assert len(second) == 1
     assert "\n" not in second[0]
     assert not (tmp_path / "made").exists()
     assert not (tmp_path / "imported").exists()
     assert stranger not in sys.modules
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration as a run's identity has it."""
+    found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    return found
 
 
 def refusals(calls: Sequence[Callable[[], object]]) -> list[str]:
@@ -145,9 +153,9 @@ def test_a_yaml_of_a_stranger_grants_no_leave(stranger, tmp_path, text):
 
 def test_a_package_that_the_user_names_is_used(compose_config, stranger, tmp_path):
     overrides = ("renderer=custom", f"renderer._target_={stranger}.Renderer")
-    config = compose_config(*overrides)
+    config = plain(compose_config(*overrides))
     check_targets(config, overrides, "custom")
-    assert type(build(config.renderer, "renderer")).__name__ == "Renderer"
+    assert type(build(config["renderer"], "renderer")).__name__ == "Renderer"
     assert type(load("renderer", "custom", _target_=f"{stranger}.Renderer")).__name__ == "Renderer"
     (tmp_path / "made").unlink()
     for wrong, words in (
@@ -162,7 +170,7 @@ def test_a_package_that_the_user_names_is_used(compose_config, stranger, tmp_pat
 
 def test_each_target_of_a_sweep_may_be_typed(compose_config, stranger):
     typed = ("renderer=custom", f"renderer._target_={stranger}.Renderer,renderers.IDR")
-    config = compose_config("renderer=custom", f"renderer._target_={stranger}.Renderer")
+    config = plain(compose_config("renderer=custom", f"renderer._target_={stranger}.Renderer"))
     check_targets(config, typed, "custom")
     with pytest.raises(ValueError, match="gives no leave"):
         check_targets(config, ("renderer=custom", "renderer._target_=renderers.IDR"), "custom")
