@@ -17,7 +17,6 @@ from bench.report.data.records import SCALE, Record, Row, family, grouped, index
 
 MACHINE = ("cpu", "device", "threads")
 MIXED = ("prior", "view", "evaluation", "field")  # parts of a configuration that rows should share
-OF_ROWS = ("prior.name",)  # of these parts, what a dataset may set for itself
 
 
 @dataclass(frozen=True)
@@ -141,11 +140,13 @@ class Runs:
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings of prior, view, evaluation and field in which runs differ though rows should share them."""
-        known = [flat({part: record["config"].get(part) for part in MIXED}, "") for record in self.records]
-        keys = dict.fromkeys(key for one in known for key in one)
-        skipped = {*OF_ROWS, *self.selection.conditions}
-        return [key for key in keys if key not in skipped and len({str(one[key]) for one in known if key in one}) > 1]
+        """The settings of prior, view, evaluation and field in which runs of one family differ."""
+        found: dict[str, None] = {}
+        for records in self.families().values():
+            known = [flat({part: record["config"].get(part) for part in MIXED}, "") for record in records]
+            keys = dict.fromkeys(key for one in known for key in one if key not in self.selection.conditions)
+            found |= {key: None for key in keys if len({str(one[key]) for one in known if key in one}) > 1}
+        return list(found)
 
     def of_newest_scene(self) -> "Runs":
         """Those runs alone that have the seed and the shape of the one requested last."""
