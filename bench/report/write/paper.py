@@ -96,7 +96,8 @@ def find_paper(results_dir: Path) -> list[Found]:
     """The tables and figures of `results_dir/paper` in their order, then shipped ones of other names."""
     own = _in(results_dir)
     names = {one.name for one in own}
-    shipped = [one for one in _in(SHIPPED) if one.name not in names] if results_dir.resolve() != SHIPPED else []
+    others = [] if results_dir.resolve() == SHIPPED else _in(SHIPPED)
+    shipped = [one for one in others if one.name not in names and one.shown.title]
     return own + [Found(one.name, one.shown, None, {}, one.base, shipped=True) for one in shipped]
 
 
