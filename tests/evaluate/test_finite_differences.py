@@ -10,6 +10,7 @@ from renderers.camera import Camera, Rays
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
 from renderers.reference import trace
+from tests.looped import each
 from tests.tiny import camera_of, plane_decoder
 
 CODE_WEIGHTS = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
@@ -32,8 +33,8 @@ def distance_to_plane(normal: torch.Tensor, rays: Rays, code: torch.Tensor) -> t
     return (level - rays.origins @ normal) / (rays.directions @ normal)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.4, 3.0])
-@pytest.mark.parametrize("angle", NORMALS)
+@each("scale", [1.0, 0.4, 3.0])
+@each("angle", NORMALS)
 def test_differences_are_the_derivatives_of_a_plane(angle, scale):
     normal, pixels = torch.tensor(NORMALS[angle], dtype=torch.float64), torch.tensor([0, 7, 20, 35])
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -119,9 +120,7 @@ def passing_decoder(at: float, height: float) -> Decoder:
     return decoder
 
 
-@pytest.mark.parametrize(
-    ("at", "height", "clear"), [(0.5, 0.004, False), (0.5, 0.02, True), (0.9, 0.004, False), (-0.5, 0.004, True)]
-)
+@each("at, height, clear", [(0.5, 0.004, False), (0.5, 0.02, True), (0.9, 0.004, False), (-0.5, 0.004, True)])
 def test_a_ray_that_passes_close_by_something_before_its_hit_is_not_clear(at, height, clear):
     field = passing_decoder(at, height).at(torch.zeros(0).double())
     z = torch.linspace(-0.9, 0.9, 19, dtype=torch.float64)

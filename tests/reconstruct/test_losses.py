@@ -16,6 +16,7 @@ from renderers.camera import Camera, Rays
 from renderers.field import Kind, Meter
 from renderers.fields.coloured import Coloured
 from renderers.silhouette import Own
+from tests.looped import each
 from tests.renderers.analytic_cases import vector
 from tests.tiny import camera_of
 
@@ -120,7 +121,7 @@ def test_the_ball_is_a_coloured_field_and_some_pixels_miss_it():
         torch.testing.assert_close(rendering.distance[hit], DISTANCE[hit], rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("mask", [None, HALF], ids=["no mask", "mask"])
+@each("mask", [None, HALF])
 def test_the_colour_term_is_the_sum_over_hits_on_the_foreground_over_all_rays(mask):
     expected = 0.0
     for pixel in range(64):
@@ -134,7 +135,7 @@ def test_the_colour_term_is_the_sum_over_hits_on_the_foreground_over_all_rays(ma
     assert torch.equal(terms["total"], terms["colour"])
 
 
-@pytest.mark.parametrize("weight", [0.0, 2.0])
+@each("weight", [0.0, 2.0])
 def test_the_colour_gradient_term_compares_neighbours_of_whole_patches(weight):
     camera = camera_of(12, field_of_view=32.0)
     corners = torch.tensor([12 * row + column for row in range(0, 12, 2) for column in range(0, 12, 2)])
@@ -156,7 +157,7 @@ def test_the_colour_gradient_term_compares_neighbours_of_whole_patches(weight):
     assert ("colour" in terms) == (weight > 0)
 
 
-@pytest.mark.parametrize("kind", ["depth", "points"])
+@each("kind", ["depth", "points"])
 def test_the_depth_term_is_the_error_of_hits_with_a_depth_over_all_rays(kind):
     given = torch.where(HALF, DISTANCE + torch.linspace(-0.2, 0.3, 64, dtype=torch.float64), torch.nan)
     known = given.isfinite()  # some of them miss the ball: given there too, they do not count
@@ -223,7 +224,7 @@ def test_the_normals_term_is_of_the_cosine_with_given_normals():
     assert exact["normals"].item() == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("slope", [1.0, 0.7, 1.3])
+@each("slope", [1.0, 0.7, 1.3])
 def test_the_eikonal_term_is_of_the_slope_at_hits_and_anywhere(slope):
     shape = ball(slope=slope)
     meter = Meter(shape)
@@ -259,7 +260,7 @@ def test_a_surface_that_no_ray_meets_has_finite_terms():
     assert gradient.isfinite() and gradient < 0  # the mask loss makes it larger
 
 
-@pytest.mark.parametrize("weights", [{"depth_loss": "depths"}, {"colour": -1.0}, {"silhouette_weight": -1.0}])
+@each("weights", [{"depth_loss": "depths"}, {"colour": -1.0}, {"silhouette_weight": -1.0}])
 def test_weights_that_cannot_be_are_refused(weights):
     with pytest.raises(ValueError, match=f"task.losses.{next(iter(weights))} must be"):
         losses(**weights)
@@ -269,13 +270,9 @@ INNER = pixels_of(camera_of(6, field_of_view=18.0))  # away from the outline, so
 TARGETS = torch.rand(36, 3, generator=torch.Generator().manual_seed(0)).round().double()  # no difference changes sign
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize(
-    "weights",
-    [{"colour": 1.0}, {"depth": 1.0}, {"normals": 1.0}, {"colour_gradient": 1.0}, {"smoothness": 1e3}],
-    ids=str,
-)
-@pytest.mark.parametrize("slope", [1.0, 0.8])
+@each("renderer", RENDERERS)
+@each("weights", [{"colour": 1.0}, {"depth": 1.0}, {"normals": 1.0}, {"colour_gradient": 1.0}, {"smoothness": 1e3}])
+@each("slope", [1.0, 0.8])
 def test_the_gradient_towards_shape_and_colours_is_that_of_differences(renderer, weights, slope):
     """DVR, Eqs. 3 to 8: through the colours at the hit, and through the hit's place."""
     settings, first = losses(**weights), ball(slope=slope)

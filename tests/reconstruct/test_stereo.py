@@ -15,6 +15,7 @@ from datasets.shot import Shot
 from datasets.truth import Truth
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
+from tests.looped import each
 from tests.reconstruct.test_losses import ball, shot_of
 from tests.reconstruct.test_subject import icosphere
 from tests.tiny import camera_of
@@ -137,8 +138,8 @@ def test_without_opencv_the_remedy_is_told(monkeypatch):
         stereo_clouds(shots, ALL)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
+@each(
+    "settings, message",
     [((0, 45.0), "task.matching.neighbours must be at least 1"), ((3, 0.0), "task.matching.most_degrees must be pos")],
 )
 def test_settings_that_cannot_be_are_told(settings, message):

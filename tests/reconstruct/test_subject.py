@@ -25,6 +25,7 @@ from datasets.truth import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_captures import nerf
 from tests.datasets.test_photographs import PLAINLY
+from tests.looped import each
 from tests.reconstruct.test_losses import RENDERERS, ball, shot_of
 from tests.tiny import ball_prior, camera_of, run_of
 
@@ -83,7 +84,7 @@ def test_photographs_of_ones_own_have_no_truth_and_no_depths(inputs, tmp_path):
         found(inputs, Depths("dense", 0.0))
 
 
-@pytest.mark.parametrize(("points", "count"), [("dense", None), ("25%", None), ("30", 30)])
+@each("points, count", [("dense", None), ("25%", None), ("30", 30)])
 def test_depths_are_given_in_the_amount_that_is_asked_for(points, count):
     shot = shot_of(ball(), CAMERA)
     given = Depths(points, 0.0).of(shot, (0, 3)).depth

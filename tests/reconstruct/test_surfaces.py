@@ -12,6 +12,7 @@ from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.surfaces import fused, given_clouds, painter, poisson, with_colours
 from datasets.mesh import Mesh
 from datasets.truth import Truth
+from tests.looped import each
 from tests.reconstruct.test_judge import CENTRE
 from tests.reconstruct.test_judge import painted as coloured_ball
 from tests.reconstruct.test_losses import ball, shot_of
@@ -47,7 +48,7 @@ def test_given_depths_become_points_of_the_surface():
     assert off_sphere(clouds[0].points - np.array(CENTRE)).max() < 1e-4
 
 
-@pytest.mark.parametrize("outward", [True, False])
+@each("outward", [True, False])
 def test_normals_look_at_the_camera_of_their_cloud(outward):
     towards = directions(600)
     cameras = (FRONT, BACK) if outward else (BACK, FRONT)

@@ -21,6 +21,7 @@ from renderers.checks import BadInput
 from renderers.field import Kind
 from renderers.silhouette import CrossEntropy
 from tests.datasets.test_photographs import PLAINLY
+from tests.looped import each
 from tests.tiny import silent
 
 CPU = torch.device("cpu")
@@ -124,7 +125,7 @@ def test_pixels_are_those_of_the_image(images):
     assert found.numpy() == pytest.approx(0.55, abs=0.01)
 
 
-@pytest.mark.parametrize(("reads", "kind"), [("distance", Kind.DISTANCE), ("occupancy", Kind.LEVEL)])
+@each("reads, kind", [("distance", Kind.DISTANCE), ("occupancy", Kind.LEVEL)])
 def test_every_code_begins_as_the_same_sphere(reads, kind):
     torch.manual_seed(0)
     model = SingleView(replace(NETWORK, reads=reads, width=64))
@@ -331,8 +332,8 @@ def test_the_overlap_is_that_of_volumes(images):
         assert overlap(model.at(torch.zeros(6)), one, CPU) == pytest.approx(expected, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("kind", "changed", "says"),
+@each(
+    "kind, changed, says",
     [
         (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
         (NETWORK, {"channels": ()}, "the length of task.network.channels"),

@@ -24,6 +24,7 @@ from renderers import reference
 from renderers.camera import Rays
 from renderers.rendering import Status
 from renderers.silhouette import Own
+from tests.looped import each
 from tests.tiny import Blind
 
 CPU = torch.device("cpu")
@@ -66,7 +67,7 @@ SOLIDS = {
 }
 
 
-@pytest.mark.parametrize("name", SOLIDS)
+@each("name", SOLIDS)
 def test_the_closed_form_agrees_with_the_reference_tracer(name):
     solid, rays = SOLIDS[name], random_rays(2000, 0)
     first = solid.trace(rays)
@@ -84,7 +85,7 @@ def test_a_ray_that_begins_inside_has_no_first_hit():
     assert bool(first.inside) and not bool(first.hit)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if stress_named(name).measure != "fit"])
+@each("name", [name for name in NAMES if stress_named(name).measure != "fit"])
 def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
     stress = stress_named(name)
     renderer = load("renderer", "dist" if stress.setting == "alpha" else "idr")
@@ -94,7 +95,7 @@ def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
     assert sum(outcome.success for outcome in outcomes) >= 2, [(o.failure, o.numbers) for o in outcomes]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each("name", NAMES)
 def test_every_stress_has_the_same_trial_for_every_renderer(name):
     stress = stress_named(name)
     if stress.measure == "fit":
@@ -117,7 +118,7 @@ def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
     return {name: n for name, n in numbers.items() if name not in ("evaluations_per_ray", "surface_moved", "hits")}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each("name", NAMES)
 def test_repeats_of_a_trial_have_other_outcomes_or_there_is_one_trial(name):
     stress = stress_named(name)
     levels = np.linspace(1, 0, 11)
@@ -125,7 +126,7 @@ def test_repeats_of_a_trial_have_other_outcomes_or_there_is_one_trial(name):
     assert differ == (stress.repeats is None)
 
 
-@pytest.mark.parametrize("renderer", ["idr", "dist", "naive", "dvr"])
+@each("renderer", ["idr", "dist", "naive", "dvr"])
 def test_one_trial_is_all_or_nothing(renderer):
     """From within, a renderer calls all rays hits or none, so that a second view would add nothing."""
     stress = stress_named("camera_inside")
@@ -138,7 +139,7 @@ def test_one_trial_is_all_or_nothing(renderer):
 MOVED = {"perturbed": (0.006, 0.03, 0.1), "quantised": (1e-4, 0.008, 0.1), "coarse_floats": (12, 7, 3)}
 
 
-@pytest.mark.parametrize(("name", "severity"), [(name, s) for name, severities in MOVED.items() for s in severities])
+@each("name, severity", [(name, s) for name, severities in MOVED.items() for s in severities])
 def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(name, severity):
     exam = SCENES[name](severity, drawn(), 40)
     first, rays = truth(exam)[0], exam.camera.double().rays().flat()
@@ -151,7 +152,7 @@ def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(n
     assert behind.quantile(0.99) <= 0.00101 and behind.quantile(0.01) >= -1e-6
 
 
-@pytest.mark.parametrize("name", MOVED)
+@each("name", MOVED)
 def test_what_moves_the_surface_is_recorded_and_not_judged(name):
     for severity in MOVED[name]:
         exam = SCENES[name](severity, drawn(), 48)
@@ -171,7 +172,7 @@ def test_a_perturbed_field_is_the_same_function_in_both_precisions():
     assert (field(points).double() - field(points.double())).abs().max() < 2e-6
 
 
-@pytest.mark.parametrize("name", ["gap", "grazing_plane", "empty_scene", "bumps", "ripples"])
+@each("name", ["gap", "grazing_plane", "empty_scene", "bumps", "ripples"])
 def test_severe_is_worse_than_mild(name):
     stress, renderer = stress_named(name), load("renderer", "idr")
     assert stress.trial(renderer, 0.0, 0, conditions()).success
@@ -243,7 +244,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     assert stress_named("gradient_samples").stressed(practical, 2.6).n_gradient_samples == 3
 
 
-@pytest.mark.parametrize("scene", ["depth_noise", "wrong_pose"])
+@each("scene", ["depth_noise", "wrong_pose"])
 def test_a_disturbed_fit_ends_further_off(scene):
     renderer = load("renderer", "dist")
     outcomes = [
