@@ -29,21 +29,46 @@ Node = dict[str, Any]
 def register_rows(folders: Sequence[Path] = ()) -> None:
     """Makes the rows of our tables choices of their groups, and those of the same tables in other folders.
 
+    Rows of folders of an earlier call are choices no more.
+
     Raises:
         ValueError: for a table that cannot be read.
     """
+    while _REPLACED:
+        group, key, before = _REPLACED.pop()
+        _stored(group).pop(key)
+        _stored(group).update({} if before is None else {key: before})
     for folder in (CONF, *folders):
         for table, group in GROUPS.items():
-            if (path := folder / f"{table}.yaml").is_file():
-                _store(path, group, _text(path))
+            if not (path := folder / f"{table}.yaml").is_file():
+                continue
+            if folder == CONF:
+                _store_ours(path, group, _text(path))
+                continue
+            for of, name, _ in _rows(path, group, _text(path)):
+                _REPLACED.append((of, f"{name}.yaml", _stored(of).get(f"{name}.yaml")))
+            _store(path, group, _text(path))
 
 
-@cache
+_REPLACED: list[tuple[str, str, Any]] = []  # rows of other folders: group, key, and what stood there before
+
+
+def _stored(group: str) -> dict[str, Any]:
+    """What Hydra keeps of a group."""
+    place = ConfigStore.instance().repo
+    for part in group.split("/"):
+        place = place.setdefault(part, {})
+    return place
+
+
 def _store(path: Path, group: str, text: str) -> None:
     for of, name, node in _rows(path, group, text):
         whole = of.startswith(METHOD) or node == {group: None}
         kept = {key: value for key, value in node.items() if key != LOOK or not whole}
         ConfigStore.instance().store(group=of, name=name, node=kept, package="_global_" if whole else None)
+
+
+_store_ours = cache(_store)
 
 
 def read_rows(folder: Path) -> dict[str, dict[str, Node]]:
