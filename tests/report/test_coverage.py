@@ -23,7 +23,6 @@ from bench.report.data.statistics import (
     median,
     paired_bootstrap,
     share,
-    wins,
 )
 
 DRAWS = 200  # of a bootstrap; the report takes 2,000
@@ -150,21 +149,6 @@ def test_shares_of_independent_trials_for_every_rate():
         found = [clopper_pearson(k / n, n) for k in range(n + 1)]
         holds = np.array([(one.low <= rates) & (rates <= one.high) for one in found])
         assert ((stats.binom.pmf(np.arange(n + 1)[:, None], n, rates) * holds).sum(axis=0) >= 0.95 - 1e-9).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(6, 1), (8, 2)], ids=str)
-@pytest.mark.parametrize("ahead", [0.0, 1.0, 2.5])
-@pytest.mark.parametrize("varying", [0.3, 1.5])  # how much it depends on the shape which is the better one
-def test_wins(size, ahead, varying):
-    truth = stats.norm.cdf(ahead / math.sqrt(2 + varying**2))
-
-    def one(generator, _):
-        by = ahead + varying * generator.normal(size=(size[0], 1))
-        first, second = np.exp(generator.normal(size=size) - by), np.exp(generator.normal(size=size))
-        return covered(wins(list(first), list(second)), truth)
-
-    assert simulated(one) >= LEAST
 
 
 @pytest.mark.slow

@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import numpy as np
@@ -12,19 +11,16 @@ from bench.report.data.statistics import (
     Interval,
     bootstrap,
     clopper_pearson,
-    compare,
     dominated,
     front,
     geometric,
     geometric_ratio,
-    holm,
     interquartile_mean,
     kaplan_meier,
     median,
     paired_bootstrap,
     rank,
     share,
-    wins,
 )
 from tests.looped import each
 
@@ -121,7 +117,6 @@ def test_fewer_than_six_shapes_have_points_and_no_interval(n):
         bootstrap(groups, mean, seed=0),
         paired_bootstrap(groups, groups, mean, seed=0),
         share(np.ones(n), 2 * np.ones(n)),
-        wins(groups, groups),
     ):
         assert math.isnan(found.low) and math.isnan(found.high) and not found.known and len(found.points) == n
         assert str(found).endswith(f" (n = {n})")
@@ -224,21 +219,7 @@ def test_a_share_counts_shapes_not_trials():
             share(np.array(bad[0]), np.array(bad[1]))
 
 
-def test_wins_are_of_pairs_and_ties_are_half():
-    first, second = singles(1, 2, 3, INF, INF, 1), singles(2, 2, 1, INF, 1, INF)
-    assert wins(first, second).points == (1, 0.5, 0, 0.5, 0, 1)
-    assert wins(first, second).value == wins(second, first).value == 0.5
-    seeds = [np.array([1.0, 1.0]), *singles(1, 1, 1, 1, 1)]
-    better = wins(seeds, [np.array([2.0, 0.5]), *singles(2, 2, 2, 2, 2)])
-    assert better.value == 6 / 7 and better.points == (0.5, 1, 1, 1, 1, 1)
-    assert (better.low, better.high) == pytest.approx((clopper_pearson(6 / 7, 6).low, clopper_pearson(6 / 7, 6).high))
-    with pytest.raises(ValueError, match="same shapes and seeds"):
-        wins(first, second[1:])
-
-
 def test_one_run_of_each_gives_no_probability_and_no_rank():
-    assert math.isnan(wins(singles(1), singles(2)).value)
-    assert wins(singles(1, 1), singles(2, 2)).value == wins([np.ones(2)], [np.full(2, 2.0)]).value == 1
     assert np.isnan(front([point([1], [1]), point([2], [2])], seed=0)).all()
     assert front([point([1, 1], [1, 1]), point([2, 2], [2, 2])], seed=0) == [1, 0]
     assert np.isnan(list(rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())).all()
@@ -290,36 +271,6 @@ def test_kaplan_meier_where_none_or_all_reach():
 def test_kaplan_meier_needs_times(times, reached):
     with pytest.raises(ValueError, match="times"):
         kaplan_meier(times, reached)
-
-
-def test_holm_worked_example():
-    # In order 0.005 * 4, 0.01 * 3, 0.03 * 2, and 0.04 * 1 raised to the one before.
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.5, 0.9]).tolist() == [1, 1]
-    assert holm([]).tolist() == []
-    with pytest.raises(ValueError, match="p-values"):
-        holm([0.1, math.nan])
-
-
-@each("n", [1, 5, 12, 40])
-def test_compare_is_the_exact_signed_rank_test(n):
-    generator = np.random.default_rng(n)
-    first, second = generator.normal(0.4, 1, (n, 3)), generator.normal(size=(n, 3))
-    expected = stats.wilcoxon(np.median(first, axis=1) - np.median(second, axis=1), method="exact").pvalue
-    assert compare(list(first), list(second)) == pytest.approx(expected)
-    assert compare(list(second), list(first)) == pytest.approx(expected)
-
-
-def test_compare_with_ties_zeros_and_failures():
-    first, second = singles(3, 1, 5, 2, INF, 9, INF, 4), singles(1, 3, 1, 1, 2, 9, INF, INF)
-    ranks, signs = [2.5, 2.5, 4, 1, 5.5, 5.5], [1, -1, 1, 1, 1, -1]  # of 2, -2, 4, 1, inf, -inf; two zeros left out
-    extreme = abs(np.dot(ranks, signs))
-    flips = [abs(np.dot(ranks, flip)) >= extreme for flip in itertools.product((-1, 1), repeat=6)]
-    assert compare(first, second) == pytest.approx(np.mean(flips))
-    assert compare(singles(1, INF), singles(1, INF)) == 1
-    assert compare(singles(*[INF] * 6), singles(*range(6))) == 2 / 64
-    with pytest.raises(ValueError, match="same shapes"):
-        compare(singles(1), singles(1, 2))
 
 
 def test_rank_worked_example():

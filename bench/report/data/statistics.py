@@ -1,4 +1,4 @@
-"""Statistics of methods' errors over runs: averages, intervals, tests, ranks and Pareto fronts.
+"""Statistics of methods' errors over runs: averages, intervals, ranks and Pareto fronts.
 
 Lower is better. A run that failed or is missing has the error +inf. A method's errors are groups: an array per shape,
 with the errors of its seeds, or a list per shape with an array per view. Where methods are compared, the same place in
@@ -212,23 +212,6 @@ def clopper_pearson(value: float, n: float, *, level: float = 0.95) -> Interval:
     return Interval(value, low, high)
 
 
-def wins(first: Groups, second: Groups, *, level: float = 0.95) -> Interval:
-    """The probability that the first has a lower error than the second on the same shape, view and seed.
-
-    It is the share of such pairs in which it is lower; equal errors, and two failures, are half a win each.
-
-    Returns:
-        The interval is that of `share`; nan ends below `FEWEST_SHAPES`, and all nan for one pair alone.
-    """
-    if _sizes(first) != _sizes(second):
-        raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
-    pairs = [(_checked(flat([a])), _checked(flat([b]))) for a, b in zip(first, second, strict=True)]
-    if sum(len(a) for a, _ in pairs) < 2:
-        return Interval(math.nan, math.nan, math.nan)
-    won = [lower(a, b) for a, b in pairs]
-    return share(won, [len(a) for a, _ in pairs], level=level)
-
-
 def kaplan_meier(times: Values, reached: np.ndarray | Sequence[bool], *, level: float = 0.95) -> Survival:
     """The share of runs that have not yet reached their goal over time (Kaplan and Meier 1958), from 1 at time 0.
 
@@ -258,36 +241,6 @@ def kaplan_meier(times: Values, reached: np.ndarray | Sequence[bool], *, level: 
         intervals = [clopper_pearson(value, n, level=level) for value, n in zip(left, worth, strict=True)]
         ends = np.array([(one.low, one.high) for one in intervals]).T
     return Survival(np.append(0.0, steps), left, *ends)
-
-
-def holm(p_values: Values) -> np.ndarray:
-    """The p-values adjusted for their number (Holm 1979), in the given order, at most 1."""
-    p = np.asarray(p_values, dtype=float)
-    if not ((p >= 0) & (p <= 1)).all():
-        raise ValueError(f"p-values must be in 0..1, but are {p}: leave out what was not tested")
-    order = np.argsort(p)
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1)
-    return adjusted
-
-
-def compare(first: Groups, second: Groups) -> float:
-    """The two-sided p-value of Wilcoxon's signed-rank test (1945) on the medians of the shapes, exact for any number.
-
-    Exact means over all flips of the signs, given the ranks: ties share their mean rank, and differences of zero are
-    left out. The difference is zero where both failed, and the largest where one failed. 1 if all are zero.
-    """
-    if len(first) != len(second):
-        raise ValueError(f"both must have the same shapes, but have {len(first)} and {len(second)}: fill in with inf")
-    a, b = shape_medians(first), shape_medians(second)
-    differ = a != b
-    difference = a[differ] - b[differ]
-    ranks = np.rint(2 * stats.rankdata(np.abs(difference))).astype(int)  # doubled, so that ties have integer ranks
-    chance = np.ones(1)  # probability of each sum of the ranks whose sign is flipped
-    for r in ranks:
-        chance = (np.append(chance, np.zeros(r)) + np.append(np.zeros(r), chance)) / 2
-    positive = ranks[difference > 0].sum()
-    return min(1.0, 2 * float(chance[: min(positive, ranks.sum() - positive) + 1].sum()))
 
 
 def rank(
