@@ -72,13 +72,8 @@ class Plan:
 
 def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """All plans of a results folder as plain data, and an error message for each that cannot be read."""
-    found = [read_plan(path, results_dir) for path in plan_paths(results_dir)]
+    found = [read_plan(path, results_dir) for path in sorted((results_dir / "sweeps").glob(f"*/{PLAN}"))]
     return [plan for plan, _ in found if plan is not None], [problem for _, problem in found if problem]
-
-
-def plan_paths(results_dir: Path) -> list[Path]:
-    """The files of all plans of a results folder, by name."""
-    return sorted((results_dir / "sweeps").glob(f"*/{PLAN}"))
 
 
 def read_plan(path: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:

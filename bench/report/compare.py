@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.records import format
 from bench.report.data import statistics
-from bench.report.data.records import SCALE, RunKey, by_shape
+from bench.report.data.records import RunKey, by_shape
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
 from bench.report.write import chart
@@ -31,29 +31,13 @@ FAILURE = (
 CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
 ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
 INTERVAL = "95 % intervals over shapes (Student's, of logarithms)"
-RATIO = "A ratio is that of geometric means over shapes; behind it the shapes on which the row is better, ties half."
+RATIO = (
+    "A ratio divides two geometric means over shapes; after it stand the shapes on which the row is better, ties half."
+)
+METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
+CONDITION = "task.points"  # over which tables have columns
+ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
 Line = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What is compared.
-
-    Args:
-        error: the metric, of which lower is better.
-        label: of its axis, with its factor and unit.
-        condition: the setting over which a table has columns, such as task.points; empty for none.
-        order: the first of its values, in their order.
-        reference: gives the preset that the row of a preset is divided by.
-        scale: of the error.
-    """
-
-    error: str = "chamfer_l2"
-    label: str = "Chamfer × 1000 (scene units²)"
-    condition: str = "task.points"
-    order: tuple[str, ...] = ("dense", "50%", "10%", "100", "50", "20")
-    reference: Callable[[str], str] = str
-    scale: float = SCALE
 
 
 @dataclass(frozen=True)
@@ -83,11 +67,11 @@ class Compared:
 
     Args:
         runs: at least one.
-        of: what is compared.
+        reference: gives the preset that the row of a preset is divided by; by default itself, so that none is.
     """
 
     runs: Runs
-    of: Comparison = field(default_factory=Comparison)
+    reference: Callable[[str], str] = str
 
     @cached_property
     def cells(self) -> pd.DataFrame:
@@ -98,9 +82,9 @@ class Compared:
         """
         frame = self.runs.frame
         found = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
-            at=self.runs.setting(self.of.condition),
+            at=self.runs.setting(CONDITION),
             ok=(frame.status == "ok").to_numpy(bool),
-            error=self.runs.error(self.of.error, self.of.scale),
+            error=self.runs.error(METRIC),
             evaluations=frame["values"],
             seconds=frame.loop,
         )
@@ -122,7 +106,7 @@ class Compared:
     def conditions(self) -> list[str]:
         """The values of the condition, in their order."""
         found = {str(value) for value in self.cells["at"]}
-        return [value for value in self.of.order if value in found] + sorted(found - {*self.of.order})
+        return [value for value in ORDER if value in found] + sorted(found - {*ORDER})
 
     def part(self, family: str, row: tuple[str, str], at: str | None = None) -> pd.DataFrame:
         """The lines of a family, or of `EVERY`, and of a row, at one condition or at all."""
@@ -182,7 +166,7 @@ class Compared:
 
     def _line(self, family: str, row: tuple[str, str]) -> Line:
         mine = self.part(family, row)
-        reference = next((other for other in self.rows if other[0] == self.of.reference(row[0])), row)
+        reference = next((other for other in self.rows if other[0] == self.reference(row[0])), row)
         costs = {cost: mine[cost][mine.ok].dropna().median() for cost in COSTS}
         return {
             **{"family": family, "row": row[1], "preset": row[0]},
@@ -279,7 +263,7 @@ class Compared:
             chart.front(axis, rows, [line[cost] for line in known], errors, on)
             style.log_axis(axis, "x", [line[cost] for line in known])
             axis.set_xlabel(label)
-        axes[0].set_ylabel(self.of.label)
+        axes[0].set_ylabel(LABEL)
         style.log_axis(axes[0], "y", [v for line in self.pooled for v in (line["error"].low, line["error"].value)])
         style.legend_below(figure, axes[0], columns=3)
         return figure
@@ -302,7 +286,7 @@ class Compared:
         for axis in axes.flat[len(self.families) :]:
             axis.axis("off")
         for axis in axes[:, 0]:
-            axis.set_ylabel(self.of.label)
+            axis.set_ylabel(LABEL)
         style.log_axis(axes[0, 0], "y", self.cells.error)
         style.legend_below(figure, *axes.flat)
         return figure
@@ -328,7 +312,7 @@ class Compared:
                 for line in known
                 if line[cost] is not None
             ]
-            panels.append(panel_data("error over cost", label, self.of.label.partition(" (")[0], points))
+            panels.append(panel_data("error over cost", label, LABEL.partition(" (")[0], points))
         return {"panels": panels}
 
 

@@ -13,9 +13,9 @@ from bench.report.compare import (
     EVERY,
     FAILURE,
     INTERVAL,
+    LABEL,
     RATIO,
     Compared,
-    Comparison,
     Gap,
     excluding_one,
     heading,
@@ -115,7 +115,7 @@ def _class(record: dict[str, Any], part: str) -> str:
 
 def make(runs: Runs) -> Result:
     """A line per family, renderer and loss: the median at each number of points."""
-    found = Crossed(runs, Comparison())
+    found = Crossed(runs)
     labels, by_row = found.labels, {row: key for key, row in found.settings.items()}
     lines = [
         {"renderer": labels[by_row[row][0]], "loss": labels[by_row[row][1]]} | line
@@ -150,7 +150,7 @@ def draw(found: Crossed) -> Figure:
         for axis, name in zip(line, families, strict=True):
             _panel(axis, found, name, given)
             axis.set_title(f"{name}, {heading(given)}")
-        line[0].set_ylabel(found.of.label)
+        line[0].set_ylabel(LABEL)
     for axis in axes[-1]:
         axis.set_xlabel("loss of the mask")
     style.log_axis(axes[0, 0], "y", found.cells.error)
@@ -174,7 +174,7 @@ def _panel(axis: Axes, found: Crossed, family: str, points: str) -> None:
 
 def make_gaps(runs: Runs) -> Result:
     """A line per pair of renderers and family: their gap under own losses, its two parts, and that under each loss."""
-    found = Crossed(runs, Comparison())
+    found = Crossed(runs)
     others = [renderer for renderer in found.renderers if renderer != REFERENCE and REFERENCE in found.renderers]
     lines = [_gaps(found, renderer, name) for renderer in others for name in (EVERY, *found.families)]
     compared = {"own": "Own losses", "renderer": "of it the renderer", "loss": "of it the loss"}
@@ -240,7 +240,7 @@ def _verdict(found: Crossed, pooled: list[Line]) -> str:
 
 def make_front(runs: Runs) -> Result:
     """A line per loss and renderer: its error over all families, its cost, and whether none is better for less."""
-    found = Crossed(runs, Comparison())
+    found = Crossed(runs)
     lines = [line for loss in found.losses for line in _placed(found, loss)]
     columns = [
         *(text("loss", "Loss of the mask"), text("renderer", "Renderer")),
@@ -295,7 +295,7 @@ def draw_front(found: Crossed, lines: list[Line]) -> Figure:
         rows, errors = [(line["preset"], line["renderer"]) for line in own], [line["error"] for line in own]
         chart.front(axis, rows, [line["evaluations"] for line in own], errors, [line["front"] for line in own])
         axis.set(title=found.labels[loss], xlabel="field values per run")
-    axes[0].set_ylabel(found.of.label)
+    axes[0].set_ylabel(LABEL)
     style.log_axis(axes[0], "x", [line["evaluations"] for line in finite])
     style.log_axis(axes[0], "y", [line["error"].value for line in finite])
     style.legend_below(figure, *axes)

@@ -1,6 +1,6 @@
 """Every renderer under one loss of the mask and at one tuned setting: errors, ratios to DIST, error over cost."""
 
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared, Comparison
+from bench.report.compare import ERROR, FAILURE, RATIO, Compared
 from bench.report.data.runs import Runs, Selection
 from bench.report.write.result import Result
 
@@ -20,7 +20,7 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per family and row, all families first."""
-    return Compared(runs, Comparison(reference=lambda _: "dist_mask")).result(
+    return Compared(runs, lambda _: "dist_mask").result(
         "Every renderer under one loss, at one tuned setting.",
         "How do all renderers compare under one loss and one setting?",
         ratio="Ratio to DIST",

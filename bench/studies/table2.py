@@ -3,7 +3,7 @@
 from typing import Any
 
 from bench.report import gallery
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared, Comparison, heading
+from bench.report.compare import ERROR, FAILURE, METRIC, ORDER, RATIO, Compared, heading
 from bench.report.data.records import Record, grouped, iterations_of, row_of, setting
 from bench.report.data.runs import Runs, Selection
 from bench.report.gallery import BEHIND, FOUND, FRONT, TRUE, Block, Scene
@@ -13,9 +13,9 @@ from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configure
 
 PLACE = 20
 READS = (Selection("table2", ("task.points",)),)
-OF = Comparison(reference=lambda _: "dist_mask")
+REFERENCE = "dist_mask"
 VARIANTS = ("_paper", "_official")  # ends of presets that the figure leaves out, to be read
-# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of `OF.order`.
+# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of `ORDER`.
 PUBLISHED = {
     "sofa": {
         "DeepSDF": (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
@@ -54,7 +54,7 @@ BOTH = (FRONT, BEHIND)
 
 def make(runs: Runs) -> Result:
     """A line per family and row, with the oracle and published numbers beside each family."""
-    found, oracle = Compared(runs, OF), oracles(runs, OF.error)
+    found, oracle = Compared(runs, lambda _: REFERENCE), oracles(runs, METRIC)
     lines = [line for name in dict.fromkeys(x["family"] for x in found.lines) for line in _family(found, name, oracle)]
     columns = [
         column for column in found.columns("Ratio to DIST with mask") if column.key not in ("evaluations", "seconds")
@@ -76,7 +76,7 @@ def _family(found: Compared, name: str, oracle: dict[str, float]) -> list[dict[s
     empty = {"family": name, "error": "", "ratio": None, "failed": ""}
     best = [empty | {"row": LABEL} | dict.fromkeys(found.conditions, oracle[name])] if name in oracle else []
     published = [
-        empty | {"row": f"published: {row}"} | dict(zip(OF.order, numbers, strict=True))
+        empty | {"row": f"published: {row}"} | dict(zip(ORDER, numbers, strict=True))
         for row, numbers in PUBLISHED.get(name, {}).items()
     ]
     return best + [line for line in found.lines if line["family"] == name] + published
@@ -127,7 +127,7 @@ def pictures(runs: Runs) -> Result:
 def _block(name: str, records: list[Record], scene: Scene) -> Block:
     """The rows of a family over the number of points, behind them the truth."""
     found = grouped(records, _points)
-    points = [p for p in OF.order if p in found] + sorted(found.keys() - {*OF.order})
+    points = [p for p in ORDER if p in found] + sorted(found.keys() - {*ORDER})
     given = [scene.shared(found[p][:1], gallery.depth) for p in points]
     rows = {"given depths": [*given, scene.shared(records, gallery.normals(TRUE), BOTH)]}
     for row, own in grouped(records, row_of).items():

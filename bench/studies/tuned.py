@@ -1,6 +1,6 @@
 """Each method at its defaults, tuned, and at its paper's setting, side by side."""
 
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared, Comparison, excluding_one
+from bench.report.compare import ERROR, FAILURE, RATIO, Compared, excluding_one
 from bench.report.data.runs import Runs, Selection
 from bench.report.write.result import Result
 from bench.report.write.table import COMPLETION, FAMILY, LOOP, configured, to_data, to_table
@@ -26,7 +26,7 @@ def default_of(preset: str) -> str:
 
 def make(runs: Runs) -> Result:
     """A line per family and row: medians, and the ratio to the method's defaults."""
-    found = Compared(runs, Comparison(reference=default_of))
+    found = Compared(runs, default_of)
     lines = [line for line in found.lines if line["family"] in found.families]
     tuned = [
         (f"{line['row']} on {line['family']}", line["ratio"]) for line in lines if line["preset"].startswith(FOLDER)

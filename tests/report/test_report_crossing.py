@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import EVERY, Comparison
+from bench.report.compare import EVERY
 from bench.report.data.runs import choose
 from bench.studies import crossing
 from bench.studies.crossing import READS, Crossed
@@ -56,7 +56,7 @@ def line(result, **wanted):
 
 
 def test_all_runs_are_one_experiment_with_a_cell_per_setting(tmp_path):
-    found = Crossed(crossed(tmp_path, shapes=2), Comparison())
+    found = Crossed(crossed(tmp_path, shapes=2))
     rows = found.settings
     assert (found.families, found.conditions) == (["sofa", "plane"], ["100", "20"])
     assert (found.renderers, found.losses) == (["dist", "idr"], ["Hinge", "CrossEntropy"])

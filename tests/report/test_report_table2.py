@@ -11,6 +11,7 @@ import pytest
 from bench.pictures import style
 from bench.records.read import read_records
 from bench.report import oracle
+from bench.report.compare import ORDER
 from bench.report.data.runs import choose
 from bench.report.write.paper import write_paper
 from bench.studies import priors, table2
@@ -76,14 +77,16 @@ def test_columns_stand_as_in_the_paper_and_published_numbers_are_marked(tmp_path
 def test_published_numbers_with_a_mask_are_no_worse_than_without(family):
     """As the paper says of them: a wrong digit would stand out; dense depth has the mask in both."""
     numbers = table2.PUBLISHED[family]
-    assert all(len(values) == len(table2.OF.order) for values in numbers.values())
+    assert all(len(values) == len(ORDER) for values in numbers.values())
     assert numbers["DIST"][0] == numbers["DIST with mask"][0]
     assert all(b < a for a, b in zip(numbers["DIST"][1:], numbers["DIST with mask"][1:], strict=True))
 
 
 def test_another_setting_of_the_shared_parts_is_told(tmp_path):
     completed(tmp_path, REFERENCE, 1.0)
-    write_run(tmp_path, "table2", OTHER, task="completion", settings={"view": {"resolution": 8}}, minute=0)
+    write_run(
+        tmp_path, "table2", OTHER, task="completion", dataset="sofa", settings={"view": {"resolution": 8}}, minute=0
+    )
     assert "Runs differ in view.resolution: rows with other values do not compare." in made(tmp_path).notes
 
 
