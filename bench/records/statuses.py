@@ -55,7 +55,7 @@ STATUSES = {
         "This is an answer, not an error. The reason says what is lacking; another renderer or setting may have it.",
     ),
     RunStatus.REFUSED: Said(
-        "The configuration cannot be.",
+        "The configuration is invalid.",
         "The reason names the key and what to type instead.",
     ),
     NOT_RUN: Said(

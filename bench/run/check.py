@@ -1,4 +1,4 @@
-"""Checks configurations before anything runs: a value that cannot be is told at once, with its cell.
+"""Checks configurations before anything runs: an invalid value is reported at once, with its cell.
 
 A configuration is built by the code that its run builds it with, `bench.run.cell.cell_of`.
 """
@@ -91,5 +91,5 @@ def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
     if count == len(plan.cells):
         return reason
     where = " ".join(plan.differing(cell)) or cell.id
-    others = f"; {count} of {len(plan.cells)} cells cannot be" if count > 1 else ""
+    others = f"; {count} of {len(plan.cells)} cells are invalid" if count > 1 else ""
     return f"cell {plan.cells.index(cell) + 1} of {len(plan.cells)} ({where}): {reason}{others}; nothing was run"

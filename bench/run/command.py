@@ -42,7 +42,7 @@ HELP = """
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML; --hydra-help is Hydra's own."""
-USAGE = 2  # exit status of a command line that asks for what there is not
+USAGE = 2  # exit status of a wrong command line
 FAILED = 1
 EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it

@@ -42,7 +42,7 @@ class Refused(BaseException):
 class Sweep:
     """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs.
 
-    `other` gets each cell of a sweep whose cells are no runs (`bench.train`, `bench.prior`); else it is None.
+    `other`: called for each cell by commands that start no runs (`bench.train`, `bench.prior`); None otherwise.
     """
 
     plan: Plan | None = None

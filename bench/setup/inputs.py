@@ -40,7 +40,7 @@ class RunInputs:
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
     photographed: Photographed | None = None  # the dataset, where it has photographs and no true shape
-    trained: int | None = None  # which of the prior's training shapes the scene's shape is, if it is one
+    trained: int | None = None  # number of the scene's shape in the prior's training; None where it was not in it
 
     @cached_property
     def scene(self) -> Scene:

@@ -15,7 +15,7 @@ from bench.records.names import differences
 from bench.records.read import RESULTS, not_run
 from bench.records.record import NOT_RUN, RunStatus
 from bench.records.statuses import STATUSES
-from bench.report.data.names import Nameable, names
+from bench.report.data.names import names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplified
@@ -37,7 +37,7 @@ def renderer(**settings) -> dict:
 
 
 def named(records) -> list[str]:
-    return names([Nameable.of(one) for one in records])
+    return names(records)
 
 
 def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():

@@ -102,7 +102,7 @@ def planned(plain, tmp_path):
 def test_a_sweep_is_told_which_cell_cannot_be(planned):
     plan = planned(("seed=0", "renderer.steps=9"), ("seed=0", "renderer.steps=0"), ("seed=0", "renderer.steps=-1"))
     with pytest.raises(ValueError, match=r"^cell 2 of 3 \(renderer.steps=0\): steps must be at least 1, not 0: .*"
-                       r"; 2 of 3 cells cannot be; nothing was run$"):  # fmt: skip
+                       r"; 2 of 3 cells are invalid; nothing was run$"):  # fmt: skip
         check_plan(plan, "basic", set())
     check_plan(plan, "basic", {"c-1", "c-2"})  # what is there already is not checked
     with pytest.raises(ValueError, match=r"^steps must be"):  # all of them: no cell is worth naming

@@ -1,12 +1,9 @@
 """Names of runs in a list: the row's name, then the settings in which runs of that name differ.
 
 What differs is found and written as `bench.records.names` does it for the rows of a sweep, so that a setting reads the
-same in both. A list has another beginning and end: a name begins with the row, since the list mixes all tasks and
-experiments, and lacks what stands in columns of its own, such as shape and seed.
+same in both. A list mixes all tasks and experiments, so a name begins with the row, and lacks what stands in columns of
+its own, such as shape and seed.
 """
-
-import json
-from dataclasses import dataclass
 
 from bench.records.names import in_order, settings_of, told_apart
 from bench.records.record import NEUTRAL_KEYS, row_name
@@ -20,35 +17,19 @@ SHOWN = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "label", 
 FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
 
 
-@dataclass(frozen=True)
-class Nameable:
-    """What the name of a run in a list depends on: its task, its row and, as JSON, the settings that may be named."""
-
-    task: str
-    row: str
-    settings: str
-
-    @classmethod
-    def of(cls, record: Record) -> "Nameable":
-        """What the name of a record depends on."""
-        return cls(record["task"], base_name(record), json.dumps(settings_of(record["config"], SHOWN)))
-
-
-def names(runs: list[Nameable]) -> list[str]:
+def names(records: list[Record]) -> list[str]:
     """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
 
     Settings are added as long as one tells apart runs of one task and row that those before it do not, so that what
     follows from another setting is not repeated; at most `MOST`.
     """
-    found = [""] * len(runs)
-    for places in grouped(range(len(runs)), lambda place: (runs[place].task, runs[place].row)).values():
-        alike = list(grouped(places, lambda place: runs[place].settings).values())
-        settings = [
-            json.loads(runs[same[0]].settings) for same in alike
-        ]  # each once: most runs of a list have the same
-        told = told_apart(
-            in_order(settings, FIRST), classes=[0] * len(alike), names=[runs[places[0]].row] * len(alike), most=MOST
-        )
+    found = [base_name(record) for record in records]
+    settings = [settings_of(record["config"], SHOWN) for record in records]
+    for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
+        alike = list(grouped(places, lambda place: str(settings[place])).values())  # most runs of a list have the same
+        different = [settings[same[0]] for same in alike]
+        rows = [found[places[0]]] * len(alike)
+        told = told_apart(in_order(different, FIRST), classes=[0] * len(alike), names=rows, most=MOST)
         for same, name in zip(alike, told.names, strict=True):
             for place in same:
                 found[place] = name

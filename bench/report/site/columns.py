@@ -7,7 +7,7 @@ from typing import Any
 from bench.records.files import digest, plain
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.record import started
-from bench.report.data.names import Nameable, names
+from bench.report.data.names import names
 from bench.report.data.records import Record, family, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
@@ -21,7 +21,7 @@ def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
     """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
     folders = [Folder(results_dir, record["folder"]) for record in records]
     texts = {name: [of(record) for record in records] for name, of in TEXTS.items()}
-    texts |= {"name": names([Nameable.of(record) for record in records]), "thumb": [one.thumb() for one in folders]}
+    texts |= {"name": names(records), "thumb": [one.thumb() for one in folders]}
     return {
         "count": len(records),
         "folder": [folder.name for folder in folders],
