@@ -5,6 +5,8 @@ import bench  # noqa: F401, before all else: it sets the OpenMP variables, which
 # isort: split
 import gc
 import os
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -98,6 +100,17 @@ def one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def forgotten_modules() -> Iterator[None]:
+    """A module of a user's that a test wrote is not imported any more in the next test, which may have its own."""
+    before = {*sys.modules}
+    yield
+    written = str(Path(tempfile.gettempdir()).resolve())
+    for name in sys.modules.keys() - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(written):
+            del sys.modules[name]
 
 
 @pytest.fixture(scope="session", autouse=True)

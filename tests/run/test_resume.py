@@ -52,7 +52,7 @@ def under_way(results: Path) -> int:
 
 
 def test_a_sweep_whose_driver_is_killed_goes_on_where_it_was(tmp_path):
-    killed_and_resumed(tmp_path, cells=3, kills=1, seed=0)
+    killed_and_resumed(tmp_path, cells=4, kills=1, seed=0)
 
 
 @pytest.mark.slow
