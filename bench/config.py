@@ -179,7 +179,9 @@ def check_top_level(config: Mapping[str, Any]) -> None:
     if evaluation["film"] not in (None, "gif", "webp"):
         raise ValueError(f"evaluation.film must be gif, webp or null, not {evaluation['film']!r}")
     if not config["results_dir"].strip():
-        raise ValueError("results_dir must name a folder, and is empty: results_dir=results")
+        raise ValueError(
+            "results_dir must name a folder, and is empty: type results_dir=results/local, or leave it out"
+        )
     if config["stress"] is not None and "stress" not in config["task"]:
         raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
     if evaluation["film"] is not None and evaluation["picture"] is None:

@@ -19,4 +19,6 @@ def nearest(word: str, known: list[str]) -> str:
         return f": did you mean {' or '.join(close)}?"
     roots = [name for name in known if not any(name.startswith(f"{other}_") for other in known)]
     shown = roots if len(known) > MANY else known
+    if not shown:
+        return ""
     return f": it has {', '.join(sorted(shown))}" + (", and variants of these" if len(shown) < len(known) else "")

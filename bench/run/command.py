@@ -33,7 +33,7 @@ GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scal
 HELP = """
     python -m bench task=completion renderer=dist                          one run
     python -m bench -m renderer=dist,dvr,newton seed=0,1,2 dataset=sofa,plane     a sweep: every combination
-    python -m bench -m +experiment=table1 scale=smoke                      all runs of a table, in seconds each
+    python -m bench -m +experiment=table1 scale=smoke                      all runs of a table, small ones
     python -m bench -m renderer=dist,dvr plan=true                         what would run, and for how long
     python -m bench dataset=mesh dataset.path=chair.obj                    your own mesh
     python -m bench renderer=custom renderer._target_=mypkg.Mine           your own renderer
@@ -205,7 +205,8 @@ def _explain(error: Exception) -> str:
             if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
                 return f"hydra/launcher={name} needs a plugin: {install(extra)}"
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
-            known = [option for option in cause.options or [] if not option.startswith("_")]  # others build on these
+            options = cause.options or names(group)  # Hydra has none for what a row builds on
+            known = [option for option in options if not option.startswith("_")]  # others build on these
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
             return what + nearest(name, known) + (own if "/" in name or "." in name else "")
     message = " ".join(str(error).split())

@@ -1,4 +1,4 @@
-"""The procedural families as they are shipped in conf/dataset."""
+"""The procedural families as they are shipped in conf/shapes.yaml."""
 
 from dataclasses import asdict, replace
 from types import SimpleNamespace
