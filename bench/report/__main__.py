@@ -39,14 +39,18 @@ def main(arguments: list[str]) -> None:
         frames = write_frame(records, results_dir)
         if len(frames) == 1:
             print(f"note: {NO_PARQUET}", file=sys.stderr)
-        for path in (*frames, *write_paper(records, results_dir), *write_sweeps(records, results_dir)):
+        broken: list[str] = []
+        papers = write_paper(records, results_dir, problems=broken)
+        for path in (*frames, *papers, *write_sweeps(records, results_dir)):
             print(path)
-        for problem in unread:
-            print(f"not read: {problem}", file=sys.stderr)
+        for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
+            print(problem, file=sys.stderr)
         if one_file:
             sent = write_one_file(results_dir)
             print(f"{sent} ({size(sent.stat().st_size)})")
         print(write_index(results_dir, meshes=meshes))
+        if broken:
+            sys.exit(1)
     except ValueError as error:
         sys.exit(str(error))
 

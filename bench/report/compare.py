@@ -237,11 +237,14 @@ class Compared:
 
         Rows that lack a shape of another row are left out: they are not of the same shapes.
         """
+        family = EVERY if len(self.families) > 1 else self.families[0]
+        had = {row: {*self.means(family, row)} for row in self.rows}
+        all_of_them = set().union(*had.values())
         known = [line for line in self.pooled if math.isfinite(line["error"].value) and line["seconds"] is not None]
-        n = max((len(line["error"].points) for line in known), default=0)
-        whole = [line for line in known if len(line["error"].points) == n]
+        whole = [line for line in known if had[line["preset"], line["row"]] == all_of_them]
         if not whole:
             return ""
+        n = len(whole[0]["error"].points)
         best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
         least, other = (format.number(line["error"].value) for line in (best, quick))

@@ -1,5 +1,7 @@
 """Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
 
+import math
+
 from bench.records import format
 from bench.report import gallery
 from bench.report.data.records import Record, Row, error, grouped, row_of
@@ -66,14 +68,14 @@ def make(runs: Runs) -> Result:
 
 
 def _verdict(of_family: dict[str, list[dict]]) -> str:
-    """The best training by the Chamfer-L1, in each family."""
+    """The best training by the Chamfer-L1 in each family, of those with as many shapes as any."""
     said = []
     for family, lines in of_family.items():
-        errors = {line["method"]: line["chamfer_l1"] for line in lines if line["method"] in TRAINED}
-        known = {row: value for row, value in errors.items() if value is not None}
+        trained = [line for line in lines if line["method"] in TRAINED and line["chamfer_l1"] is not None]
+        n = max((line["runs"] for line in trained), default=0)
+        known = {x["method"]: x["chamfer_l1"] for x in trained if x["runs"] == n and math.isfinite(x["chamfer_l1"])}
         if known:
             first = min(known, key=lambda row: known[row])
-            n = max(line["runs"] for line in lines)
             alone = thousandfold(known.get("RGB"))
             said.append(f"{family}: {first} *{thousandfold(known[first])}*, RGB alone {alone} (n = {n})")
     return f"Least median Chamfer-L1 × 1000 of the trainings: {'; '.join(said)}." if said else ""

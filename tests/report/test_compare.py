@@ -97,6 +97,13 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean(tmp_path):
     assert "The least error × 1000 is" in verdict and "(neus with mask" in verdict.partition(";")[0]
 
 
+def test_rows_without_a_common_shape_are_not_ranked(tmp_path):
+    runs = compared(tmp_path)
+    of = {"dist_mask": "sofa", "newton_mask": "plane"}
+    kept = [record for record in runs.records if of.get(record["method"]) == record["dataset"]]
+    assert one_loss.make(type(runs)(runs.selection, tmp_path, kept)).verdict == ""
+
+
 @pytest.mark.parametrize(
     ("preset", "default"),
     [

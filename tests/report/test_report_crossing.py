@@ -1,5 +1,6 @@
 """The pages of the crossing, made from run folders whose errors are known."""
 
+import json
 import math
 
 import numpy as np
@@ -134,3 +135,17 @@ def test_the_figure_has_a_panel_per_family_and_number_of_points(tmp_path):
     assert len(shown) == 2 * (2 + 1)  # of each renderer: its shapes under each loss, and its medians
     medians = [y for drawn in shown for y in drawn.get_ydata() if drawn.get_label() == "IDR"]
     assert medians == pytest.approx([1.5 * 1.5, 1.5 * 3 * 1.5])
+
+
+def test_an_earlier_setting_of_a_renderer_is_left_out(tmp_path):
+    crossed(tmp_path, families=("sofa",), shapes=1)
+    folder = next(
+        path for path in (tmp_path / "runs").iterdir() if '"renderer": "dist"' in (path / "record.json").read_text()
+    )
+    record = json.loads((folder / "record.json").read_text())
+    record["config"]["renderer"]["epsilon"] = 1e-3
+    record["started"] = "2020-01-01T00:00:00+00:00"
+    (tmp_path / "runs" / "odd").mkdir()
+    (tmp_path / "runs" / "odd" / "record.json").write_text(json.dumps(record | {"id": "odd"}))
+    result = crossing.make(choose(read_records(tmp_path)[0], READS[0], tmp_path))
+    assert len(result.table) == 4 and "Not shown: 1 run" in " ".join(result.notes)

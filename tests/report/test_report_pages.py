@@ -79,7 +79,7 @@ def test_two_presets_under_one_label_are_two_rows(tmp_path):
     for preset, queries in (("dist", 5), ("mine", 7)):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)
     made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path))
-    assert list(made.data["queries"]) == [5, 7]
+    assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
 
 
 def test_a_preset_that_nobody_listed_has_a_look_of_its_own():
@@ -103,6 +103,16 @@ def test_a_study_is_found_by_its_file(tmp_path, monkeypatch):
     finally:
         studies.cache_clear()
         sys.modules.pop("bench.studies.mine", None)
+
+
+def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch):
+    write_run(tmp_path, "table1", NAIVE, metrics=costs(3))
+    write_run(tmp_path, "fig4", NAIVE, metrics=costs(3))
+    broken = next(study for study in studies() if "fig4" in study.pages)
+    monkeypatch.setitem(broken.pages, "fig4", lambda runs: {}["lost"])
+    problems: list[str] = []
+    written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
+    assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
 
 
 def test_every_study_has_pages_of_its_own():

@@ -185,3 +185,10 @@ def test_all_three_are_written(tmp_path):
     written = write_paper(read_records(tmp_path)[0], tmp_path)
     assert [path.stem for path in written] == ["stability", "stability_cost", "stability_curves"]
     assert all(path.with_suffix(".png").stat().st_size > 1000 for path in written[:2])
+
+
+def test_of_an_axis_that_was_defined_anew_the_newest_run_counts(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    broke(tmp_path, "wires", "DIST", 0.7, repeats=3)
+    result = made(tmp_path, "stability")
+    assert len(result.table) == 1 and len(result.data) == 1 and "Not shown: 1 run" in " ".join(result.notes)

@@ -90,14 +90,18 @@ def test_another_setting_of_the_shared_parts_is_told(tmp_path):
     assert "Runs differ in view.resolution: rows with other values do not compare." in made(tmp_path).notes
 
 
-def test_another_setting_of_the_renderer_is_a_row_of_its_own(tmp_path):
-    completed(tmp_path, REFERENCE, 2.0)
-    task = {"points": "100", "_target_": "completion"}
-    odd = {"task": task, "index": 0, "dataset": {"name": "sofa"}, "renderer": {"epsilon": 1.0}}
-    write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 1}, settings=odd)
+@pytest.mark.parametrize("odd", [{"renderer": {"epsilon": 1.0}}, {"silhouette": {"weight": 9}}, {"task": {"code": 1}}])
+def test_another_setting_under_the_same_name_is_no_part_of_the_row(tmp_path, odd):
+    for index in range(3):
+        completed(tmp_path, REFERENCE, 2.0, index=index, minute=10 + index)
+    task = {"points": "100", "_target_": "completion"} | odd.get("task", {})
+    settings = {"index": 0, "dataset": {"name": "sofa"}} | odd | {"task": task}
+    run = {"task": "completion", "dataset": "sofa", "metrics": {"chamfer_l2": 1}, "settings": settings}
+    write_run(tmp_path, "table2", REFERENCE, minute=1, **run)
     result = made(tmp_path)
-    assert cell(result, f"{REFERENCE} (epsilon 5e-05)", "100 pts") == "2.00"
-    assert cell(result, f"{REFERENCE} (epsilon 1.0)", "100 pts") == "1000"
+    assert cell(result, REFERENCE, "100 pts") == "2.00" and "Not shown: 1 run" in told(result)
+    write_run(tmp_path, "table2", REFERENCE, minute=50, **run)
+    assert cell(made(tmp_path), REFERENCE, "Failed") == "0 of 1"  # the newest setting, alone
 
 
 def test_a_row_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):

@@ -158,8 +158,10 @@ class Runs:
 def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
     """The newest run of each cell of an experiment, at the scale of the run that was requested last; None without one.
 
-    A cell is a row with its renderer's settings, a task, a split, a draw, a shape, a view, a seed and the selection's
-    conditions. Rows stand in the order in which they started, and are told apart by their renderers' settings.
+    A cell is a row, a task, a split, a draw, a shape, a view, a seed and the selection's conditions. A row has one
+    setting, the one that was requested last: runs of a row with other settings would be averaged as one. On one scene,
+    where nothing is averaged, rows of one name are told apart by their renderers' settings. Rows stand in the order in
+    which they started.
     """
     found = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
     if not found:
@@ -167,6 +169,9 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ru
     shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
     newest = max(found, key=requested)
     same = [r for r in found if all(_part(r, key, selection) == _part(newest, key, selection) for key in shared)]
+    if "dataset" not in selection.alike:
+        last = {_row(record): _setting(record, selection) for record in sorted(same, key=requested)}
+        same = [record for record in same if _setting(record, selection) == last[_row(record)]]
     cells: dict[Hashable, Record] = {}
     for record in same:
         cells[_cell(record, selection)] = record  # keeps the place of the first record, with the content of the newest
@@ -190,7 +195,7 @@ def named_rows(records: list[Record]) -> list[Record]:
     """The records with the names of their rows under `row`.
 
     A mask loss that all share is left out, since captions name it; rows of one name get the settings of the renderer
-    in which they differ.
+    in which they differ, and their presets where these differ.
     """
     shared = {"silhouette": {}} if shared_loss(records) else {}
     names = [row_name(record["config"] | shared, record["renderer"]) for record in records]
@@ -202,6 +207,9 @@ def named_rows(records: list[Record]) -> list[Record]:
         for place, own in settings.items():
             told = [f"{key.strip('_')} {own[key]}" for key in differ if key in own]
             names[place] += f" ({', '.join(told)})" if told else ""
+    presets = grouped(range(len(records)), lambda place: names[place])
+    several = {name for name, own in presets.items() if len({row_of(records[place]).preset for place in own}) > 1}
+    names = [f"{n}, {row_of(r).preset}" if n in several else n for n, r in zip(names, records, strict=True)]
     return [record | {"row": name} for record, name in zip(records, names, strict=True)]
 
 
@@ -220,7 +228,20 @@ def _part(record: Record, key: str, selection: Selection) -> Any:
     return {name: value for name, value in found.items() if f"{key}.{name}" not in selection.conditions}
 
 
+def _row(record: Record) -> Hashable:
+    """What has one setting: a row in a task, and of a search space a draw."""
+    return row_of(record), record["task"], record["config"].get("draw")
+
+
+def _setting(record: Record, selection: Selection) -> Any:
+    """The settings of a row: the renderer's, the task's without conditions, the loss of the mask, the resolution."""
+    parts = [_part(record, key, selection) for key in ("renderer", "task", "silhouette")]
+    return [*parts, setting(record["config"], "view", "resolution")]
+
+
 def _cell(record: Record, selection: Selection) -> Hashable:
-    conditions = (str(setting(record["config"], *key.split("."))) for key in (*selection.conditions, "split", "draw"))
+    """What has one run. A condition that is a node, such as a stress, is named by the shape's family already."""
+    found = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
+    conditions = (str(value) for value in found if not isinstance(value, dict))
     settings = str(sorted(renderer_settings(record).items()))
-    return (row_of(record), record["task"], settings, *solid(record), view(record), record["seed"], *conditions)
+    return (*_row(record), settings, *solid(record), view(record), record["seed"], *conditions)

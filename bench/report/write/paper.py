@@ -60,17 +60,30 @@ def studies() -> tuple[Study, ...]:
     return tuple(sorted((Study(f.PLACE, f.READS, f.PAGES) for f in files), key=lambda study: study.place))
 
 
-def write_paper(records: list[dict[str, Any]], results_dir: Path, into: Path | None = None) -> list[Path]:
+BROKEN = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)  # of an odd or foreign record
+
+
+def write_paper(
+    records: list[dict[str, Any]], results_dir: Path, into: Path | None = None, problems: list[str] | None = None
+) -> list[Path]:
     """Writes the files of every page that has runs to the folder `paper`; gives the path of each page's CSV.
 
     Args:
         into: the folder that gets `paper`; by default the results folder. Where it is another, it is what is shipped:
             pages of runs of scale=smoke are left out.
+        problems: gets a line for each study that cannot be made of these runs; without it, its error is raised.
     """
     written = []
     for study in studies():
         experiments = [selection.experiment for selection in study.reads]
-        for place, (name, result) in enumerate(study.results(records, results_dir).items()):
+        try:
+            results = study.results(records, results_dir)
+        except BROKEN as error:
+            if problems is None:
+                raise
+            problems.append(f"not made: {', '.join(study.pages)} ({type(error).__name__}: {error})")
+            continue
+        for place, (name, result) in enumerate(results.items()):
             shown = result.shown(100 * study.place + place, experiments)
             if into is None or not shown.caption.startswith(SMOKE):
                 written.append(write(result, shown, (into or results_dir) / FOLDER / name)[0])
