@@ -98,6 +98,12 @@ def check_targets(config: Mapping[str, Any], typed: Sequence[str], renderer: str
             check_package(target, name, [*named, *([first] if LEAVE in node else [])])
 
 
+def has_foreign(config: Mapping[str, Any]) -> bool:
+    """Whether a configuration names a class of a package that is not ours."""
+    targets = (node.get("_target_") for _, node in _nodes(config))
+    return any(target is not None and str(target).split(".")[0] not in OURS for target in targets)
+
+
 def _values_of(told: list[Override], key: str) -> list[Any]:
     """The values that overrides give a key, those of a sweep one by one."""
     values: list[Any] = []

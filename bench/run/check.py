@@ -4,18 +4,20 @@ A configuration is built by the code that its run builds it with, `bench.run.cel
 """
 
 import io
+import os
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
+from multiprocessing.connection import Connection
 from typing import Any
 
 from omegaconf import DictConfig
 
-from bench.config import build, check_draw, check_label, check_names, check_top_level
+from bench.config import Isolation, build, check_draw, check_label, check_names, check_top_level
 from bench.records.folder import Identity, identify
 from bench.records.read import Plan, PlannedCell
 from bench.run.messages import reason_of
-from bench.run.process import RunLimits
-from bench.targets import check_targets
+from bench.run.process import BOOT, INTERVAL, RunLimits, fork_server, raise_if_stopped, signals_delayed, warm_up
+from bench.targets import check_targets, has_foreign
 from bench.trackers import Tracker
 
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
@@ -49,6 +51,57 @@ def tracker_of(config: Mapping[str, Any]) -> Tracker:
     return build(config["tracker"], "tracker", config["packages"])
 
 
+def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why the run of each configuration would be refused; empty where it would not, or where that was not found out.
+
+    Classes of the user's are built in a process of their own: one that hangs, or ends its process, does so in its run.
+
+    Args:
+        configs: resolved, as plain data.
+    """
+    if any(config["isolation"] == Isolation.process and has_foreign(config) for config in configs):
+        return _in_a_child(configs)
+    built: dict[str, Any] = {}  # what they share
+    return [refusal(config, built) for config in configs]
+
+
+def _in_a_child(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    warm_up()
+    context = fork_server()
+    ours, childs = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(configs, childs), daemon=True)
+    reasons: list[str] = []
+    try:
+        with signals_delayed():  # a request that breaks off would end the server
+            process.start()
+            childs.close()
+        waited = 0.0
+        while len(reasons) < len(configs) and waited < BOOT:
+            raise_if_stopped()
+            waited = 0.0 if ours.poll(INTERVAL) else waited + INTERVAL
+            if not waited:
+                reasons.append(ours.recv())
+    except (EOFError, OSError):  # a class of the user's ended the process: its run will say how
+        pass
+    finally:
+        ours.close()
+        if process.pid is not None:
+            process.kill()
+            process.join()
+    return reasons + [""] * (len(configs) - len(reasons))
+
+
+def _answer(configs: Sequence[Mapping[str, Any]], channel: Connection) -> None:
+    """Sends the reasons one by one, in a process of its own, which prints nothing."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 1)
+    os.dup2(nothing, 2)
+    built: dict[str, Any] = {}
+    with suppress(BrokenPipeError):
+        for config in configs:
+            channel.send(refusal(config, built))
+
+
 def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
     """Why the run of a configuration would be refused; empty where it would not, or would fail in another way.
 
@@ -79,9 +132,10 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     Raises:
         ValueError: where a cell cannot be, with the cell and what is wrong with it.
     """
-    away, built = {} if launcher in HERE else {"device": "cpu"}, {}
-    found = [(cell, refusal(cell.config | away, built)) for cell in plan.cells if cell.id not in reused]
-    bad = [(cell, reason) for cell, reason in found if reason]
+    away = {} if launcher in HERE else {"device": "cpu"}
+    cells = [cell for cell in plan.cells if cell.id not in reused]
+    found = refusals([cell.config | away for cell in cells])
+    bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]
     if bad:
         raise ValueError(_of_sweep(plan, *bad[0], len(bad)))
 

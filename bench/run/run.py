@@ -17,7 +17,7 @@ from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record
-from bench.run.check import refusal, tracker_of
+from bench.run.check import refusals, tracker_of
 from bench.run.command import unwritten
 from bench.run.compose import planned
 from bench.run.messages import Job, Message, Notice, Started, Step, reason_of
@@ -85,7 +85,7 @@ def _check(identity: Identity) -> None:
     reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
     if not reused and not config["plan"]:
         warm_up()  # the server of processes loads what runs take, while this process loads what the check takes
-    if not reused and (reason := refusal(config)):
+    if not reused and (reason := refusals([config])[0]):
         raise ValueError(reason)
     if config["plan"]:
         cell = planned(identity, [])

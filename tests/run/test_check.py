@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.read import Plan, PlannedCell
+from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import Record
 from bench.run import process
-from bench.run.check import check_plan, refusal
+from bench.run.check import check_plan, refusal, refusals
 from bench.run.messages import Job
 from tests import tiny
 from tests.run.driving import ROOT, command
@@ -83,6 +83,19 @@ def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(
     monkeypatch.syspath_prepend(tmp_path)
     assert refusal(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("end", ["os._exit(3)", "raise SystemExit"])
+def test_a_class_that_ends_its_process_ends_its_run_alone(plain, tmp_path, monkeypatch, end):
+    module = f"ending_{tmp_path.name}"
+    (tmp_path / f"{module}.py").write_text(CODE.format(name="Mine", act=end))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = plain("renderer=custom", f"renderer._target_={module}.Mine")
+    assert refusals([own, own]) == ["", ""]
+    few = ("renderer=custom", f"renderer._target_={module}.Mine", "seed=0,1", f"results_dir={tmp_path / 'r'}")
+    assert command("-m", *few, *SMALL).code == 1
+    assert [record["status"] for record in read_records(tmp_path / "r")[0]] == ["crashed"] * 2
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ OF_NETWORK = (train_main, "+method=single_view", "task.training.steps=7", "task.
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusal", lambda config: "")
+    monkeypatch.setattr(run_module, "refusals", lambda configs: [""] * len(configs))
     return tmp_path / "r"
 
 
