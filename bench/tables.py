@@ -32,7 +32,7 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
     Rows of folders of an earlier call are choices no more.
 
     Raises:
-        ValueError: for a table that cannot be read.
+        ValueError: for a table that cannot be read, and for a row or file of another folder with the name of ours.
     """
     while _REPLACED:
         group, key, before = _REPLACED.pop()
@@ -46,8 +46,14 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
                 _store_ours(path, group, _text(path))
                 continue
             for of, name, _ in _rows(path, group, _text(path)):
+                if of != TUNED and name in names(of):  # settings that were tuned again are meant to take the place
+                    raise ValueError(f"{path}: {name} is a {group} of {CONF} already: give the row another name")
                 _REPLACED.append((of, f"{name}.yaml", _stored(of).get(f"{name}.yaml")))
             _store(path, group, _text(path))
+        for group in GROUPS.values() if folder != CONF else ():
+            for file in sorted((folder / group).glob("*.yaml")):
+                if group != TUNED and file.stem in read_rows(CONF)[group]:
+                    raise ValueError(f"{file}: {file.stem} is a row of {CONF} already: give the file another name")
 
 
 _REPLACED: list[tuple[str, str, Any]] = []  # rows of other folders: group, key, and what stood there before

@@ -216,7 +216,7 @@ class Compared:
         sure = excluding_one([(line["row"], line["ratio"]) for line in self.pooled], ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost.",
-            "verdict": f"{self.best('error × 1000')} {sure}".strip(),
+            "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
             "remarks": (ERROR, f"{RATIO} {FAILURE}"),
@@ -248,8 +248,8 @@ class Compared:
         best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
         least, other = (format.number(line["error"].value) for line in (best, quick))
-        shapes = f"n = {n} shape{'s' if n != 1 else ''}"
-        return f"The least {least_of} is *{least}* {told[0]}; the quickest row has {other} {told[1]}; {shapes}."
+        quickest = f"the quickest row has {other} {told[1]}; n = {n} shape{'s' if n != 1 else ''}."
+        return f"The least geometric mean of {least_of} is *{least}* {told[0]}; {quickest}"
 
     @style.styled
     def draw_front(self, filled: Callable[[str], bool] | None = None) -> Figure:

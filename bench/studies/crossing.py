@@ -133,7 +133,7 @@ def make(runs: Runs) -> Result:
         "Every renderer under every loss of the mask.",
         "Median error of each renderer under each loss of the mask.",
         question="Which renderer is best under which loss of the mask?",
-        verdict=found.best("error × 1000"),
+        verdict=found.best("errors × 1000"),
         remarks=(ERROR, f"Under its own paper's loss: {own}.", LOSSES),
         data=to_data(RUNS, runs.records),
         table=to_table(columns, lines),

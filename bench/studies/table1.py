@@ -89,9 +89,10 @@ def _verdict(data: pd.DataFrame) -> str:
     found = data[(data["status"] == "ok") & data["step_s"].notna()].sort_values("step_s")
     if len(found) < 2:
         return ""
+    limits = int(data["status"].isin(["timeout", "oom"]).sum())
     first, last = ((format.seconds(found["step_s"].iloc[i]), found["row"].iloc[i]) for i in (0, -1))
     return (
-        f"A step takes *{first[0]}* with {first[1]} and {last[0]} with {last[1]}; {len(data) - len(found)} of "
+        f"A step takes *{first[0]}* with {first[1]} and {last[0]} with {last[1]}; {limits} of "
         f"{len(data)} rows reach a limit at this size (n = one shape)."
     )
 

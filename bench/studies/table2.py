@@ -63,7 +63,7 @@ def make(runs: Runs) -> Result:
         "Shape completion from one depth image, over its sparsity.",
         "Which method completes a shape best from sparse depth?",
         plotted="Median error over {shapes and seeds} at each number of given depth points, and the geometric mean.",
-        verdict=found.best("error × 1000 over all numbers of points"),
+        verdict=found.best("errors × 1000 over all numbers of points"),
         remarks=(ERROR, " ".join((found.shapes(), _given(runs), _iterations(runs))), *NOTES),
         data=to_data(RUNS, runs.records),
         table=to_table(columns, lines),

@@ -268,3 +268,16 @@ def test_a_row_without_masks_is_not_named_by_a_loss_of_them():
     assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
     config["task"]["masks"] = True
     assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, IDR's mask loss"
+
+
+@pytest.mark.parametrize(("file", "text"), [
+    ("variants.yaml", "dist: {base: idr, steps: 3}\n"),
+    ("methods.yaml", "dist_mask: {renderer: idr, label: DIST with mask}\n"),
+    ("renderer/dist_aggressive.yaml", "defaults: [dist, _self_]\n"),
+])  # fmt: skip
+def test_a_choice_of_a_user_takes_no_name_of_ours(tmp_path, file, text):
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(text)
+    with pytest.raises(ValueError, match=r"already: give the (row|file) another name"):
+        register_rows([tmp_path])
+    register_rows()

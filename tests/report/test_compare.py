@@ -94,7 +94,7 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean(tmp_path):
     assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11"
     kept = [record for record in runs.records if record["method"] != "newton_mask" or record["config"]["index"] == 0]
     verdict = one_loss.make(type(runs)(runs.selection, tmp_path, kept)).verdict  # of one shape, the easiest
-    assert "The least error × 1000 is" in verdict and "(neus with mask" in verdict.partition(";")[0]
+    assert "The least geometric mean of errors × 1000 is" in verdict and "(neus with mask" in verdict.partition(";")[0]
 
 
 def test_rows_without_a_common_shape_are_not_ranked(tmp_path):
