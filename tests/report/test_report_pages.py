@@ -16,19 +16,15 @@ from bench.studies import table1
 from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
 
 STUDY = """
-from bench.report.data.runs import Selection
-from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, metric, to_data, to_table
+from bench.report.study import Result, Selection, table
 
 PLACE = {place}
 READS = (Selection("mine"),)
-COLUMNS = (*IDENTITY, metric("queries", "Queries"))
+COLUMNS = (*table.IDENTITY, table.metric("queries", "Queries"))
 
 
 def make(runs):
-    lines = runs.records
-    tables = {{"data": to_data(COLUMNS, lines), "table": to_table(COLUMNS, lines)}}
-    return Result(runs, "Mine.", "Queries.", **tables)
+    return Result(runs, "Mine.", "Queries.", columns=COLUMNS, lines=runs.records)
 
 
 PAGES = {{"mine": make, "mine_again": make}}

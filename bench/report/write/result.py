@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from bench.records.files import plain
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
+from bench.report.write.table import Column, to_data, to_table
 
 # Special characters of LaTeX, and characters that its standard fonts lack.
 _LATEX = {
@@ -56,14 +57,17 @@ class Result:
         runs: what it is made of.
         title: its title, as a sentence.
         plotted: what is plotted, as a sentence.
-        data: the raw numbers, including those that the figure plots.
         question: as a reader would ask it; empty for a page of pictures.
         verdict: the answer, one sentence with its numbers between asterisks; empty where the runs do not give it.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
         estimates: those that are shown with it, if there are shapes enough; empty for intervals that always are there.
         remarks: notes of its own; empty ones are left out.
-        table: the numbers as text for readers.
+        columns: of the table.
+        lines: of the table, as its columns read them.
+        run_columns: of the raw numbers where these have a line per run, not those of the table.
+        data: the raw numbers, including those that the figure plots; by default as the columns have them.
+        table: the numbers as text for readers; by default as the columns have them.
         figure: the figure.
         chart: panels of series for the page, as `chart_panel` makes them.
         atlas: a grid of cells for the page, as the study `stability` makes it.
@@ -72,17 +76,27 @@ class Result:
     runs: Runs
     title: str
     plotted: str
-    data: pd.DataFrame
     question: str = ""
     verdict: str = ""
     n: str = ""
     interval: str = ""
     estimates: Iterable[Interval] = ()
     remarks: Iterable[str] = ()
+    columns: Sequence[Column] = ()
+    lines: Sequence[Any] = ()
+    run_columns: Sequence[Column] = ()
+    data: pd.DataFrame | None = None
     table: pd.DataFrame | None = None
     figure: Figure | None = None
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.data is None:
+            listed = (self.run_columns, self.runs.records) if self.run_columns else (self.columns, self.lines)
+            object.__setattr__(self, "data", to_data(*listed))
+        if self.table is None and self.columns:
+            object.__setattr__(self, "table", to_table(self.columns, self.lines))
 
     @cached_property
     def caption(self) -> str:
