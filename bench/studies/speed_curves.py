@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy import stats
 
 from bench.pictures import style
 from bench.records import format
 from bench.report.data.curves import HISTORY, history_of, spearman
 from bench.report.data.records import SCALE, Record, Row, base_renderer, family, index, loop_seconds, median_of_known
 from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import FEWEST_SHAPES, kaplan_meier
+from bench.report.data.statistics import FEWEST_SHAPES
 from bench.report.write import chart
 from bench.report.write.chart import panel_data, series
 from bench.report.write.result import Result
@@ -146,17 +147,19 @@ def draw(rows: list[Setting], *, few: bool) -> Figure:
 
 
 def _survival(axis: Axes, rows: list[Setting]) -> None:
-    """Draws the share of each setting's runs not yet at the target; a tick is the end of a run that did not."""
+    """Draws the share of each setting's runs not yet at the target; a tick is the end of a run that did not.
+
+    The share is that of Kaplan and Meier (1958): a run that did not reach the target is censored at its end.
+    """
     known = [time for row in rows for time, _ in row.times if math.isfinite(time)]
     latest = max(known, default=1.0)  # until then those that failed remain
     for row in rows:
-        colour, ends = style.look(row.renderer).colour, [min(time, latest) for time, _ in row.times]
-        left = kaplan_meier(ends, [hit for _, hit in row.times])
-        where, share = np.append(left.times, max(ends)), np.append(left.remaining, left.remaining[-1])
-        axis.step(where, share, where="post", color=colour)
+        colour, hit = style.look(row.renderer).colour, np.array([hit for _, hit in row.times])
+        ends = np.array([min(time, latest) for time, _ in row.times])
+        left = stats.ecdf(stats.CensoredData(ends[hit], right=ends[~hit])).sf
+        axis.step([0.0, *left.quantiles], [1.0, *left.probabilities], where="post", color=colour)
         ticks = [time for time, hit in row.times if not hit and math.isfinite(time)]
-        at = [left.remaining[np.searchsorted(left.times, time, side="right") - 1] for time in ticks]
-        axis.plot(ticks, at, "|", color=colour, ms=6)
+        axis.plot(ticks, left.evaluate(ticks), "|", color=colour, ms=6)
     axis.set(xlabel="time (seconds)", ylim=(-0.03, 1.03))
     axis.set_ylabel(f"share of runs\nnot yet at Chamfer × 1000 = {SCALE * TARGET:g}")
     style.log_axis(axis, "x", known)

@@ -19,7 +19,6 @@ from bench.report.data.statistics import (
     geometric,
     geometric_ratio,
     interquartile_mean,
-    kaplan_meier,
     median,
     paired_bootstrap,
     share,
@@ -149,21 +148,6 @@ def test_shares_of_independent_trials_for_every_rate():
         found = [clopper_pearson(k / n, n) for k in range(n + 1)]
         holds = np.array([(one.low <= rates) & (rates <= one.high) for one in found])
         assert ((stats.binom.pmf(np.arange(n + 1)[:, None], n, rates) * holds).sum(axis=0) >= 0.95 - 1e-9).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [6, 8])
-def test_runs_that_have_not_reached_their_goal(n):
-    times = np.array([0.3, 0.7, 1.5, 2.5])
-
-    def one(generator, _):
-        needed, ended = generator.exponential(size=n), generator.uniform(0.5, 4, n)
-        left = kaplan_meier(np.minimum(needed, ended), needed <= ended)
-        at = np.searchsorted(left.times, times, side="right") - 1
-        return (left.low[at] <= np.exp(-times)) & (np.exp(-times) <= left.high[at])
-
-    generator = np.random.default_rng(n)
-    assert np.mean([one(generator, None) for _ in range(SIMULATIONS)], axis=0).min() >= LEAST
 
 
 def test_the_extremes_of_fewer_shapes_cover_too_little():

@@ -16,7 +16,6 @@ from bench.report.data.statistics import (
     geometric,
     geometric_ratio,
     interquartile_mean,
-    kaplan_meier,
     median,
     paired_bootstrap,
     rank,
@@ -93,19 +92,18 @@ def test_a_run_counted_as_failed_never_improves_an_average(errors, data):
         assert average(fewer) >= average(errors)
 
 
-@each("level", [0.8, 0.95])
-def test_interval_of_a_mean_is_that_of_student(level):
+def test_interval_of_a_mean_is_that_of_student():
     # A draw's mean varies by the shapes' variance (over n) and by the seeds' within a shape. With one seed the widening
     # makes it mean +- t s / sqrt(n), s with n - 1 in the denominator; a plain percentile would be narrower by 11 %.
-    n, t = 16, stats.t.ppf(0.5 + level / 2, 15)
+    n, t = 16, stats.t.ppf(0.975, 15)
     shapes = 10 + stats.norm.ppf((np.arange(n) + 0.5) / n)[:, None]
-    interval = bootstrap(list(shapes), mean, seed=0, level=level, draws=40_000)
+    interval = bootstrap(list(shapes), mean, seed=0, draws=40_000)
     half = t * shapes.std(ddof=1) / math.sqrt(n)
     assert interval.value == pytest.approx(10)
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
     groups = shapes + np.array([-2.0, 0, 2])
-    interval = bootstrap(list(groups), mean, seed=0, level=level, draws=40_000)
+    interval = bootstrap(list(groups), mean, seed=0, draws=40_000)
     half = t * math.sqrt((shapes.var() + groups[0].var() / 3) / (n - 1))
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
@@ -187,19 +185,16 @@ def test_pairing_needs_the_same_runs(second):
         paired_bootstrap(singles(1, 2, 3), second, median, seed=0)
 
 
-def test_bad_groups_and_levels():
+def test_bad_groups():
     for groups in ([], [np.ones(2), np.ones(0)], [np.array([1.0, math.nan])]):
         with pytest.raises(ValueError, match="must"):
             bootstrap(groups, median, seed=0)
-    with pytest.raises(ValueError, match="level"):
-        bootstrap(singles(*range(6)), median, seed=0, level=95)
 
 
 @each("successes, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])
-@each("level", [0.9, 0.95])
-def test_clopper_pearson_is_the_exact_interval(successes, n, level):
-    expected = stats.binomtest(successes, n).proportion_ci(level, method="exact")
-    interval = clopper_pearson(successes / n, n, level=level)
+def test_clopper_pearson_is_the_exact_interval(successes, n):
+    expected = stats.binomtest(successes, n).proportion_ci(method="exact")
+    interval = clopper_pearson(successes / n, n)
     assert (interval.low, interval.value, interval.high) == pytest.approx((expected.low, successes / n, expected.high))
 
 
@@ -223,9 +218,6 @@ def test_one_run_of_each_gives_no_probability_and_no_rank():
     assert np.isnan(front([point([1], [1]), point([2], [2])], seed=0)).all()
     assert front([point([1, 1], [1, 1]), point([2, 2], [2, 2])], seed=0) == [1, 0]
     assert np.isnan(list(rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())).all()
-    points = {"a": {(20, "cow"): 1.0, (50, "cow"): 1.0}, "b": {(20, "cow"): 2.0}}
-    assert np.isnan(list(rank(points, draw=lambda key: key[1]).values())).all()
-    assert rank(points) == {"a": 1, "b": 2}
 
 
 def test_equal_settings_have_equal_probabilities_and_ranks():
@@ -237,40 +229,6 @@ def test_equal_settings_have_equal_probabilities_and_ranks():
     assert dominated([1, 1, 2], [1, 1, 1]).tolist() == [False, False, True]
     alike = {"cow": 1.0, "car": 2.0}
     assert rank({"a": alike, "b": alike, "c": {"cow": 0.5, "car": 3.0}}) == {"a": 2, "b": 2, "c": 2}
-
-
-def test_kaplan_meier_worked_example():
-    # At risk 6, 5, 3, 1: reached at 1 (5/6 remain), at 3 with a run censored then (4/5), at 4 (2/3), censored at 5, 7.
-    survival = kaplan_meier([5, 1, 3, 3, 4, 7], [False, True, True, False, True, False])
-    assert survival.times.tolist() == [0, 1, 3, 4, 5, 7]
-    remaining = np.array([5 / 6, 2 / 3, 4 / 9])
-    assert survival.remaining == pytest.approx([1, *remaining, 4 / 9, 4 / 9])
-    # Greenwood: s^2 = S^2 sum(d / (r (r - d))); runs without censoring that would give it: S (1 - S) / s^2
-    variance = remaining**2 * np.cumsum([1 / 30, 1 / 20, 1 / 6])
-    exact = [clopper_pearson(s, s * (1 - s) / v) for s, v in zip(remaining, variance, strict=True)]
-    assert survival.low[1:4] == pytest.approx([one.low for one in exact])
-    assert survival.high[1:4] == pytest.approx([one.high for one in exact])
-    assert (survival.low[0], survival.high[0]) == pytest.approx((0.025 ** (1 / 6), 1))  # none has reached it: 6 of 6
-
-
-def test_kaplan_meier_where_none_or_all_reach():
-    assert kaplan_meier([3, 2], [False, False]).remaining.tolist() == [1, 1, 1]
-    everyone = kaplan_meier([3.0, 2.0], [True, True])
-    assert (everyone.times.tolist(), everyone.remaining.tolist()) == ([0, 2, 3], [1, 0.5, 0])
-    assert np.isnan(everyone.low).all() and np.isnan(everyone.high).all()  # fewer than six
-    six = kaplan_meier([1, 2, 3, 4, 5, 6], [True] * 6)
-    expected = [clopper_pearson(left / 6, 6) for left in (6, 5, 4, 3, 2, 1)]
-    assert six.low[:6] == pytest.approx([one.low for one in expected])
-    assert six.high[:6] == pytest.approx([one.high for one in expected])
-    assert (six.low[6], six.high[6]) == pytest.approx((0, 0.975))  # one at risk
-    assert kaplan_meier([2.0], [True]).remaining.tolist() == [1, 0]
-    assert kaplan_meier([2.0], [False]).remaining.tolist() == [1, 1]
-
-
-@each("times, reached", [([], []), ([1.0], [True, False]), ([INF], [False]), ([-1.0], [True])])
-def test_kaplan_meier_needs_times(times, reached):
-    with pytest.raises(ValueError, match="times"):
-        kaplan_meier(times, reached)
 
 
 def test_rank_worked_example():

@@ -9,7 +9,7 @@ shapes stand in `Interval.points` to be shown instead. From one run alone no pro
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ Values = np.ndarray | Sequence[float]
 Groups = Sequence[Any]  # of each shape an array of its seeds, or a sequence of such arrays, one per view
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
 Point = tuple[Groups, Groups]  # the costs and the errors of one setting
+LEVEL = 0.95  # of all intervals
 FEWEST_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
 
 
@@ -66,16 +67,6 @@ class Interval:
         return f"{format.number(self.value)} {self.ends()}"
 
 
-@dataclass(frozen=True)
-class Survival:
-    """The share `remaining` from each of `times` until the next; nan ends where the interval is not defined."""
-
-    times: np.ndarray
-    remaining: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
 def interquartile_mean(values: Values) -> float | np.ndarray:
     """The mean of the middle half [...] of values [..., n]; a value at the edge of that half counts in part."""
     ordered = np.sort(_checked(values), axis=-1)
@@ -105,7 +96,7 @@ def lower(first: Values, second: Values) -> float:
     return float(((a < b) + 0.5 * (a == b)).sum())
 
 
-def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, level: float = 0.95, draws: int = 2000) -> Interval:
+def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, draws: int = 2000) -> Interval:
     """The statistic of all runs with its hierarchical bootstrap interval over shapes, views and seeds.
 
     A draw takes shapes with replacement, of each drawn shape views with replacement, and of each drawn view seeds with
@@ -121,10 +112,10 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, level: float =
         Ends are draws, never interpolated, so they can be +inf; nan below `FEWEST_SHAPES`.
     """
     (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
-    return _interval(value, drawn, points[0], level)
+    return _interval(value, drawn, points[0])
 
 
-def geometric(groups: Groups, *, level: float = 0.95) -> Interval:
+def geometric(groups: Groups) -> Interval:
     """The geometric mean over shapes of those of their runs, with Student's interval of the mean logarithm over shapes.
 
     The bootstrap's interval of it covers 93.5 % with six shapes, this one 95 %.
@@ -132,10 +123,10 @@ def geometric(groups: Groups, *, level: float = 0.95) -> Interval:
     Returns:
         nan ends below `FEWEST_SHAPES`, and where a value is 0 or infinite.
     """
-    return _of_logarithms(np.array([np.mean(_logs(group)) for group in groups]), level)
+    return _of_logarithms(np.array([np.mean(_logs(group)) for group in groups]))
 
 
-def geometric_ratio(first: Groups, second: Groups, *, level: float = 0.95) -> Interval:
+def geometric_ratio(first: Groups, second: Groups) -> Interval:
     """The ratio of two geometric means over the same shapes, with Student's interval of the shapes' ratios.
 
     Where both fail on a shape, neither is better: its ratio is 1. See `geometric`.
@@ -147,7 +138,7 @@ def geometric_ratio(first: Groups, second: Groups, *, level: float = 0.95) -> In
         raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
     pairs = zip(first, second, strict=True)
     means = [(float(np.mean(_logs(a))), float(np.mean(_logs(b)))) for a, b in pairs]
-    return _of_logarithms(np.array([0.0 if one == other else one - other for one, other in means]), level)
+    return _of_logarithms(np.array([0.0 if one == other else one - other for one, other in means]))
 
 
 def _logs(group: Any) -> np.ndarray:
@@ -155,19 +146,17 @@ def _logs(group: Any) -> np.ndarray:
         return np.log(_checked(flat([group])))
 
 
-def _of_logarithms(logs: np.ndarray, level: float) -> Interval:
+def _of_logarithms(logs: np.ndarray) -> Interval:
     """The exponential of the mean of the shapes' logarithms, with its interval."""
     n, points = len(logs), tuple(np.exp(logs).tolist())
     middle = float(np.mean(logs))
     if n < FEWEST_SHAPES or not np.isfinite(logs).all():
         return Interval(math.exp(middle) if middle < math.inf else middle, math.nan, math.nan, points)
-    half = float(stats.t.ppf((1 + level) / 2, n - 1) * np.std(logs, ddof=1) / math.sqrt(n))
+    half = float(stats.t.ppf((1 + LEVEL) / 2, n - 1) * np.std(logs, ddof=1) / math.sqrt(n))
     return Interval(*(math.exp(middle + side * half) for side in (0, -1, 1)), points)
 
 
-def paired_bootstrap(
-    first: Groups, second: Groups, statistic: Statistic, *, seed: int, level: float = 0.95, draws: int = 2000
-) -> Interval:
+def paired_bootstrap(first: Groups, second: Groups, statistic: Statistic, *, seed: int, draws: int = 2000) -> Interval:
     """The ratio of the first's statistic to the second's, with its interval over the same draws of both.
 
     Equal statistics have the ratio 1, also if both are +inf or 0: where both fail, neither is better.
@@ -176,10 +165,10 @@ def paired_bootstrap(
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
     """
     value, drawn, points = _resample([first, second], statistic, seed, draws)
-    return _interval(_ratio(*value), _ratio(*drawn), _ratio(*points), level)
+    return _interval(_ratio(*value), _ratio(*drawn), _ratio(*points))
 
 
-def share(successes: Values, trials: Values, *, level: float = 0.95) -> Interval:
+def share(successes: Values, trials: Values) -> Interval:
     """The share of successes among all trials of all shapes, with an interval over shapes.
 
     The interval is that of `clopper_pearson` with as many trials as there are shapes. Trials of one shape depend on
@@ -199,63 +188,29 @@ def share(successes: Values, trials: Values, *, level: float = 0.95) -> Interval
     value, points = float(k.sum() / m.sum()), tuple((k / m).tolist())
     if len(k) < FEWEST_SHAPES:
         return Interval(value, math.nan, math.nan, points)
-    return replace(clopper_pearson(value, len(k), level=level), points=points)
+    return replace(clopper_pearson(value, len(k)), points=points)
 
 
-def clopper_pearson(value: float, n: float, *, level: float = 0.95) -> Interval:
+def clopper_pearson(value: float, n: float) -> Interval:
     """A share among n independent trials with its exact interval (Clopper and Pearson 1934); n need not be whole."""
     if not 0 <= value <= 1 or n < 1:
         raise ValueError(f"the share must be in 0..1 and n at least 1, but they are {value} and {n}: count the trials")
-    k, tail = value * n, (1 - level) / 2
+    k, tail = value * n, (1 - LEVEL) / 2
     low = 0.0 if value == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
     high = 1.0 if value == 1 else float(stats.beta.ppf(1 - tail, k + 1, n - k))
     return Interval(value, low, high)
 
 
-def kaplan_meier(times: Values, reached: np.ndarray | Sequence[bool], *, level: float = 0.95) -> Survival:
-    """The share of runs that have not yet reached their goal over time (Kaplan and Meier 1958), from 1 at time 0.
-
-    Args:
-        times: when a run reached its goal or, if it did not, when it ended; finite, 0 or more, in any unit.
-        reached: whether the run reached its goal. A run that did not is censored at its end.
-
-    Returns:
-        The interval at a time is that of `clopper_pearson` for the number of runs without censoring that would give
-        the share its variance by Greenwood's formula (Rothman 1978, Journal of Chronic Diseases 31) or, where all or
-        none remain, for those at risk. It takes runs as independent; nan below `FEWEST_SHAPES` runs.
-    """
-    times, reached = np.asarray(times, dtype=float), np.asarray(reached, dtype=bool)
-    if times.shape != reached.shape or times.ndim != 1 or not times.size:
-        raise ValueError(f"times and reached must be as many, one or more, but are {times.shape} and {reached.shape}")
-    if not (np.isfinite(times) & (times >= 0)).all():
-        raise ValueError(f"times must be finite and 0 or more, but are {times}: give the time at which a run ended")
-    steps = np.unique(times)
-    at_risk = np.append(len(times), (times >= steps[:, None]).sum(axis=1))
-    ended = np.append(0, ((times == steps[:, None]) & reached).sum(axis=1))
-    left = np.cumprod(1 - ended / at_risk)
-    ends = np.full((2, len(left)), math.nan)
-    if len(times) >= FEWEST_SHAPES:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            variance = left**2 * np.cumsum(ended / (at_risk * (at_risk - ended)))
-            worth = np.where((left > 0) & (left < 1), left * (1 - left) / variance, at_risk)
-        intervals = [clopper_pearson(value, n, level=level) for value, n in zip(left, worth, strict=True)]
-        ends = np.array([(one.low, one.high) for one in intervals]).T
-    return Survival(np.append(0.0, steps), left, *ends)
-
-
-def rank(
-    table: dict[Any, dict[Any, float | None]], *, draw: Callable[[Any], Hashable] = lambda shape: shape
-) -> dict[Any, float]:
+def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, float]:
     """Each method's mean rank over the shapes, 1 is the best; equal errors share their mean rank.
 
     A method without a finite error for a shape has the worst rank there: the number of methods. A shape at which all
-    methods fail is left out. From one draw no rank is given: nan.
+    methods fail is left out. From one shape no rank is given: nan.
 
     Args:
         table: the errors of each method by shape, or by anything else that is compared.
-        draw: gives the shape and seed to which such a key belongs.
     """
-    if len({draw(key) for errors in table.values() for key in errors}) < 2:
+    if len({shape for errors in table.values() for shape in errors}) < 2:
         return dict.fromkeys(table, math.nan)
     errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
     return errors.rank(axis=1).fillna(len(table)).mean().fillna(len(table)).to_dict()
@@ -360,13 +315,11 @@ def _draw(sizes: list[list[int]], seed: int, draws: int) -> list[np.ndarray]:
     return [node[total == n][kept[total == n]].reshape(-1, n) for n in np.unique(total)]
 
 
-def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray, level: float) -> Interval:
+def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray) -> Interval:
     """The expanded percentile interval of the statistic's draws, and the statistic of each shape."""
-    if not 0 < level < 1:
-        raise ValueError(f"level must be between 0 and 1, but is {level}: 0.95 is usual")
     n, shapes = len(points), tuple(points.tolist())
     if n < FEWEST_SHAPES:
         return Interval(float(value), math.nan, math.nan, shapes)
-    tail = stats.norm.cdf(math.sqrt(n / (n - 1)) * stats.t.ppf((1 - level) / 2, n - 1))
+    tail = stats.norm.cdf(math.sqrt(n / (n - 1)) * stats.t.ppf((1 - LEVEL) / 2, n - 1))
     low, high = np.quantile(drawn, tail, method="lower"), np.quantile(drawn, 1 - tail, method="higher")
     return Interval(float(value), float(low), float(high), shapes)
