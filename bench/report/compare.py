@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format
+from bench.records.read import read_plans
 from bench.report.data import statistics
 from bench.report.data.records import RunKey, by_shape
 from bench.report.data.runs import Runs
@@ -26,7 +27,7 @@ EVERY = "all families"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
 FAILURE = (
     "In geometric means a run that did not end ok has the largest finite error of any row on the same shape, seed and "
-    "condition; a shape on which every row failed is left out."
+    "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
 )
 CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
 ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
@@ -67,11 +68,12 @@ class Compared:
 
     Args:
         runs: at least one.
-        reference: gives the preset that the row of a preset is divided by; by default itself, so that none is.
+        reference: gives the name or the preset of the row that the row of a preset is divided by. Of several rows of
+            that preset it is the first one of the plan of the sweep.
     """
 
     runs: Runs
-    reference: Callable[[str], str] = str
+    reference: Callable[[str], str] | None = None
 
     @cached_property
     def cells(self) -> pd.DataFrame:
@@ -103,6 +105,21 @@ class Compared:
         return list(dict.fromkeys(zip(self.cells.preset, self.cells.row, strict=True)))
 
     @cached_property
+    def planned(self) -> list[tuple[str, str]]:
+        """The rows in the order of the sweep that planned most of the runs; others last, in that of the runs."""
+        of_run = {record["folder"]: (row.preset, row.name) for row, of in self.runs.rows().items() for record in of}
+        plans, _ = read_plans(self.runs.results_dir)
+        found = [[of_run[cell["id"]] for cell in plan["cells"] if cell["id"] in of_run] for plan in plans]
+        ordered = [row for rows in sorted(found, key=len, reverse=True) for row in rows]
+        return list(dict.fromkeys([*ordered, *self.rows]))
+
+    def reference_of(self, row: tuple[str, str]) -> tuple[str, str]:
+        """The row that a row is divided by; itself where there is no other."""
+        wanted = row[1] if self.reference is None else self.reference(row[0])
+        named = [other for other in self.planned if other[1] == wanted]
+        return next(iter(named + [other for other in self.planned if other[0] == wanted]), row)
+
+    @cached_property
     def conditions(self) -> list[str]:
         """The values of the condition, in their order."""
         found = {str(value) for value in self.cells["at"]}
@@ -124,15 +141,22 @@ class Compared:
 
         Left out are those without a run at a condition of their family, and those on which every row failed.
         """
+        return {run: mean for run, mean in self._means[row].items() if family in (EVERY, run[0][0])}
+
+    @cached_property
+    def _means(self) -> dict[tuple[str, str], dict[RunKey, float]]:
         wanted = self.cells.groupby("family", sort=False)["at"].nunique()
-        found: dict[RunKey, float] = {}
-        for (name, solid, view, seed), own in self.part(family, row).groupby(
-            ["family", "solid", "view", "seed"], sort=False, dropna=False
-        ):
+        found: dict[tuple[str, str], dict[RunKey, float]] = {row: {} for row in self.rows}
+        places = ["preset", "row", "family", "solid", "view", "seed"]
+        for (preset, row, family, solid, view, seed), own in self.cells.groupby(places, sort=False, dropna=False):
             mean = float(geometric_mean(own.score.to_numpy()))
-            if len(own) == wanted[name] and math.isfinite(mean):
-                found[(name, solid), view, seed] = mean
+            if len(own) == wanted[family] and math.isfinite(mean):
+                found[preset, row][(family, solid), view, seed] = mean
         return found
+
+    def lacking(self, family: str, row: tuple[str, str]) -> int:
+        """The number of shapes, views and seeds that another row has at all conditions and this one has not."""
+        return len({run for other in self.rows for run in self.means(family, other)} - {*self.means(family, row)})
 
     def error(self, family: str, row: tuple[str, str]) -> Interval:
         """The geometric mean of a row's errors over shapes, with its interval; nan without a shape."""
@@ -159,14 +183,14 @@ class Compared:
         """A line per family and row, all families first where there are several.
 
         Each has family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
-        reference), median costs, `front_COST`, "yes" where no row has less error for less cost, and `failed`.
+        reference), median costs, `front_COST`, "yes" where no row has less error for less cost, `failed`, and how many
+        shapes and seeds it is `lacking`, which keeps it from fronts and verdicts.
         """
         names = [EVERY, *self.families] if len(self.families) > 1 else self.families
         return [line for name in names for line in self._front([self._line(name, row) for row in self.rows])]
 
     def _line(self, family: str, row: tuple[str, str]) -> Line:
-        mine = self.part(family, row)
-        reference = next((other for other in self.rows if other[0] == self.reference(row[0])), row)
+        mine, reference, lacking = self.part(family, row), self.reference_of(row), self.lacking(family, row)
         costs = {cost: mine[cost][mine.ok].dropna().median() for cost in COSTS}
         return {
             **{"family": family, "row": row[1], "preset": row[0]},
@@ -174,13 +198,15 @@ class Compared:
             "error": self.error(family, row),
             "ratio": None if reference == row else self.gap(family, row, reference),
             **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
-            "failed": f"{(~mine.ok).sum()} of {len(mine)}",
+            "lacking": lacking,
+            "failed": f"{(~mine.ok).sum()} of {len(mine)}" + (f", {lacking} missing" if lacking else ""),
         }
 
     @staticmethod
     def _front(lines: list[Line]) -> list[Line]:
         for cost in COSTS:
-            front = statistics.on_front([line[cost] for line in lines], [line["error"].value for line in lines])
+            costs = [None if line["lacking"] else line[cost] for line in lines]
+            front = statistics.on_front(costs, [line["error"].value for line in lines])
             lines = [line | {f"front_{cost}": "yes" if on else ""} for line, on in zip(lines, front, strict=True)]
         return lines
 
@@ -213,7 +239,8 @@ class Compared:
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
         columns = self.columns(ratio)
-        sure = excluding_one([(line["row"], line["ratio"]) for line in self.pooled], ratio.removeprefix("Ratio "))
+        whole = [(line["row"], line["ratio"]) for line in self.pooled if not line["lacking"]]
+        sure = excluding_one(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost.",
             "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
@@ -237,18 +264,15 @@ class Compared:
 
         Rows that lack a shape of another row are left out: they are not of the same shapes.
         """
-        family = EVERY if len(self.families) > 1 else self.families[0]
-        had = {row: {*self.means(family, row)} for row in self.rows}
-        all_of_them = set().union(*had.values())
         known = [line for line in self.pooled if math.isfinite(line["error"].value) and line["seconds"] is not None]
-        whole = [line for line in known if had[line["preset"], line["row"]] == all_of_them]
+        whole = [line for line in known if not line["lacking"]]
         if not whole:
             return ""
         n = len(whole[0]["error"].points)
         best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
         least, other = (format.number(line["error"].value) for line in (best, quick))
-        quickest = f"the quickest row has {other} {told[1]}; n = {n} shape{'s' if n != 1 else ''}."
+        quickest = f"the quickest row has {other} {told[1]}; n = {format.plural(n, 'shape')}."
         return f"The least geometric mean of {least_of} is *{least}* {told[0]}; {quickest}"
 
     @style.styled

@@ -1,9 +1,11 @@
 """The comparison of rows and its pages, made from run folders whose errors and costs are known."""
 
+import json
+
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import COSTS, EVERY
+from bench.report.compare import COSTS, EVERY, Compared
 from bench.report.data.runs import choose
 from bench.studies import one_loss, tuned
 from tests.report.test_report_paper import write_run
@@ -91,10 +93,44 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean(tmp_path):
     kept = [record for record, cell in zip(runs.records, cells, strict=True) if cell != lacking]
     result = one_loss.make(type(runs)(runs.selection, tmp_path, kept))
     newton = line(result, "newton with mask", "sofa")
-    assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11"
+    assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11, 1 missing"
+    assert newton["front_evaluations"] == "" and "newton" not in result.verdict  # though it has the fewest values
     kept = [record for record in runs.records if record["method"] != "newton_mask" or record["config"]["index"] == 0]
     verdict = one_loss.make(type(runs)(runs.selection, tmp_path, kept)).verdict  # of one shape, the easiest
     assert "The least geometric mean of errors × 1000 is" in verdict and "(neus with mask" in verdict.partition(";")[0]
+
+
+def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset(tmp_path):
+    cells = []
+    for label, factor in (("tried before", 3), ("DIST", 2), ("Newton", 1)):
+        folder = write_run(
+            tmp_path,
+            "one_loss",
+            label,
+            **{"task": "completion", "renderer": "dist", "method": "newton_mask" if factor == 1 else "dist_mask"},
+            metrics={"chamfer_l2": factor / 1000},
+            settings={"task": {"points": "20"}, "renderer": {"steps": factor}},
+        )
+        cells.append(
+            {"id": folder.name, "overrides": [], "seed": 0, "config": {}}
+            | dict.fromkeys(("task", "renderer", "dataset", "method"), "")
+        )
+    runs = choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path)
+    assert line(one_loss.make(runs), "Newton", "car")["ratio"].startswith("0.333 ")  # without a plan
+    (tmp_path / "sweeps" / "one").mkdir(parents=True)
+    plan = {"schema": 1, "name": "one", "asked": "2025-03-01T12:00:00+00:00", "cells": cells[1:]}
+    (tmp_path / "sweeps" / "one" / "plan.json").write_text(json.dumps(plan))
+    found = one_loss.make(runs)
+    assert line(found, "Newton", "car")["ratio"].startswith("0.500 ")
+    assert line(found, "DIST", "car")["ratio"] == ""
+    assert Compared(runs, lambda _: "tried before").reference_of(("newton_mask", "Newton"))[1] == "tried before"
+
+
+def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
+    for name, points in (("sofa", 1000), ("plane", 5000)):
+        evaluation = {"evaluation": {"points": points}, "prior": {"name": name}, "dataset": {"name": name}}
+        write_run(tmp_path, "one_loss", "DIST", dataset=name, settings=evaluation)
+    assert choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path).mixed() == ["evaluation.points"]
 
 
 def test_rows_without_a_common_shape_are_not_ranked(tmp_path):

@@ -16,7 +16,6 @@ from bench.report.data.frame import to_frame
 from bench.report.data.records import SCALE, Record, Row, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
-MIXED = ("prior", "view", "evaluation", "field")  # parts of a configuration that rows should share
 
 
 @dataclass(frozen=True)
@@ -140,10 +139,12 @@ class Runs:
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings of prior, view, evaluation and field in which runs of one family differ."""
+        """The settings of view and evaluation in which runs differ, and those of prior and field within one family."""
+        together = [(self.records, ("view", "evaluation"))]
+        together += [(records, ("prior", "field")) for records in self.families().values()]
         found: dict[str, None] = {}
-        for records in self.families().values():
-            known = [flat({part: record["config"].get(part) for part in MIXED}, "") for record in records]
+        for records, parts in together:
+            known = [flat({part: record["config"].get(part) for part in parts}, "") for record in records]
             keys = dict.fromkeys(key for one in known for key in one if key not in self.selection.conditions)
             found |= {key: None for key in keys if len({str(one[key]) for one in known if key in one}) > 1}
         return list(found)
