@@ -31,7 +31,7 @@ PASSIVE = (
     ),
     *(f"bench/{name}.py" for name in ("merge", "tune", "train", "photos", "turntable")),
     *(f"bench/run/{name}.py" for name in ("check", "compose", "library", "plan", "summary", "sweep")),
-    *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read", "statuses")),
+    *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"

@@ -27,6 +27,11 @@ def number(x: int | float | str | None, scale: float = 1.0) -> str:
     return f"{mantissa}e{power}"
 
 
+def plural(count: int, word: str) -> str:
+    """A count with its word, such as 1 scene or 2 scenes."""
+    return f"{count} {word}{'s' if count != 1 else ''}"
+
+
 def count(n: int | float | None) -> str:
     """A count, whole below 1000 and then with k, M, G, T, P for powers of 1000, such as 999, 12.3k or 1.43M."""
     if n is None or not math.isfinite(n):

@@ -3,20 +3,17 @@
 import sys
 from pathlib import Path
 
-from bench.records.format import size
 from bench.records.read import RESULTS, read_records
 from bench.report.data.frame import NO_PARQUET, write_frame
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, write_index
-from bench.report.write.one_file import write_one_file
 from bench.report.write.paper import write_paper, write_readme
 
-USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [one_file=true] [ship=PATH]
+USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
   meshes        of how many runs, the newest first, the mesh turns on the page; 500 unless given, or all
-  one_file      true: also writes report.html, the page in one file to send, with small pictures and without meshes
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
-KEYS = ("results_dir", "meshes", "one_file", "ship")
+KEYS = ("results_dir", "meshes", "ship")
 
 
 def main(arguments: list[str]) -> None:
@@ -31,7 +28,6 @@ def main(arguments: list[str]) -> None:
         given = parsed(arguments)
         results_dir = Path(given.get("results_dir", RESULTS))
         meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
-        one_file = _one_file(given.get("one_file", "false"))
         records, unread = read_records(results_dir)
         if ship := given.get("ship"):
             print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
@@ -45,9 +41,6 @@ def main(arguments: list[str]) -> None:
             print(path)
         for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
             print(problem, file=sys.stderr)
-        if one_file:
-            sent = write_one_file(results_dir)
-            print(f"{sent} ({size(sent.stat().st_size)})")
         print(write_index(results_dir, meshes=meshes))
         if broken:
             sys.exit(1)
@@ -78,12 +71,6 @@ def _meshes(text: str) -> int | None:
     if not text.isdecimal():
         raise ValueError(f"meshes must be a number of runs or all, found {text!r}\n{USAGE}")
     return int(text)
-
-
-def _one_file(text: str) -> bool:
-    if text not in ("true", "false"):
-        raise ValueError(f"one_file must be true or false, found {text!r}\n{USAGE}")
-    return text == "true"
 
 
 if __name__ == "__main__":

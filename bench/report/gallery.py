@@ -18,6 +18,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch, Rectangle
 
 from bench.pictures import style
+from bench.records.format import plural
 from bench.report.data.records import Record, family, grouped, index, row_of
 from bench.report.data.runs import Runs
 
@@ -214,7 +215,7 @@ def compared(runs: Runs, names: Sequence[str], most: int) -> Compared:
 def missing(scenes: Iterable[Scene]) -> list[str]:
     """A note per reason why runs have no pictures."""
     reasons = Counter(why for scene in scenes for why in scene.reasons)
-    return [f"No pictures of {count} run{'s' if count > 1 else ''}: {why}." for why, count in reasons.items()]
+    return [f"No pictures of {plural(count, 'run')}: {why}." for why, count in reasons.items()]
 
 
 def first_shapes(runs: Runs, most: int, presets: Sequence[str] = ()) -> Runs:

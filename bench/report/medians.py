@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format, metrics
+from bench.records.format import plural as plural
 from bench.report.data.records import Record, family, index
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import median
@@ -28,11 +29,6 @@ def scene_of(record: Record) -> str:
     dataset = record["config"].get("dataset", {})
     own = dataset.get("path") and not dataset.get("strength") and not index(record)
     return family(record) if own else f"{family(record)} {index(record)}"
-
-
-def plural(count: int, word: str) -> str:
-    """A count with its word, such as 1 scene or 2 scenes."""
-    return f"{count} {word}{'s' if count != 1 else ''}"
 
 
 def scored(runs: Runs, name: str) -> pd.Series:

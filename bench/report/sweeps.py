@@ -17,7 +17,7 @@ from bench.report.data.statistics import Interval, bootstrap, median, paired_boo
 from bench.report.write.caption import OVER
 from bench.report.write.paper import SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
-from bench.report.write.table import Column, counted, shown, text, to_data, to_table
+from bench.report.write.table import Column, counted, text
 
 MOST_VALUES = 6  # of a swept key that the caption lists
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
@@ -114,18 +114,16 @@ def median_of(runs: list[Record], metric: str) -> Interval | None:
     Where it is not known which direction of the metric is better, it is that of the runs that have the metric. None
     where a run that ended ok lacks it, or no run has it.
     """
-    values = {run_key(run): measured(run, metric) for run in runs}
-    ended = {run_key(run): run["status"] == "ok" for run in runs}
-    if all(value is None for value in values.values()) or any(values[key] is None for key in ended if ended[key]):
+    known = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
+    if not known or any(run["status"] == "ok" and run_key(run) not in known for run in runs):
         return None
     if better(metric) == LOWER:
         return _middle({run_key(run): error(run, metric) for run in runs})
     if better(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
-        short = {key: -float(value) if ended[key] and value == value else 0.0 for key, value in values.items()}
-        found = _middle(short)
+        ended = {run_key(run): run["status"] == "ok" for run in runs}
+        found = _middle({key: -known[key] if ok and known[key] == known[key] else 0.0 for key, ok in ended.items()})
         return Interval(-found.value, -found.high, -found.low, tuple(-point for point in found.points))
-    known = {key: value for key, value in values.items() if value is not None}
-    return _middle(known) if all(value == value and value > -math.inf for value in known.values()) else None
+    return _middle(known) if all(value > -math.inf for value in known.values()) else None
 
 
 def _middle(values: dict[RunKey, float]) -> Interval:
@@ -160,44 +158,39 @@ def table_of(sweep: Sweep) -> Result:
             f"The CSV also has {', '.join(more)}." if more else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
         ),
-        data=to_data(_data_columns(names), found),
-        table=to_table(_columns(headings, found), found),
+        columns=_columns(names, headings, several=any(line["ratio"] is not None for line in found)),
+        lines=found,
     )
 
 
-def _columns(headings: dict[str, Metric], found: list[dict[str, Any]]) -> list[Column]:
-    """The columns of the readable table."""
+def _columns(names: list[str], headings: dict[str, Metric], *, several: bool) -> list[Column]:
+    """The columns: readers see the metrics with headings, and the ratio where there are several rows."""
     first = next(iter(headings.values()), Metric("")).label.split(" (")[0]
-    several = any(line["ratio"] is not None for line in found)
+    ratio = Metric(f"{first} over the first row's" if several else "")
     return [
         text("row", "Run"),
-        *(shown(m.label, lambda line, name=name, m=m: _words(line[name], m.factor)) for name, m in headings.items()),
-        *([shown(f"{first} over the first row's", lambda line: _words(line["ratio"]))] if several else []),
-        shown("Failed", lambda line: counted(line["failed"], line["runs"], line["rate"])),
+        *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
+        *_estimate("ratio", ratio),
+        Column("runs"),
+        Column("failed", "Failed", words=lambda line: counted(line["failed"], line["runs"], line["rate"])),
+        *_ends("failed", "rate"),
+        text("reasons"),
         Column("loop_seconds", "Loop", show=format.seconds),
         Column("value_evaluations", "Field values", show=format.count),
     ]
 
 
-def _words(interval: Interval | None, factor: float = 1.0) -> str:
-    return format.MISSING if interval is None else str(interval.times(factor))
+def _estimate(key: str, shown: Metric) -> list[Column]:
+    """The columns of an estimate that a line may lack, and of the ends of its interval: in scene units for the CSV."""
 
+    def words(line: dict[str, Any]) -> str:
+        return format.MISSING if line[key] is None else str(line[key].times(shown.factor))
 
-def _data_columns(names: list[str]) -> list[Column]:
-    """The columns of the CSV: of each metric the median and the ends of its interval, in scene units."""
-    return [
-        text("row"),
-        *(column for name in (*names, "ratio") for column in _ends(name, name)),
-        *(Column(key) for key in ("runs", "failed")),
-        *_ends("failed", "rate")[1:],
-        *(text("reasons"), Column("loop_seconds"), Column("value_evaluations")),
-    ]
+    return [Column(key, shown.label, lambda line: getattr(line[key], "value", None), words=words), *_ends(key, key)]
 
 
 def _ends(key: str, of: str) -> list[Column]:
-    """Columns of an estimate and of the ends of its interval."""
-    ends = {"": "value", "_low": "low", "_high": "high"}
-    return [Column(key + tail, value=lambda line, end=end: getattr(line[of], end, None)) for tail, end in ends.items()]
+    return [Column(f"{key}_{end}", value=lambda line, end=end: getattr(line[of], end, None)) for end in ("low", "high")]
 
 
 def _listed(sweep: Sweep) -> str:

@@ -12,20 +12,12 @@ import pytest
 from tests.report.conftest import without_shipped  # noqa: F401
 
 FLAGS = (
-    *(
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--disable-background-networking",
-    ),
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a GPU
 )
-HARMLESS = (  # said of WebGL in software where a picture of it is taken, and of how Plotly measures letters
-    *("GPU stall due to ReadPixels", "Canvas2D: Multiple readback operations"),
-)
+# Said of WebGL in software where a picture of it is taken, and of how Plotly measures letters.
+HARMLESS = ("GPU stall due to ReadPixels", "Canvas2D: Multiple readback operations")
 PATIENCE = 60_000  # milliseconds until something is given up, on a busy machine
 
 
@@ -37,10 +29,10 @@ class Tab:
     results: Path
     wrong: list[str] = field(default_factory=list)
 
-    def open(self, address: str = "", file: str = "index.html") -> Any:
+    def open(self, address: str = "") -> Any:
         """Goes to an address of the page, such as #/runs."""
         self.page.goto("about:blank")
-        self.page.goto((self.results / file).as_uri() + address)
+        self.page.goto((self.results / "index.html").as_uri() + address)
         return self.page
 
     def watch(self) -> None:
@@ -69,7 +61,7 @@ def browser() -> Iterator[Any]:
     if chromium is None:
         pytest.skip("needs Chromium: `make test-browser` installs it, or CHROMIUM=/path/to/chromium names it")
     with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=chromium, args=list(FLAGS[1:]), headless=True, timeout=PATIENCE)
+        opened = driver.chromium.launch(executable_path=chromium, args=list(FLAGS), headless=True, timeout=PATIENCE)
         yield opened
         opened.close()
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bench.report.write.html import write_index
-from bench.report.write.one_file import write_one_file
 from tests.browser import made
 
 pytestmark = pytest.mark.browser
@@ -36,10 +35,6 @@ FOLDERS = (
     "__proto__",
 )
 MALICE = " ".join(ATTACKS)
-
-
-def hostile(number: int) -> str:
-    return ATTACKS[number % len(ATTACKS)]
 
 
 @pytest.fixture(scope="module")
@@ -158,16 +153,6 @@ def test_each_run_of_a_stranger_is_shown_as_text(strange, tab):
     page = one.open(page.evaluate("implicitBench.runs.link(0)"))
     page.get_by_role("heading", name="Make it again").wait_for()
     assert "hacked" in page.locator("main").text_content()
-
-
-def test_a_file_of_a_stranger_that_is_sent_runs_nothing(strange, tab):
-    one = tab(strange)
-    sent = write_one_file(strange)
-    page = one.open("", sent.name)
-    for address in addresses(page):
-        page = one.open(address, sent.name)
-        page.wait_for_timeout(150)
-        assert page.evaluate("window.hacked") is None, address
 
 
 def test_scripts_that_a_stranger_left_among_ours_are_gone(tmp_path, tab):

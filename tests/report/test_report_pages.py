@@ -6,7 +6,6 @@ import sys
 import pytest
 
 import bench.studies
-from bench.pictures import style
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import choose
@@ -76,12 +75,6 @@ def test_two_presets_under_one_label_are_two_rows(tmp_path):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)
     made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path))
     assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
-
-
-def test_a_preset_that_nobody_listed_has_a_look_of_its_own():
-    new = [style.look(name) for name in ("mine", "yours")]
-    assert new == [style.look(name) for name in ("mine", "yours")]
-    assert new[0] != new[1]
 
 
 def test_a_study_is_found_by_its_file(tmp_path, monkeypatch):

@@ -389,7 +389,7 @@ def test_same_records_give_the_same_files(reported, tmp_path, capsys):
 
 
 def test_row_keeps_its_look_and_known_rows_differ():
-    assert style.look("some new strategy") == style.look("some new strategy")
+    assert style.look("mine") == style.look("mine") != style.look("yours")  # that nobody listed
     strategies = [style.look(preset) for preset in table1.PUBLISHED]
     assert len({look.colour for look in strategies}) == len({look.marker for look in strategies}) == 7
 

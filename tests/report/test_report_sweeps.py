@@ -172,18 +172,6 @@ def test_a_row_has_medians_not_means_of_its_ended_runs(tmp_path):
     assert (found["loop_seconds"], found["value_evaluations"]) == (2.5, 2500)  # of the four that ended ok
 
 
-def test_the_interval_is_over_shapes_however_many_seeds_they_have(tmp_path):
-    for name, seeds in (("one", 1), ("four", 4)):
-        cells = [cell("dist", index=i, seed=s, steps=name) for i in range(6) for s in range(seeds)]
-        swept(tmp_path, cells, name)
-        for number, one in enumerate(cells):
-            ran(tmp_path, one, 0.001 * (1 + number // seeds))  # the same for all seeds of a shape
-    one, four = (table(tmp_path, name).loc["DIST"] for name in ("one", "four"))
-    widths = [found["chamfer_l2_high"] - found["chamfer_l2_low"] for found in (one, four)]
-    assert widths[1] > 0.8 * widths[0]  # more seeds are no more shapes
-    assert (one["runs"], four["runs"]) == (6, 24)
-
-
 def test_the_share_of_failures_has_an_interval(tmp_path):
     cells = [cell("dist", index=i) for i in range(12)]
     swept(tmp_path, cells)
@@ -205,16 +193,6 @@ def test_rows_stand_in_the_order_of_the_plan_and_metrics_in_that_of_tables(tmp_p
     named = [name for name in found if name in metrics]
     assert named == ["chamfer_l2", "fscore", "own_queries"]  # the first one has the ratio
     assert found.loc["DIST", "ratio"] == 1
-
-
-def test_special_characters_of_names_are_escaped_in_latex(tmp_path):
-    cells = [cell("dist", max_steps=steps) for steps in ("5%", "6%")]
-    swept(tmp_path, cells)
-    for one in cells:
-        ran(tmp_path, one, 0.001)
-    assert list(table(tmp_path).index) == ["max_steps 5%", "max_steps 6%"]
-    text = (tmp_path / "sweeps" / "completion-1" / "table.tex").read_text()
-    assert r"max\_steps 5\% & " in text and r"renderer.max\_steps (5\%, 6\%)" in text
 
 
 def test_two_sweeps_have_their_own_runs(tmp_path):

@@ -1,11 +1,10 @@
-"""What the page is made of: names by what differs, safe scripts, meshes, words of a run, one file."""
+"""What the page is made of: names by what differs, safe scripts, meshes, words of a run."""
 
 import base64
 import json
 import shlex
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,16 +13,13 @@ import trimesh
 from bench.records.names import differences
 from bench.records.read import RESULTS, not_run
 from bench.records.record import NOT_RUN, RunStatus
-from bench.records.statuses import STATUSES
-from bench.report.data.names import names
+from bench.report.site.columns import names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplified
-from bench.report.site.script import safe_json, to_script
-from bench.report.site.words import TASKS, asked, command, lines_again
+from bench.report.site.words import STATUSES, TASKS, asked, command
 from bench.report.write import html
-from bench.report.write.html import write_index
-from bench.report.write.one_file import small_picture, write_one_file
+from bench.report.write.html import safe_json, to_script, write_index
 from tests.browser import made
 from tests.report.page_data import Page
 from tests.report.test_report import record, write_run
@@ -36,39 +32,35 @@ def renderer(**settings) -> dict:
     return {"config": {"renderer": settings}}
 
 
-def named(records) -> list[str]:
-    return names(records)
-
-
 def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():
     swept = [record("x", **renderer(_label_="DIST", epsilon=epsilon)) for epsilon in (1e-4, 5e-5)]
-    assert [name.removeprefix("DIST, ") for name in named(swept)] == list(differences(swept).names)
+    assert [name.removeprefix("DIST, ") for name in names(swept)] == list(differences(swept).names)
 
 
 def test_runs_are_named_by_what_differs():
     swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
-    assert named(swept) == ["DIST, steps 20", "DIST, steps 50"]
+    assert names(swept) == ["DIST, steps 20", "DIST, steps 50"]
     same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
-    assert named(same) == ["DIST", "DIST"]
+    assert names(same) == ["DIST", "DIST"]
 
 
 def test_a_setting_that_follows_from_another_is_not_named():
     configs = [{"scale": {"name": name}, "view": {"resolution": size}} for name, size in (("smoke", 32), ("desk", 64))]
-    assert named([record("x", config=config) for config in configs]) == ["dist, scale smoke", "dist, scale desk"]
+    assert names([record("x", config=config) for config in configs]) == ["dist, scale smoke", "dist, scale desk"]
 
 
 def test_own_renderers_are_named_by_their_class():
     own = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
-    assert named(own) == ["Mine", "Other"]
+    assert names(own) == ["Mine", "Other"]
     labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
-    assert named([labelled]) == ["Ours"]
+    assert names([labelled]) == ["Ours"]
 
 
 def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
-    assert max(name.count(",") for name in named([record("x", config=config) for config in configs])) == 3
+    assert max(name.count(",") for name in names([record("x", config=config) for config in configs])) == 3
     alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
-    assert named([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
+    assert names([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
 
 
 @pytest.mark.parametrize(
@@ -138,16 +130,6 @@ def test_the_lines_for_python_open_the_run(tmp_path):
     exec(Page(results).run("completion-0001")["python"], found)  # as a reader would paste them
     assert found["run"].folder == "completion-0001" and found["run"].chamfer_l2 == 0.002
     assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
-
-
-def test_the_lines_for_python_ask_for_what_was_typed():
-    typed = ["task=completion", "renderer.steps=40", "results_dir=elsewhere", "label='it\\'s'"]
-    run = mock.Mock()
-    with mock.patch("bench.run", run):
-        exec(lines_again(record("x", overrides=typed), Path("my results")), {})
-    run.assert_called_once_with([*typed[:2], typed[3]], results_dir="my results")
-    long = lines_again(record("x", overrides=[f"task.points={n}" for n in range(20)]), Path(RESULTS))
-    assert max(map(len, long.splitlines())) < 90 and "results_dir" not in long
 
 
 def test_costs_are_by_phase_and_add_up(tmp_path):
@@ -294,16 +276,3 @@ def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):
     links = [link.removeprefix("page/") for link in Page(tmp_path).shell.links if link.startswith("page/")]
     assert set(links) >= shipped - {"index.html"} and links[-1] == html.START
     assert all(len((html.ASSETS / name).read_text(encoding="utf-8").splitlines()) <= 300 for name in html.SCRIPTS)
-
-
-def test_one_file_names_the_hash_of_each_of_its_scripts_and_links_to_nothing(tmp_path):
-    made.write(tmp_path, 0)
-    text = write_one_file(tmp_path).read_text(encoding="utf-8")
-    assert text.count("<script>") == text.count("</script>") == text.count("'sha256-")
-    assert "src=" not in text.split("<script>")[0] and "page/" not in text.split("<body>")[0]
-    assert "data:image/webp;base64," in text and len(text) < 8_000_000
-
-
-def test_a_picture_that_cannot_be_read_is_left_out(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"no picture")
-    assert small_picture(tmp_path / "a.png", 100) == small_picture(tmp_path / "none.png", 100) == ""

@@ -143,22 +143,33 @@ def by_shape(values: dict[RunKey, float]) -> list[Any]:
     return arrays if any(len(views) > 1 for views in arrays) else [of_view for (of_view,) in arrays]
 
 
-def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
-    """A line with the headings and the definition of each metric that is shown.
+def definition(known: dict[str, Any], name: str) -> Any:
+    """The definition of a metric; empty where there is none.
 
-    Args:
-        records: of the experiment. The key of a definition can name several metrics, such as "lost, false", all that
-            begin alike, such as "depth_error", or that of one band, such as "frontal.code_cosine".
-        names: heading by metric.
+    A key is a list of names, such as "lost, false". It is also that of another band's metric of that name, such as
+    "frontal.code_cosine", and of names that begin so: "saved_..." and "depth_error" of depth_error_p99.
     """
-    lines: dict[str, str] = {}
-    for record in records:
-        for key, text in record["definitions"].items():
-            parts = [part.strip().rsplit(".", 1)[-1] for part in key.split(",")]
-            found = [h for name, h in names.items() if any(name == p or name.startswith(f"{p}_") for p in parts)]
-            if found:
-                lines.setdefault(", ".join(dict.fromkeys(found)), text)
-    return [f"{headings}: {text}" for headings, text in lines.items()]
+    keys = [(part.strip(), words) for key, words in known.items() for part in key.split(",")]
+    last = name.rsplit(".", 1)[-1]
+    for fits in (
+        lambda part: part == name,
+        lambda part: part.endswith("...") and name.startswith(part[:-3]),
+        lambda part: part.rsplit(".", 1)[-1] == last,
+        lambda part: last.startswith(f"{part.rsplit('.', 1)[-1]}_"),
+    ):
+        for part, words in keys:
+            if fits(part):
+                return words
+    return ""
+
+
+def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
+    """A line with the headings and the definition of each metric that is shown; `names` has the heading by metric."""
+    lines: dict[str, list[str]] = {}
+    for name, heading in names.items():
+        told = next(filter(None, (definition(record["definitions"], name) for record in records)), "")
+        lines.setdefault(told, []).append(heading)
+    return [f"{', '.join(dict.fromkeys(headings))}: {told}" for told, headings in lines.items() if told]
 
 
 def repeated(records: list[Record]) -> str:

@@ -15,7 +15,6 @@
 
   function start() {
     const about = bench.store.have("list", "about");
-    bench.oneFile = about.oneFile;
     bench.runs = bench.openRuns();
     document.querySelector(".skip").addEventListener("click", (event) => {
       event.preventDefault(); // the part of the address behind the # says what is shown
@@ -23,7 +22,7 @@
     });
     document.getElementById("tools").append(bench.themeButton());
     fill(document.getElementById("counts"), plural(bench.runs.count, "run"), bench.runs.count ? counts() : null);
-    fill(document.getElementById("problems"), problems(about.problems), bench.oneFile && element("p.note", null, about.left));
+    fill(document.getElementById("problems"), problems(about.problems));
     bench.address.follow(show);
     show();
   }

@@ -5,16 +5,32 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.files import digest, plain
+from bench.records.format import plural
 from bench.records.metrics import FIRST, MEASURED, SHOWN
-from bench.records.record import started
-from bench.report.data.names import names
-from bench.report.data.records import Record, family, loop_seconds, run_key, setting, value_evaluations
+from bench.records.names import in_order, settings_of, told_apart
+from bench.records.record import NEUTRAL_KEYS, row_name, started
+from bench.report.data.records import (
+    OURS,
+    Record,
+    family,
+    grouped,
+    loop_seconds,
+    run_key,
+    setting,
+    value_evaluations,
+)
 from bench.report.site.files import Folder
 
 DIGITS = 5  # of numbers in the list; a run's own page has all of them
 LONGEST_REASON = 300
 GIVEN = ("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest")
 METRICS = SHOWN | MEASURED
+CUSTOM = "custom"  # the choice of renderer that stands for a user's class
+MOST_TOLD = 3  # settings in a name
+# Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
+IN_COLUMNS = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw"}
+# What is named first where several settings tell runs apart.
+TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
 
 
 def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
@@ -36,12 +52,42 @@ def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
     }
 
 
+def names(records: list[Record]) -> list[str]:
+    """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
+
+    What differs is written as for the rows of a sweep, so that a setting reads the same in both; what stands in columns
+    of its own, such as shape and seed, is left out. Settings are added as long as one tells apart runs of one task and
+    row that those before it do not, so that what follows from another setting is not repeated; at most `MOST_TOLD`.
+    """
+    found = [_base_name(record) for record in records]
+    settings = [settings_of(record["config"], IN_COLUMNS) for record in records]
+    for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
+        alike = list(grouped(places, lambda place: str(settings[place])).values())  # most runs of a list have the same
+        different = [settings[same[0]] for same in alike]
+        rows = [found[places[0]]] * len(alike)
+        told = told_apart(in_order(different, TOLD_FIRST), classes=[0] * len(alike), names=rows, most=MOST_TOLD)
+        for same, name in zip(alike, told.names, strict=True):
+            for place in same:
+                found[place] = name
+    return found
+
+
+def _base_name(record: Record) -> str:
+    """The name of a record's row; of a user's renderer without a label, its class."""
+    name = row_name(record["config"], record["renderer"])
+    target = str(setting(record["config"], "renderer", "_target_") or "")
+    if record["renderer"] == CUSTOM and target and not target.startswith(OURS):
+        own = target.rpartition(".")[2]
+        return name.replace(CUSTOM, own, 1) if name.startswith(CUSTOM) else name
+    return name
+
+
 def machine(record: Record) -> str:
     """The machine that the run's times depend on, with its threads; empty where the run ended before it knew."""
     environment = record["environment"]
     parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
     label, threads = " + ".join(part for part in parts if part and part != "cpu"), environment.get("threads")
-    return f"{label}, {threads} thread{'s' if threads != 1 else ''}" if label and threads else ""
+    return f"{label}, {plural(threads, 'thread')}" if label and threads else ""
 
 
 def number(value: Any) -> int | float | None:

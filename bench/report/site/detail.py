@@ -5,11 +5,10 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.statuses import STATUSES
-from bench.report.data.records import Record
+from bench.report.data.records import Record, definition
 from bench.report.site.columns import number
 from bench.report.site.files import ALT, Folder
-from bench.report.site.words import asked, command, lines_again, lines_open
+from bench.report.site.words import STATUSES, asked, command, lines_open
 
 MOST_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
 PHASES = {
@@ -40,7 +39,6 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "pictures": [[name, folder.link(name), ALT.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
         "command": command(record, results_dir),
-        "again": lines_again(record, results_dir),
         "python": lines_open(record, results_dir / "runs" / folder.name, files),
     }
 
@@ -91,7 +89,7 @@ def _metrics(record: Record) -> list[list[Any]]:
             name,
             _value(record["metrics_start"].get(name)),
             _value(record["metrics"].get(name)),
-            definition(record["definitions"], name),
+            text(definition(record["definitions"], name)),
         ]
         for name in names
     ]
@@ -100,23 +98,6 @@ def _metrics(record: Record) -> list[list[Any]]:
 def _value(value: Any) -> int | float | str | None:
     known = number(value)
     return known if known is not None or value is None else text(value)
-
-
-def definition(definitions: dict[str, Any], name: str) -> str:
-    """The definition of a metric. A key is a list of names; `saved_...` matches a prefix, `NAME.error` a suffix."""
-    if name in definitions:
-        return text(definitions[name])
-    keys = [([part.strip() for part in key.split(",")], words) for key, words in definitions.items()]
-    last = name.rsplit(".", 1)[-1] if "." in name else None
-    for fits in (
-        lambda part: part == name,
-        lambda part: part.endswith("...") and name.startswith(part[:-3]),
-        lambda part: "." in part and part.rsplit(".", 1)[-1] == last,
-    ):
-        for parts, words in keys:
-            if any(fits(part) for part in parts):
-                return text(words)
-    return ""
 
 
 def _costs(record: Record) -> dict[str, Any]:

@@ -1,11 +1,10 @@
 """The files of a run that the page links to: those that are there, and lie within the results folder."""
 
-import hashlib
 from pathlib import Path
 
 from bench.records.files import leads_out
 from bench.records.record import PICTURES
-from bench.report.write.paper import link
+from bench.report.write.paper import key_of, link
 
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
 SUFFIXES = (".png", ".gif", ".webp")  # of pictures
@@ -33,8 +32,8 @@ class Folder:
 
     @property
     def key(self) -> str:
-        """The name of the run's files among those of the page: letters and digits, whatever the folder is called."""
-        return hashlib.sha256(self.name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        """The name of the run's files among those of the page."""
+        return key_of(self.name)
 
     def has(self, name: str) -> bool:
         """Whether it has this file, and not a link to something outside of the results folder."""

@@ -1,12 +1,13 @@
-"""What a run was asked, in words; the command and lines of Python that make it again and open it."""
+"""What a run was asked and what its status means, in words; the command that makes it again, lines that open it."""
 
 import json
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench.records import metrics
 from bench.records.read import RESULTS
+from bench.records.record import NOT_RUN, RunStatus
 from bench.report.data.records import Record, iterations_of, setting
 
 TASKS = {
@@ -27,8 +28,67 @@ TASKS = {
     "capacity": "Measure how much model a shape needs",
 }
 LEFT_OUT = ("results_dir", "rerun")  # of a command, which stands for any folder
-WIDEST = 90  # letters of overrides on one line
 MOST_SHOWN = 4  # metrics that the lines print
+
+
+class Said(NamedTuple):
+    """What a status means, and what helps; `remedy` is empty where there is nothing to mend."""
+
+    meaning: str
+    remedy: str = ""
+
+
+STATUSES = {
+    RunStatus.OK: Said("It ended as planned."),
+    RunStatus.NAN: Said(
+        "The loss became NaN.",
+        "Lower task.optimiser.learning_rate. The curve shows the last iteration with a finite loss.",
+    ),
+    RunStatus.DIVERGED: Said(
+        "The loss rose a hundredfold.",
+        "Lower task.optimiser.learning_rate, or the weight of the loss that rises first.",
+    ),
+    RunStatus.NOT_REACHED: Said(
+        "The loss did not fall.",
+        "Try more iterations (task.optimiser.iterations), another seed, or a renderer that has the gradient which the "
+        "task needs: `task=gradients` compares them.",
+    ),
+    RunStatus.EMPTY: Said(
+        "The field ended without a surface.",
+        "Lower task.optimiser.learning_rate, or raise the weight of the loss of the mask. strip.png shows when the "
+        "surface was lost.",
+    ),
+    RunStatus.TIMEOUT: Said(
+        "A limit of time, or of field values, was reached.",
+        "Raise time_limit=SECONDS (null is none), or make the work smaller: scale=smoke, view.resolution=32.",
+    ),
+    RunStatus.OOM: Said(
+        "A limit of memory was reached.",
+        "Raise memory_limit=GIB where the machine has more, or make the work smaller: view.resolution, "
+        "evaluation.grid.",
+    ),
+    RunStatus.CRASHED: Said(
+        "An error ended it.",
+        "verbose=true shows where the error came from, and isolation=off lets a debugger stop there. log.txt has "
+        "all of it.",
+    ),
+    RunStatus.KILLED: Said(
+        "It was stopped from outside, or is still under way.",
+        "The same command runs it again.",
+    ),
+    RunStatus.UNSUPPORTED: Said(
+        "The renderer lacks what the task needs.",
+        "This is an answer, not an error. The reason says what is lacking; another renderer or setting may have it.",
+    ),
+    RunStatus.REFUSED: Said(
+        "The configuration is invalid.",
+        "The reason names the key and what to type instead.",
+    ),
+    NOT_RUN: Said(
+        "A sweep planned it, and it has not been run.",
+        "The command of the sweep runs what is missing, and reuses what is there.",
+    ),
+}
 
 
 def asked(record: Record) -> str:
@@ -50,20 +110,8 @@ def asked(record: Record) -> str:
 
 def command(record: Record, results_dir: Path) -> str:
     """The command that makes the run again, for a shell."""
-    folder = [] if _default(results_dir) else [f"results_dir={results_dir.as_posix()}"]
+    folder = [] if results_dir.as_posix() == RESULTS else [f"results_dir={results_dir.as_posix()}"]
     return shlex.join(["python", "-m", "bench", *_overrides(record), *folder])
-
-
-def lines_again(record: Record, results_dir: Path) -> str:
-    """The lines that make the run again in Python, or reuse it where nothing has changed."""
-    words = [_quoted(word) for word in _overrides(record)]
-    folder = "" if _default(results_dir) else f", results_dir={_quoted(results_dir.as_posix())}"
-    inner = ", ".join(words)
-    if len(inner) + len(folder) > WIDEST:
-        inner = "".join(f"\n    {word}," for word in words) + "\n"
-    return "\n".join(
-        ["import bench", "", f"record = bench.run([{inner}]{folder})", "print(record.status, record.metrics)"]
-    )
 
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
@@ -95,10 +143,6 @@ def _quoted(text: str) -> str:
 def _overrides(record: Record) -> list[str]:
     """What the command line set, or what a sweep has planned."""
     return [text for text in map(str, record.get("overrides") or []) if text.partition("=")[0] not in LEFT_OUT]
-
-
-def _default(results_dir: Path) -> bool:
-    return results_dir.as_posix() == RESULTS
 
 
 def _known(of: Any, record: Record) -> Any:

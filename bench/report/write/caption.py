@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from operator import itemgetter
 from typing import Any
 
+from bench.records.format import plural
 from bench.report.data.records import Record, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
@@ -76,8 +77,8 @@ def warnings(runs: Runs) -> list[str]:
 def _sample(runs: Runs) -> str:
     """The numbers of runs, shapes, views where these are several, and seeds."""
     shapes, views, seeds = _levels(runs)
-    parts = [_plural("shape", shapes), *([_plural("view", views)] if views > 1 else []), _plural("seed", seeds)]
-    return f"{_plural('run', len(runs.records))} ({', '.join(parts)})"
+    parts = [plural(shapes, "shape"), *([plural(views, "view")] if views > 1 else []), plural(seeds, "seed")]
+    return f"{plural(len(runs.records), 'run')} ({', '.join(parts)})"
 
 
 def _levels(runs: Runs) -> tuple[int, int, int]:
@@ -126,7 +127,7 @@ def _outcome(runs: Runs) -> str:
 def _omitted(runs: Runs) -> str:
     """The number of runs of this experiment that are not shown, and the reason; empty where all are shown."""
     reason = "of this experiment at another scale or on another scene, or replaced by newer ones"
-    return f"Not shown: {_plural('run', runs.left_out)} {reason}." if runs.left_out else ""
+    return f"Not shown: {plural(runs.left_out, 'run')} {reason}." if runs.left_out else ""
 
 
 def _mixed(runs: Runs) -> str:
@@ -155,7 +156,7 @@ def _loaded(runs: Runs) -> str:
 
 def _machine(cpu: Any, device: Any, threads: Any) -> str:
     parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
-    return "; ".join([" + ".join(parts), *([_plural("thread", threads)] if threads else [])])
+    return "; ".join([" + ".join(parts), *([plural(threads, "thread")] if threads else [])])
 
 
 def _failure(record: Record) -> str:
@@ -165,7 +166,3 @@ def _failure(record: Record) -> str:
 
 def _listed(names: list[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def _plural(word: str, count: int) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"

@@ -2,18 +2,18 @@
 
 import json
 import os
+import re
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import file_lock, write_text
+from bench.records.files import file_lock, plain, write_text
 from bench.records.read import check_results, read_records
-from bench.report.data.records import Record
 from bench.report.site.columns import columns
 from bench.report.site.detail import detail
 from bench.report.site.files import Folder
-from bench.report.site.papers import papers
-from bench.report.site.script import remove_others, to_script, write_script
+from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
 FOLDER = "page"  # of the results folder
@@ -30,9 +30,14 @@ DATA = tuple(f"data/{kind}" for kind in ("list", "run", "mesh", "paper"))
 MOST_MESHES = 500  # of the newest runs; `bench.report meshes=all` makes all
 # Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
 POLICY = (
-    "default-src 'none'; script-src {scripts}; style-src {styles}; img-src {pictures}; "
+    "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src 'self' file: data:; "
     "base-uri 'none'; form-action 'none'"
 )
+
+# Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
+UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
+KEY = re.compile(r"[0-9a-f]{16}\.js")  # of the files with details
+ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
 def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
@@ -50,40 +55,37 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
     with file_lock(results_dir, FOLDER):  # of two sweeps that end, the last one's page has the runs of both
         records, problems = read_records(results_dir)
         data, page = results_dir / FOLDER / "data", results_dir / "index.html"
-        _copy_assets(results_dir / FOLDER)
-        _write_details(records, results_dir, data / "run")
-        _write_meshes(records, results_dir, data / "mesh", meshes)
+        folders = [Folder(results_dir, record["folder"]) for record in records]
         entries, wholes = papers(results_dir)
-        for key, whole in wholes.items():
-            write_script(data / "paper" / f"{key}.js", to_script("paper", key, whole))
-        remove_others(data / "paper", wholes)
-        about = {"problems": problems, "oneFile": False}
-        lists = {"about": about, "papers": entries, "runs": columns(records, results_dir)}
+        _copy_assets(results_dir / FOLDER)
+        runs = zip(folders, records, strict=True)
+        _write_all(data, "run", ((folder.key, detail(record, folder, results_dir)) for folder, record in runs))
+        _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
+        _write_all(data, "paper", wholes.items())
+        lists = {"about": {"problems": problems}, "papers": entries, "runs": columns(records, results_dir)}
         for name, content in lists.items():
-            write_script(data / "list" / f"{name}.js", to_script("list", name, content))
+            write_script(data, "list", name, content)
         write_text(page, shell())
     return page
 
 
-def _write_details(records: list[Record], results_dir: Path, place: Path) -> None:
-    """Writes the details of each run, and removes those of runs that are gone."""
-    folders = [Folder(results_dir, record["folder"]) for record in records]
-    for record, folder in zip(records, folders, strict=True):
-        write_script(place / f"{folder.key}.js", to_script("run", folder.key, detail(record, folder, results_dir)))
-    remove_others(place, [folder.key for folder in folders])
+def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> None:
+    """Writes the scripts of a kind by their keys, and removes those of what is gone."""
+    keys = []
+    for key, content in contents:
+        write_script(data, kind, key, content)
+        keys.append(key)
+    remove_others(data / kind, keys)
 
 
-def _write_meshes(records: list[Record], results_dir: Path, place: Path, most: int | None) -> None:
+def _write_meshes(folders: list[Folder], data: Path, most: int | None) -> None:
     """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
-    folders = [Folder(results_dir, record["folder"]) for record in records]
-    folders = [folder for folder in folders if folder.has("mesh.ply")]
     left_out = {"none": f"Made for the newest {most} runs: `python -m bench.report meshes=all` makes all."}
     for number, folder in enumerate(folders):
-        path, source = place / f"{folder.key}.js", folder.path / "mesh.ply"
-        if not _is_newer(path, source, folder.key):
-            made = _mesh(source) if most is None or number < most else left_out
-            write_script(path, to_script("mesh", folder.key, made))
-    remove_others(place, [folder.key for folder in folders])
+        source = folder.path / "mesh.ply"
+        if not _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key):
+            write_script(data, "mesh", folder.key, _mesh(source) if most is None or number < most else left_out)
+    remove_others(data / "mesh", [folder.key for folder in folders])
 
 
 def _mesh(source: Path) -> dict[str, Any]:
@@ -118,41 +120,65 @@ def _refuse_links(results_dir: Path) -> None:
 
 def shell() -> str:
     """The page without its data."""
-    beside = "'self' file:"
-    policy = POLICY.format(scripts=beside, styles=f"{beside} 'unsafe-inline'", pictures=f"{beside} data:")
     names = [*SCRIPTS, *(f"data/list/{name}.js" for name in LISTS), START]
-    return filled(
-        policy,
-        "\n".join(f'<link rel="stylesheet" href="{FOLDER}/{name}">' for name in STYLES),
-        "\n".join(f'<script src="{FOLDER}/{name}"></script>' for name in names),
-    )
-
-
-def filled(policy: str, styles: str, scripts: str) -> str:
-    """The text of `index.html` with these parts."""
+    parts = {
+        "policy": POLICY,
+        "styles": "\n".join(f'<link rel="stylesheet" href="{FOLDER}/{name}">' for name in STYLES),
+        "scripts": "\n".join(f'<script src="{FOLDER}/{name}"></script>' for name in names),
+    }
     text = (ASSETS / "index.html").read_text(encoding="utf-8")
-    for name, part in {"policy": policy, "styles": styles, "scripts": scripts}.items():
+    for name, part in parts.items():
         text = text.replace(f"{{{{ {name} }}}}", part)
     return text
 
 
-def library() -> Path:
-    """Plotly's script, of the package that is installed."""
-    return Path(find_spec("plotly").origin).parent / "package_data" / LIBRARY
-
-
 def _copy_assets(folder: Path) -> None:
     for name in (*STYLES, *SCRIPTS, START):
-        _copy(ASSETS / name, folder / name)
-    _copy(library(), folder / LIBRARY)
+        write_file(folder / name, (ASSETS / name).read_bytes())
+    write_file(folder / LIBRARY, (Path(find_spec("plotly").origin).parent / "package_data" / LIBRARY).read_bytes())
 
 
-def _copy(source: Path, target: Path) -> None:
-    """Copies a file, unless the target has that content already."""
-    content = source.read_bytes()
-    if target.is_file() and target.read_bytes() == content:
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    scratch = target.with_name(f".{target.name}.{os.getpid()}")
+def to_script(kind: str, key: str, data: Any) -> str:
+    """A script that hands data to the page: `implicitBench.receive(kind, key, data)`, in ASCII.
+
+    Numbers that are not finite are the strings "inf", "-inf" and "nan".
+    """
+    parts = (safe_json(part) for part in (kind, key, data))
+    return f"implicitBench.receive({', '.join(parts)});\n"
+
+
+def safe_json(data: Any) -> str:
+    """JSON in ASCII that can stand within a script element."""
+    try:
+        text = ENCODER.encode(data)
+    except ValueError:  # a number that is not finite
+        text = ENCODER.encode(plain(data))
+    return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def remove_others(folder: Path, keys: Iterable[str]) -> None:
+    """Removes the scripts of what is gone."""
+    kept = {f"{key}.js" for key in keys}
+    if folder.is_dir():
+        with os.scandir(folder) as found:
+            gone = [one.name for one in found if one.name not in kept and KEY.fullmatch(one.name)]
+        for name in gone:
+            (folder / name).unlink(missing_ok=True)
+
+
+def write_script(data: Path, kind: str, key: str, content: Any) -> None:
+    """Writes the script that hands over the content of that kind and key."""
+    write_file(data / kind / f"{key}.js", to_script(kind, key, content).encode("ascii"))
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Writes a file, unless it has that content already."""
+    try:
+        if not path.is_symlink() and path.read_bytes() == content:  # what a link leads to may change
+            return
+    except OSError:
+        pass
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
     scratch.write_bytes(content)
-    scratch.replace(target)
+    scratch.replace(path)

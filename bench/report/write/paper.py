@@ -1,5 +1,6 @@
 """Writes the tables and figures of all studies and their README; finds those of a results folder for index.html."""
 
+import hashlib
 import os
 import re
 from collections.abc import Callable
@@ -23,6 +24,7 @@ SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
 SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
 STUDIES = ROOT / "bench" / "studies"
+BESIDE = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
 
 HEAD = """# Results
 
@@ -132,6 +134,31 @@ def find_sweeps(results_dir: Path) -> list[Found]:
     return [Found(name, one.shown, one.picture, one.files, one.base) for name, one in found]
 
 
+def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """The entry of each table and figure, those of sweeps last, and by its key all that its own view shows."""
+    entries, wholes = [], {}
+    for found in [*find_paper(results_dir), *find_sweeps(results_dir)]:
+        key = key_of(found.name)
+        shown = found.shown
+        texts = {"question": shown.question, "verdict": shown.verdict, "shipped": found.shipped}
+        entries.append({"name": found.name, "key": key, "title": (shown.title or found.name).rstrip("."), **texts})
+        wholes[key] = {
+            **{"caption": shown.caption, "notes": shown.notes, "header": shown.columns},
+            **{"rows": shown.rows + _beside(found, results_dir), "files": found.files, "picture": found.picture},
+            **{"chart": shown.chart, "atlas": shown.atlas},
+        }
+    return entries, wholes
+
+
+def _beside(found: Found, results_dir: Path) -> list[list[str]]:
+    """The shipped rows of a table of the user's, marked; none where its columns are others, or it is shipped itself."""
+    if found.shipped or found.base.parents[1] != results_dir or results_dir.resolve() == SHIPPED:
+        return []
+    shipped = found_at(SHIPPED / FOLDER, found.name, (FOLDER,)).shown
+    same = shipped.columns and shipped.columns == found.shown.columns
+    return [[BESIDE + row[0], *row[1:]] for row in shipped.rows] if same else []
+
+
 def write_readme(results_dir: Path) -> Path | None:
     """Writes `results_dir/README.md` with all tables and figures, so that no number is copied by hand.
 
@@ -167,6 +194,11 @@ def found_at(folder: Path, name: str, place: tuple[str, ...]) -> Found:
 def link(*parts: str) -> str:
     """The address of a file as seen from the results folder, percent-encoded byte for byte."""
     return "/".join(quote(os.fsencode(part), safe="") for part in parts)
+
+
+def key_of(name: str) -> str:
+    """The name of a script of data: letters and digits, whatever its run or table is called."""
+    return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def _section(page: Found) -> str:

@@ -63,7 +63,6 @@
       reason: (place) => data.reason[place],
       reused: (place) => reused.has(place),
       place: (wanted) => places.get(wanted),
-      held: (place) => bench.store.have("run", data.key[place]),
       detail: (place) => bench.store.load("run", data.key[place]),
       mesh: (place) => bench.store.load("mesh", data.key[place]),
       picture: (place) => text(place, "thumb") && data.address[place] + text(place, "thumb"),

@@ -19,8 +19,7 @@
   function load(kind, key) {
     const name = `${kind}/${key}`;
     if (received.has(name)) return Promise.resolve(received.get(name));
-    if (!/^[a-z]+\/[A-Za-z0-9_-]+$/.test(name) || bench.oneFile)
-      return Promise.reject(new Error("It is not in this file."));
+    if (!/^[a-z]+\/[A-Za-z0-9_-]+$/.test(name)) return Promise.reject(new Error(`${name} is no name of data.`));
     if (!waiting.has(name)) {
       const waits = {};
       waits.promise = new Promise((resolve, reject) => Object.assign(waits, {resolve, reject}));

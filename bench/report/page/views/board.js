@@ -158,8 +158,7 @@
   ];
 
   function thumb(place) {
-    const detail = bench.oneFile && bench.runs.held(place);
-    const src = bench.oneFile ? detail && detail.pictures.length && detail.pictures[0][1] : bench.runs.picture(place);
+    const src = bench.runs.picture(place);
     if (!src) return element("span.soft", {"aria-hidden": "true"}, MISSING);
     const image = element("img", {src, alt: "", loading: "lazy", width: 60, height: 48});
     return element("a", {href: bench.runs.link(place), tabindex: "-1", "aria-hidden": "true"}, image);

@@ -48,7 +48,7 @@
 
   /* What answers the mouse, the picture, the table, caption and files; what shows the same twice is folded. */
   function parts(known, data) {
-    const image = () => element("img.figure", {src: data.shown || data.picture, alt: data.caption || known.title, loading: "lazy"});
+    const image = () => element("img.figure", {src: data.picture, alt: data.caption || known.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
     const table = data.rows.length > 0 && bench.written(data.header, data.rows);

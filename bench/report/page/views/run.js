@@ -40,8 +40,7 @@
       section("Costs", costs(detail.costs)),
       section("Make it again",
         copied(detail.command, "Copy the command"),
-        element("p.soft", null, "Configurations are code: read one that is not yours first. From Python:"),
-        copied(detail.again, "Copy the lines that make it again")),
+        element("p.soft", null, "Configurations are code: read one that is not yours first.")),
       section("Open it in Python", copied(detail.python, "Copy the lines that open it")),
       section("Files", element("p.files", null, element("code", null, bench.runs.folder(place)), " ", links)),
       details(`All ${detail.settings.length} settings`, facts(detail.settings)),
@@ -92,7 +91,7 @@
   function picture([name, src, alt]) {
     const shown = element("img", {src, alt: alt || name, loading: "lazy"});
     const caption = element("figcaption", null, element("b", null, name), alt ? ` ${alt}` : "");
-    return element("figure", null, bench.oneFile ? shown : element("a", {href: src}, shown), caption);
+    return element("figure", null, element("a", {href: src}, shown), caption);
   }
 
   /* A bar per phase, and what was counted. */
