@@ -43,6 +43,7 @@ TERMS = {
     "eikonal": "#bcbd22",
 }
 MOST_PHOTOGRAPHS = 4  # shown, in two rows
+GIVEN_INCHES = 2.0  # width of the axes with what is given
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def draw_run(
     curve: list[dict[str, Any]],
     title: str,
 ) -> None:
-    """Writes the pictures of a run, summary.png and its parts, at a higher resolution than in the run.
+    """Writes summary.png and curve.png of a run, at a higher resolution than in the run.
 
     Args:
         folder: the run folder.
@@ -106,22 +107,26 @@ def draw_run(
         ),
         ViewPair("truth", see(truth, front), see(truth, back)),
     )
-    figures = {
-        "input": _input(given),
-        "depth": _row(pairs, _show_depth, "Depth (camera z, scene units)"),
-        "normals": _row(pairs, _show_normals, "Normals (right, up, towards the camera as red, green, blue)"),
-        "silhouette": _row(pairs[:2], _show_silhouette(pairs[2]), "Silhouette error"),
-        "curve": _curve(curve),
-        "summary": _summary(pairs, given, title),
-    }
-    for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+    _summary(pairs, given, title).savefig(folder / "summary.png", dpi=110, bbox_inches="tight")
+    draw_curve(folder / "curve.png", curve)
 
 
 @rc_context(SCREEN)
 def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     """Writes the terms of a loss over iterations and seconds."""
-    _curve(curve).savefig(path, dpi=110, bbox_inches="tight")
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
+        for name, colour in TERMS.items():
+            known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
+            if known:
+                axis.semilogy(*zip(*known, strict=True), label=name, color=colour, lw=1.4)
+        axis.set_xlabel(label)
+    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[0].set_ylabel("weighted loss")
+    if axes[0].lines:
+        axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 @rc_context(SCREEN)
@@ -258,46 +263,9 @@ def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
     return figure
 
 
-def _row(pairs: tuple[ViewPair, ...], show: Any, title: str) -> Figure:
-    figure = Figure(figsize=(3.2 * len(pairs) + 0.6, 3.5), layout="constrained")
-    axes = figure.subplots(1, len(pairs))
-    for axis, pair in zip(axes, pairs, strict=True):
-        image = show(axis, pair, pairs)
-        axis.set_title(pair.title)
-    if show is _show_depth:
-        figure.colorbar(image, ax=axes, shrink=0.8)
-    figure.suptitle(title)
-    return figure
-
-
-def _input(given: Given) -> Figure:
-    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
-    axis = figure.subplots()
-    points = _show_given(axis, given, inches=3.5)
-    if given.photographs is None:
-        figure.colorbar(points, ax=axis, label="depth (scene units)", shrink=0.8)
-    axis.set_title(f"Given: {given.summary}")
-    return figure
-
-
-def _curve(curve: list[dict[str, Any]]) -> Figure:
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
-        for name, colour in TERMS.items():
-            known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
-            if known:
-                axis.semilogy(*zip(*known, strict=True), label=name, color=colour, lw=1.4)
-        axis.set_xlabel(label)
-    figure.axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.axes[0].set_ylabel("weighted loss")
-    if figure.axes[0].lines:
-        figure.axes[0].legend(frameon=False)
-    return figure
-
-
 def _show_depth(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    low, high = _depth_range(pairs)
+    depths = np.concatenate([other.front.depth.numpy()[other.front.mask.numpy()] for other in pairs])
+    low, high = (depths.min(), depths.max()) if depths.size else (0.0, 1.0)
     shown = np.where(pair.front.mask.numpy(), pair.front.depth.numpy(), np.nan)
     part = window([other.front.mask.numpy() for other in pairs])
     return bare(axis).imshow(shown[part], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
@@ -329,22 +297,21 @@ def _show_silhouette(truth: ViewPair) -> Any:
     return show
 
 
-def _show_given(axis: Any, given: Given, inches: float = 2.0) -> Any:
-    """Shows some photographs; or the mask, and a square as large as a pixel for each depth, on axes `inches` wide."""
+def _show_given(axis: Any, given: Given) -> None:
+    """Shows some photographs; or the mask, and a square as large as a pixel for each depth."""
     if given.photographs is not None:
         places = np.linspace(0, len(given.photographs), MOST_PHOTOGRAPHS, endpoint=False).astype(int)
         chosen = given.photographs[places]
-        return bare(axis).imshow(np.concatenate([np.concatenate(chosen[:2], 1), np.concatenate(chosen[2:], 1)], 0))
+        bare(axis).imshow(np.concatenate([np.concatenate(chosen[:2], 1), np.concatenate(chosen[2:], 1)], 0))
+        return
     mask = given.view.mask.numpy()
     rows, columns = window([mask])
     bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axis.set_xlim(columns.start - 0.5, columns.stop - 0.5)
     axis.set_ylim(rows.stop - 0.5, rows.start - 0.5)
     at = np.nonzero(given.observed)
-    size = (72 * inches / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
-    return axis.scatter(
-        at[1], at[0], c=given.view.depth.numpy()[at], s=size, cmap="viridis_r", marker="s", linewidths=0
-    )
+    size = (72 * GIVEN_INCHES / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
+    axis.scatter(at[1], at[0], c=given.view.depth.numpy()[at], s=size, cmap="viridis_r", marker="s", linewidths=0)
 
 
 def window(masks: Sequence[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
@@ -356,8 +323,3 @@ def window(masks: Sequence[Bool[np.ndarray, "height width"]]) -> tuple[slice, sl
 def normals_image(view: View) -> Float[np.ndarray, "height width 3"]:
     """The normals of `picture_normals` as red, green, blue; white where there is no surface."""
     return torch.where(view.mask[..., None], picture_normals(view) / 2 + 0.5, 1.0).clamp(0, 1).numpy()
-
-
-def _depth_range(pairs: tuple[ViewPair, ...]) -> tuple[float, float]:
-    depths = np.concatenate([pair.front.depth.numpy()[pair.front.mask.numpy()] for pair in pairs])
-    return (float(depths.min()), float(depths.max())) if depths.size else (0.0, 1.0)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from bench.pictures import style
 
@@ -84,40 +83,24 @@ class Candidates:
 
 
 def panels(axes: np.ndarray, candidates: Candidates) -> None:
-    """Draws the error over the size and over FLOPs per query, with a ring around the recommended candidate."""
+    """Draws the error over the size and over FLOPs per query: standard errors, half a pixel, the recommended one."""
+    fitted = [result for result in candidates.results if result.error is not None]
     for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
-        panel(axis, candidates, key)
-        name_chosen(axis, candidates, key)
-        axis.set_xlabel(AXES[key])
+        for kind, (label, colour, marker) in KINDS.items():
+            numbers = [result.numbers for result in fitted if result.kind == kind]
+            if numbers:
+                x, y, spread = ([own[name] for own in numbers] for name in (key, "error", "standard_error"))
+                axis.errorbar(x, y, yerr=spread, fmt=marker, color=colour, ms=4, lw=0.8, label=label)
+        axis.axhline(candidates.footprint, color="#888888", lw=0.9, ls="--", label="half a pixel")
+        if candidates.best is not None:
+            low, spread = (candidates.best.numbers[name] for name in ("error", "standard_error"))
+            label = "one standard error of the best"
+            axis.axhspan(low, low + spread, color="#cccccc", alpha=0.6, lw=0, label=label)
+        if candidates.chosen is not None:
+            at = candidates.chosen.numbers[key], candidates.chosen.error
+            axis.plot(*at, "o", ms=9, mfc="none", mec="#111111", mew=1.2, label="recommended")
+            axis.annotate(candidates.chosen.label, at, (0, 9), textcoords="offset points", ha="center", fontsize=7)
+        axis.set(xscale="log", yscale="log", xlabel=AXES[key])
+        style.log_axis(axis, "y", [result.error for result in fitted])
     axes[0].set_ylabel("held-out error (scene units)")
     style.legend_below(axes[0].figure, axes[-1])
-
-
-def panel(axis: Axes, candidates: Candidates, key: str) -> None:
-    """Draws the error over one cost, with standard errors, half a pixel, and the best candidate's standard error."""
-    fitted = [result for result in candidates.results if result.error is not None]
-    for kind, (label, colour, marker) in KINDS.items():
-        of_kind = [result for result in fitted if result.kind == kind]
-        if of_kind:
-            names = (key, "error", "standard_error")
-            x, y, spread = (np.array([result.numbers[name] for result in of_kind]) for name in names)
-            axis.errorbar(x, y, yerr=spread, fmt=marker, color=colour, ms=4, lw=0.8, label=label)
-    chosen, best = candidates.chosen, candidates.best
-    axis.axhline(candidates.footprint, color="#888888", lw=0.9, ls="--", label="half a pixel")
-    if best is not None:
-        top = best.numbers["error"] + best.numbers["standard_error"]
-        axis.axhspan(
-            best.numbers["error"], top, color="#cccccc", alpha=0.6, lw=0, label="one standard error of the best"
-        )
-    if chosen is not None:
-        at = chosen.numbers[key], chosen.numbers["error"]
-        axis.plot(*at, "o", ms=9, mfc="none", mec="#111111", mew=1.2, label="recommended")
-    axis.set(xscale="log", yscale="log")
-    style.log_axis(axis, "y", [result.error for result in fitted])
-
-
-def name_chosen(axis: Axes, candidates: Candidates, key: str) -> None:
-    """Writes the recommended candidate's name above its ring."""
-    if (chosen := candidates.chosen) is not None:
-        at = chosen.numbers[key], chosen.numbers["error"]
-        axis.annotate(chosen.label, at, (0, 9), textcoords="offset points", ha="center", fontsize=7)

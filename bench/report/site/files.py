@@ -14,9 +14,6 @@ ALT = {  # what the pictures of a run show
     "strip.gif": "The way from the start to the end, moving",
     "strip.webp": "The way from the start to the end, moving",
     "curve.png": "Loss and error over the iterations",
-    "depth.png": "Depth: before, after, truth",
-    "normals.png": "Normals: before, after, truth",
-    "silhouette.png": "Pixels of the silhouette that are missed or spurious",
     "input.png": "What was given",
     "failure.png": "The first failure: kinds of pixels, beside the true distance",
 }
