@@ -19,7 +19,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from bench.pictures import style
 from bench.records.format import plural
-from bench.report.data.records import Record, family, grouped, index, row_of
+from bench.report.data.records import Record, Row, family, grouped, index, row_of
 from bench.report.data.runs import Runs
 
 LARGEST, LARGEST_COMPARED = 0.9, 1.5  # inches of a picture's side at most, and of one beside a colour bar
@@ -39,9 +39,9 @@ Paint = Callable[[Arrays], Sequence[np.ndarray]]  # a picture [height, width, 3]
 
 @dataclass(frozen=True)
 class Cell:
-    """Pictures side by side, each with the part of it that is shown, and a note over them; without any, a blank."""
+    """Pictures side by side, each with the part of it that is shown, or None, and a note; without any, a blank."""
 
-    pictures: Sequence[tuple[np.ndarray, Window]] = ()
+    pictures: Sequence[tuple[np.ndarray, Window | None]] = ()
     note: str = ""
 
 
@@ -67,12 +67,7 @@ def arrays(folder: Path, names: Iterable[str]) -> tuple[Arrays, str]:
         return {}, f"images.npz lacks an array: {error.args[0]}"
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
         return {}, "images.npz cannot be read"
-    masks = {name for name in found if name.endswith("hit")}
-    shapes = {found[name].shape for name in masks}
-    shapes |= {array.shape[:-1] for name, array in found.items() if name.endswith(("normals", "colours"))}
-    if len(shapes) > 1 or any(0 in shape or len(shape) < 2 for shape in shapes):
-        return {}, "images.npz holds arrays of different sizes"
-    return {name: array.astype(bool if name in masks else float) for name, array in found.items()}, ""
+    return {name: array.astype(bool if name.endswith("hit") else float) for name, array in found.items()}, ""
 
 
 class Scene:
@@ -105,13 +100,7 @@ class Scene:
     def whole(self, records: Iterable[Record], name: str) -> Cell:
         """A whole picture that all runs of some records share, of another camera than the others."""
         known = next((self.arrays[r["folder"]] for r in records if r["folder"] in self.arrays), None)
-        return Cell() if known is None else Cell([whole(known[name])])
-
-
-def whole(picture: np.ndarray) -> tuple[np.ndarray, Window]:
-    """A picture all of which is shown."""
-    height, width = (length / max(picture.shape[:2]) for length in picture.shape[:2])
-    return picture, ((height - 1) / 2, (width - 1) / 2, 1.0)
+        return Cell() if known is None else Cell([(known[name], None)])
 
 
 def coloured(colours: np.ndarray, hit: np.ndarray) -> np.ndarray:
@@ -133,6 +122,27 @@ def normals(prefix: str = "") -> Paint:
 def colours(prefix: str = "") -> Paint:
     """Pictures of the colours of a shape."""
     return lambda found: [coloured(found[f"{prefix}colours"], found[f"{prefix}hit"])]
+
+
+def colours_above_normals(
+    scene: Scene,
+    title: str,
+    rows: Iterable[Row],
+    records: Sequence[Record],
+    first: tuple[str, str, Paint],
+    prefix: str = "",
+) -> Block:
+    """A block with the colours of each row and its normals below, of arrays with that prefix.
+
+    `first` is the heading of the column before them, its only line, "colours" or "normals", and its picture.
+    """
+    at = {row_of(record): record for record in records}
+    heading, line, paint = first
+    cells = {
+        name: [scene.shared(records, paint) if name == line else Cell(), *(scene.cell(at.get(row), of) for row in rows)]
+        for name, of in (("colours", colours(prefix)), ("normals", normals(prefix)))
+    }
+    return Block(title, [heading, *(row.name for row in rows)], cells)
 
 
 def depth(found: Arrays) -> Sequence[np.ndarray]:
@@ -285,10 +295,10 @@ def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
             axis.text(*where, cell.note, ha="center", va="center", fontsize=5, color=style.MISSED)
 
 
-def _show(axis: Axes, picture: np.ndarray, window: Window, place: tuple[float, float], inches: float) -> None:
-    """Draws a picture so that the part of it in the window fills the square at a place."""
-    (top, left, side), (x, y) = window, place
+def _show(axis: Axes, picture: np.ndarray, window: Window | None, place: tuple[float, float], inches: float) -> None:
+    """Draws a picture so that the part of it in the window fills the square at a place; all of it without a window."""
     height, width = (length / max(picture.shape[:2]) for length in picture.shape[:2])
+    (top, left, side), (x, y) = window or ((height - 1) / 2, (width - 1) / 2, 1.0), place
     edges = (x - left / side, x + (width - left) / side, y + (height - top) / side, y - top / side)
     # A large picture is averaged, so that single pixels stay visible; the pixels of others stay as they are.
     sharp = side * max(picture.shape[:2]) <= inches * style.RC["savefig.dpi"]

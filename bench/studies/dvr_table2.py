@@ -1,18 +1,15 @@
 """Table 2 and Figs. 6 to 8 of DVR, Fig. 19 of DIST: shape and colour from rendered photographs."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from bench.pictures import style
-from bench.report import gallery
+from bench.records.format import plural
 from bench.report.data.records import SCALE, Record, grouped, row_of, setting
-from bench.report.data.runs import Runs, Selection
 from bench.report.gallery import Arrays, Block, Cell, Scene, coloured
-from bench.report.medians import COST, best, draw_runs, medians, plural, scene_of, scored
-from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, thousandfold, to_data, to_table
+from bench.report.medians import COST, best, draw_runs, medians, scene_of, scored
+from bench.report.study import Result, Runs, Selection, gallery, style
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, thousandfold
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -85,8 +82,9 @@ def make(runs: Runs) -> Result:
         question="Which method finds shape and colour from photographs?",
         verdict=best(lines, "seen_chamfer_l1", "Chamfer-L1 × 1000 of what the photographs see", scenes, scale=SCALE),
         remarks=NOTES,
-        data=to_data(RUNS, runs.records),
-        table=to_table(COLUMNS, [*lines, *published]),
+        columns=COLUMNS,
+        lines=[*lines, *published],
+        run_columns=RUNS,
         figure=draw_runs(runs, panels),
     )
 
@@ -104,10 +102,12 @@ def _conditions(runs: Runs) -> str:
 
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, one row of those that look alike."""
-    rows = [row.name for row in runs.rows() if row.preset not in ALIKE] or [row.name for row in runs.rows()]
+    rows = [row for row in runs.rows() if row.preset not in ALIKE] or list(runs.rows())
     every = grouped(runs.records, scene_of)
-    shown = dict(list(every.items())[:SCENES])
-    scenes = {name: Scene(runs, [r for r in of if row_of(r).name in rows], ARRAYS) for name, of in shown.items()}
+    shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
+    scenes = {name: Scene(runs, of, ARRAYS) for name, of in shown.items()}
+    photograph = ("held out", "colours", lambda found: [found["photograph"]])
+    blocks = [gallery.colours_above_normals(scenes[name], name, rows, of, photograph) for name, of in shown.items()]
     return Result(
         runs,
         "Shapes from photographs in pictures.",
@@ -118,18 +118,9 @@ def figures(runs: Runs) -> Result:
             "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
             *gallery.missing(scenes.values()),
         ),
-        data=to_data(PICTURED, runs.records),
-        figure=gallery.draw([_block(name, rows, of, scenes[name]) for name, of in shown.items()]),
+        run_columns=PICTURED,
+        figure=gallery.draw(blocks),
     )
-
-
-def _block(name: str, rows: list[str], records: list[Record], scene: Scene) -> Block:
-    """The held-out photograph and the colours of each row, normals below."""
-    at = {row_of(record).name: record for record in records}
-    photograph = scene.shared(records, lambda found: [found["photograph"]])
-    colours = [scene.cell(at.get(row), gallery.colours()) for row in rows]
-    normals = [scene.cell(at.get(row), gallery.normals()) for row in rows]
-    return Block(name, ["held out", *rows], {"colours": [photograph, *colours], "normals": [Cell(), *normals]})
 
 
 def rerendering(runs: Runs) -> Result:
@@ -138,50 +129,56 @@ def rerendering(runs: Runs) -> Result:
     row = next((row for row in ended if row.preset == PRESET), ended[0])
     of_scene = grouped([record for record in runs.records if row_of(record) == row], scene_of)
     kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
-    made = {name: _line(record, runs.folder(record)) for name, record in kept.items()}
+    shown = replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept))
+    lines = {name: _line(runs, record) for name, record in kept.items()}
+    columns = max((list(pictures) for pictures, _ in lines.values()), key=len)
+    cells = {
+        name: list(pictures.values()) or [Cell(note=_status(kept[name]) or "no picture")]
+        for name, (pictures, _) in lines.items()
+    }
     return Result(
-        replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept)),
+        shown,
         "A reconstructed shape, rendered again.",
         f"The shape of {row.name}, of the first scenes, in several sizes, from other sides, and under other lights.",
         remarks=(
             "Shapes were learnt from photographs alone; the one shown was held out, sizes and lights are seen by its "
             "camera, and turns are about the vertical axis.",
             f"Lights: the learnt colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
-            *(f"No pictures of {name}: {why}." for name, (_, _, why) in made.items() if why),
+            *(f"No pictures of {name}: {why}." for name, (_, why) in lines.items() if why),
         ),
-        data=to_data(PICTURED, kept.values()),
-        figure=gallery.draw(
-            [Block("", max((c for c, _, _ in made.values()), key=len), {n: cells for n, (_, cells, _) in made.items()})]
-        ),
+        run_columns=PICTURED,
+        figure=gallery.draw([Block("", columns, cells)]),
     )
 
 
-def _line(record: Record, folder: Path) -> tuple[list[str], list[Cell], str]:
-    """The names of a line's columns, its cells, and why there are none."""
-    status = "" if record["status"] == "ok" else record["status"]
-    read = {
-        prefix: gallery.arrays(folder, [prefix + part for part in ("colours", "normals", "hit")])
-        for prefix in (*SIZES, *TURNED)
-    }
-    photograph, why = gallery.arrays(folder, ["photograph"])
-    why = next((said for _, said in read.values() if said), why)
-    if why:
-        return [], [Cell(note=status or "no picture")], why
-    last = SIZES[-1]
-    shown = {"photograph": (photograph["photograph"], read[last][0][f"{last}hit"])}
-    for prefix, (found, _) in read.items():
+def _line(runs: Runs, record: Record) -> tuple[dict[str, Cell], str]:
+    """The cells of a scene by the names of their columns, and why there are none."""
+    parts = ("colours", "normals", "hit")
+    prefixes = (*SIZES, *TURNED)
+    read = [gallery.arrays(runs.folder(record), ["photograph", *(each + part for part in parts)]) for each in prefixes]
+    if why := next((why for _, why in read if why), ""):
+        return {}, why
+    of = dict(zip(prefixes, (found for found, _ in read), strict=True))
+    last = of[SIZES[-1]]
+    hit = last[f"{SIZES[-1]}hit"]
+    shown = {"photograph": (last["photograph"], hit)}
+    for prefix, found in of.items():
         name = TURNED.get(prefix, f"{max(found[f'{prefix}hit'].shape)} pixels")
-        shown[name] = _lit(found, prefix)
-    shown |= {name: _lit(read[last][0], last, light) for name, light in LIGHTS.items()}
-    return [*shown], [Cell([(picture, style.window([hit]))], status) for picture, hit in shown.values()], ""
+        shown[name] = _lit(found, prefix), found[f"{prefix}hit"]
+    shown |= {name: (_lit(last, SIZES[-1], light), hit) for name, light in LIGHTS.items()}
+    return {name: Cell([(picture, style.window([hit]))], _status(record)) for name, (picture, hit) in shown.items()}, ""
 
 
-def _lit(found: Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The picture of a shape, as it is or under a light, and its hits."""
+def _status(record: Record) -> str:
+    return "" if record["status"] == "ok" else record["status"]
+
+
+def _lit(found: Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> np.ndarray:
+    """The picture of a shape, as it is or under a light."""
     colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
     if light is not None:
         colours = colours * (AMBIENT + (1 - AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)[..., None])
-    return coloured(colours, hit), hit
+    return coloured(colours, hit)
 
 
 PAGES = {"dvr_table2": make, "dvr_figures": figures, "rerendering": rerendering}

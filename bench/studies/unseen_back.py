@@ -2,24 +2,11 @@
 
 import math
 
-from bench.report import gallery
-from bench.report.data.records import Record, definitions, grouped, row_of
-from bench.report.data.runs import Runs, Selection
-from bench.report.gallery import Block, Cell, Scene
-from bench.report.medians import COST, medians, plural, scene_of
-from bench.report.write.result import Result
-from bench.report.write.table import (
-    FAMILY,
-    IDENTITY,
-    LOOP,
-    Column,
-    metrics,
-    percent,
-    text,
-    thousandfold,
-    to_data,
-    to_table,
-)
+from bench.records.format import plural
+from bench.report.data.records import definitions, grouped
+from bench.report.medians import COST, medians, scene_of
+from bench.report.study import Result, Runs, Selection, gallery
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, percent, text, thousandfold
 
 PLACE = 51
 READS = (Selection("unseen_back", setup=("scenes", "machine")),)
@@ -50,7 +37,12 @@ def make(runs: Runs) -> Result:
     """A line per row, and pictures from behind."""
     lines, every = medians(runs, NAMES), grouped(runs.records, scene_of)
     arrays = [BACK + part for part in ("truth", "colours", "normals", "hit")]
-    scenes = {name: Scene(runs, every[name], arrays) for name in list(every)[:SCENES]}
+    scenes = {name: gallery.Scene(runs, every[name], arrays) for name in list(every)[:SCENES]}
+    truth = ("truth", "normals", lambda found: [found[f"{BACK}truth"]])
+    blocks = [
+        gallery.colours_above_normals(scene, name, runs.rows(), every[name], truth, BACK)
+        for name, scene in scenes.items()
+    ]
     return Result(
         runs,
         "Photographs from one side, and the back that none shows.",
@@ -59,34 +51,23 @@ def make(runs: Runs) -> Result:
         question="What leaves bumps on the side that no photograph shows?",
         verdict=_verdict(lines, plural(len(every), "scene")),
         remarks=(*NOTES, *definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
-        data=to_data(RUNS, runs.records),
-        table=to_table(COLUMNS, lines),
-        figure=gallery.draw([_block(runs, name, every[name], scene) for name, scene in scenes.items()]),
+        columns=COLUMNS,
+        lines=lines,
+        run_columns=RUNS,
+        figure=gallery.draw(blocks),
     )
 
 
 def _verdict(lines: list[dict], n: str) -> str:
     """Rows whose unseen sides are no bumpier than the truth's, and the bumpiest one."""
     bumps = {line["method"]: line["unseen_roughness"] for line in lines if line["unseen_roughness"] is not None}
-    smooth, worst = (
-        [row for row, value in bumps.items() if value <= 0],
-        max(bumps, key=lambda row: bumps[row], default=""),
-    )
+    smooth = [row for row, value in bumps.items() if value <= 0]
+    worst = max(bumps, key=lambda row: bumps[row], default="")
     said = [f"no bumpier than the truth, by their medians: {'; '.join(smooth)}"] if smooth else []
     if worst and 0 < bumps[worst] < math.inf:
         said.append(f"the bumpiest, by *{bumps[worst]:.1f}°* more than the truth: {worst}")
     told = "; ".join([*said, f"n = {n}"])
     return f"{told[0].upper()}{told[1:]}." if said else ""
-
-
-def _block(runs: Runs, name: str, records: list[Record], scene: Scene) -> Block:
-    """The colours of each row from behind, and normals below, beside the true ones."""
-    rows, at = list(runs.rows()), {row_of(record): record for record in records}
-    colours = [scene.cell(at.get(row), gallery.colours(BACK)) for row in rows]
-    normals = [scene.cell(at.get(row), gallery.normals(BACK)) for row in rows]
-    truth = scene.shared(records, lambda found: [found[f"{BACK}truth"]])
-    names = ["truth", *(row.name for row in rows)]
-    return Block(name, names, {"colours": [Cell(), *colours], "normals": [truth, *normals]})
 
 
 PAGES = {"unseen_back": make}

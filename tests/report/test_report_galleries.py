@@ -5,7 +5,7 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.runs import choose
-from bench.report.gallery import Block, Cell, arrays, draw, whole
+from bench.report.gallery import Block, Cell, draw
 from bench.studies import dvr_table2, fig12, table2, table3
 from tests.report.test_report_paper import told, write_run
 
@@ -213,22 +213,13 @@ def test_a_picture_fills_its_cell_with_the_part_in_the_window_and_is_cut_there()
 
 
 def test_a_large_picture_is_averaged_so_that_single_pixels_stay_visible():
-    figure = draw([Block("", ["a", "b"], {"c": [Cell([whole(np.ones((size, size, 3)))]) for size in (16, 1024)]})])
+    figure = draw([Block("", ["a", "b"], {"c": [Cell([(np.ones((size, size, 3)), None)]) for size in (16, 1024)]})])
     assert [image.get_interpolation() for image in figure.axes[0].get_images()] == ["nearest", "auto"]
-
-
-@pytest.mark.parametrize("broken", [{"hit": (4, 5)}, {"normals": (4, 4)}, {"colours": (5, 4, 3)}, {"hit": (0, 0)}])
-def test_arrays_of_different_sizes_are_none(tmp_path, broken):
-    sizes = {"hit": (4, 4), "normals": (4, 4, 3), "colours": (4, 4, 3)}
-    np.savez(tmp_path / "images.npz", **{name: np.ones(size) for name, size in (sizes | broken).items()})
-    assert arrays(tmp_path, sizes) == ({}, "images.npz holds arrays of different sizes")
-    np.savez(tmp_path / "images.npz", **{name: np.ones(size) for name, size in sizes.items()})
-    assert set(arrays(tmp_path, sizes)[0]) == set(sizes)
 
 
 def test_names_of_narrow_columns_are_wrapped_and_stay_within_the_figure():
     names = ["DIST, paper's, 72 views, 180 iterations", *(f"row {number}" for number in range(10))]
-    rows = {"a name of a row that is long": [Cell([whole(np.ones((8, 8, 3)))])] * len(names)}
+    rows = {"a name of a row that is long": [Cell([(np.ones((8, 8, 3)), None)])] * len(names)}
     figure = draw([Block("car", names, rows)])
     figure.draw_without_rendering()
     axis = figure.axes[0]
