@@ -1,29 +1,16 @@
 """Fig. 6 of DIST in numbers: the success rate of camera pose over the initial error in rotation."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.data.records import Row, setting
-from bench.report.data.runs import Runs, Selection
+from bench.records.format import plural
+from bench.report.data.records import setting
 from bench.report.data.statistics import Interval, share
-from bench.report.medians import plural
-from bench.report.write import chart
-from bench.report.write.result import Result
-from bench.report.write.table import (
-    FAMILY,
-    IDENTITY,
-    LOOP,
-    Column,
-    configured,
-    counted,
-    metrics,
-    text,
-    to_data,
-    to_table,
-)
+from bench.report.study import Result, Runs, Selection, chart, format, style
+from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, counted, metrics, text
 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
@@ -46,8 +33,9 @@ RUNS = (
 
 def make(runs: Runs) -> Result:
     """A line per method: its success rate at each angle, and its costs."""
-    of_row = {row: _poses(runs, row) for row in runs.rows()}
-    angles = sorted({angle for found in of_row.values() for angle in found.degrees})
+    found = _poses(runs)
+    rows = dict(list(found.groupby(["row", "preset"], sort=False)))
+    angles = sorted(found.degrees.unique())
     settings = setting(runs.requested(), "task") or {}
     columns = [
         text("method", "Method"),
@@ -55,41 +43,38 @@ def make(runs: Runs) -> Result:
         Column("seconds", "Loop", show=format.seconds),
         Column("evaluations", "Evaluations", show=format.count),
     ]
-    lines = [{"method": row.name, **_costs(found), **_angles(found)} for row, found in of_row.items()]
     return Result(
         runs,
         "Camera pose from a depth image and a silhouette of a known shape.",
         PLOTTED.format(**settings),
         question="From how far off is the camera of a known shape found?",
-        verdict=_verdict(of_row, angles[-1]),
+        verdict=_verdict(found[found.degrees == angles[-1]], angles[-1]),
         interval="95 % intervals over shapes (Clopper and Pearson)",
-        estimates=[_rate(own) for found in of_row.values() for _, own in found.groupby("degrees")],
+        estimates=[_rate(own) for _, own in found.groupby(["row", "preset", "degrees"])],
         remarks=[note.format(**settings) for note in NOTES],
-        data=to_data(RUNS, runs.records),
-        table=to_table(columns, lines),
-        figure=draw(of_row, angles),
+        columns=columns,
+        lines=[_line(row, own) for (row, _), own in rows.items()],
+        run_columns=RUNS,
+        figure=draw(rows, angles),
     )
 
 
-def _poses(runs: Runs, row: Row) -> pd.DataFrame:
-    """The runs of a row: their angle, whether the pose was found, their shape and costs; a failed run found none."""
+def _poses(runs: Runs) -> pd.DataFrame:
+    """A line per run: row, shape, angle, whether the pose was found, and costs; a failed run found none."""
     ok = (runs.frame.status == "ok").to_numpy(bool)
-    found = runs.frame[["family", "solid"]].assign(
+    return runs.frame[["row", "preset", "family", "solid"]].assign(
         degrees=runs.number("config.task.degrees"),
         found=ok & (runs.number("success") == 1).to_numpy(),
         seconds=runs.frame.loop.where(ok),
         evaluations=runs.frame["values"].where(ok),
     )
-    return found[((runs.frame.row == row.name) & (runs.frame.preset == row.preset)).to_numpy()]
 
 
-def _costs(found: pd.DataFrame) -> dict[str, float | None]:
-    medians = {name: found[name].median() for name in ("seconds", "evaluations")}
-    return {name: None if np.isnan(value) else float(value) for name, value in medians.items()}
-
-
-def _angles(found: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    return {str(angle): own for angle, own in found.groupby("degrees")}
+def _line(row: str, own: pd.DataFrame) -> dict[str, Any]:
+    """The runs of a method by their angle, and its median costs, None where they are not known."""
+    medians = own[["seconds", "evaluations"]].median().astype(object)
+    costs = medians.where(medians.notna(), None).to_dict()
+    return {"method": row, **costs, **{str(angle): of_angle for angle, of_angle in own.groupby("degrees")}}
 
 
 def _rate(found: pd.DataFrame) -> Interval:
@@ -102,29 +87,25 @@ def _share(found: pd.DataFrame | None) -> str:
     return "" if found is None else counted(found.found.sum(), len(found), _rate(found))
 
 
-def _verdict(of_row: dict[Row, pd.DataFrame], angle: float) -> str:
+def _verdict(far: pd.DataFrame, angle: float) -> str:
     """The rows that find most and fewest cameras from the largest angle."""
-    far = {row.name: own[own.degrees == angle] for row, own in of_row.items() if (own.degrees == angle).any()}
-    most, least = (pick(far, key=lambda row: far[row].found.sum()) for pick in (max, min))
-    said = {row: f"{far[row].found.sum()} of {len(far[row])}" for row in (most, least)}
-    shapes = plural(len({*zip(far[most].family, far[most].solid, strict=True)}), "shape")
+    counts = far.groupby("row", sort=False).found.agg(["sum", "size"])
+    most, least = counts["sum"].idxmax(), counts["sum"].idxmin()
+    said = {row: f"{counts['sum'][row]} of {counts['size'][row]}" for row in (most, least)}
+    shapes = plural(len(far[far.row == most][["family", "solid"]].drop_duplicates()), "shape")
     return f"From {angle:g} degrees {most} finds *{said[most]}* cameras, {least} {said[least]}; n = {shapes}."
 
 
 @style.styled
-def draw(of_row: dict[Row, pd.DataFrame], angles: list[float]) -> Figure:
-    """Draws success over the initial angle, and over a method's median seconds."""
-    figure, ((left, right),) = chart.sheet(3.0, 1, 2, width_ratios=(1.6, 1))
-    for place, (row, found) in enumerate(of_row.items()):
+def draw(rows: dict[tuple[str, str], pd.DataFrame], angles: list[float]) -> Figure:
+    """Draws success over the initial angle."""
+    figure, ((axis,),) = chart.sheet(2.8)
+    for place, ((row, preset), found) in enumerate(rows.items()):
         rates = {angle: _rate(own).times(100) for angle, own in found.groupby("degrees")}
-        beside = np.array(list(rates)) + 0.5 * (place - len(of_row) / 2)  # so that bars do not overlap
-        chart.estimates(left, row.preset, beside, list(rates.values()), bars=True, label=row.name)
-        if (seconds := _costs(found)["seconds"]) is not None:
-            chart.points(right, row.preset, seconds, 100 * found.found.mean())
-    left.set(xlabel="initial error in rotation (degrees)", ylabel="poses found (%)", ylim=(-3, 103), xticks=angles)
-    right.set(xlabel="loop, median (seconds)", ylabel="poses found, all angles together (%)", ylim=(-3, 103))
-    style.log_axis(right, "x", [_costs(found)["seconds"] for found in of_row.values()])
-    style.legend_below(figure, left)
+        beside = np.array(list(rates)) + 0.5 * (place - len(rows) / 2)  # so that bars do not overlap
+        chart.estimates(axis, preset, beside, list(rates.values()), bars=True, label=row)
+    axis.set(xlabel="initial error in rotation (degrees)", ylabel="poses found (%)", ylim=(-3, 103), xticks=angles)
+    style.legend_below(figure, axis)
     return figure
 
 

@@ -1,20 +1,12 @@
 """Errors of gradients against central differences: at hits by the angle of the ray, and at the outline by the blur."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.data.records import Record, measured
-from bench.report.data.runs import Runs, Selection
-from bench.report.write import chart
-from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, text, to_data, to_table, whole
+from bench.report.study import Result, Runs, Selection, chart, format, style
+from bench.report.write.table import IDENTITY, Column, text, to_data, whole
 
 PLACE = 200
 READS = (Selection("gradients", alike=("dataset", "view", "prior", "task")),)
@@ -54,7 +46,7 @@ VISIBLE_NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per renderer and band, failed runs too."""
-    told = _by_band(runs)
+    told = _of_bands(runs, BANDS, NUMBERS)
     unseen = int((told.loc[told["band"].isin(ANGLES), ["code_median_error", "camera_median_error"]] == 0).sum().sum())
     return Result(
         runs,
@@ -68,8 +60,9 @@ def make(runs: Runs) -> Result:
             *NOTES,
             f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else "",
         ),
-        data=told.drop(columns="name"),
-        table=to_table(COLUMNS, _lines(told)),
+        columns=COLUMNS,
+        lines=_lines(told),
+        data=told.drop(columns=["name", "preset"]),
         figure=draw(told),
     )
 
@@ -85,38 +78,29 @@ def make_visibility(runs: Runs) -> Result:
         question="Does what comes into view have a gradient?",
         verdict=_verdict_visible(told),
         remarks=VISIBLE_NOTES,
-        data=told.drop(columns=["name", "preset"]),
-        table=to_table(COLUMNS_VISIBLE, _lines(told)),
+        columns=COLUMNS_VISIBLE,
+        lines=_lines(told),
+        data=told.drop(columns=["name", "preset", "band"]),
         figure=draw_visibility(told),
     )
 
 
-def _identity(runs: Runs) -> pd.DataFrame:
-    """A line per run, with its readable name, where it did not end ok with its status."""
-    data = to_data(IDENTITY, runs.records)
-    return data.assign(name=[record["name"] for record in runs.named()])
-
-
-def _by_band(runs: Runs) -> pd.DataFrame:
-    """A line per run and band."""
-    identity = _identity(runs)
-    bands = [{"band": band} | {name: runs.number(f"{band}.{name}") for name in NUMBERS} for band in BANDS]
-    return pd.concat([identity.assign(**band) for band in bands]).sort_index(kind="stable", ignore_index=True)
+def _of_bands(runs: Runs, bands: Iterable[str], names: Sequence[str]) -> pd.DataFrame:
+    """A line per run and band, with the run's preset and readable name."""
+    identity = to_data(IDENTITY, runs.records).assign(preset=list(runs.frame.preset), name=runs.names())
+    found = [identity.assign(band=band, **{name: runs.number(f"{band}.{name}") for name in names}) for band in bands]
+    return pd.concat(found).sort_index(kind="stable")
 
 
 def _by_blur(runs: Runs) -> pd.DataFrame:
     """A line per run and blur of which it has numbers, the least first; nan where a renderer has no blur."""
-    lines = [(place, blur) for place, record in enumerate(runs.records) for blur in _blurs(record)]
-    bands = [(runs.records[place], f"{OUTLINE}_{blur}" if blur else OUTLINE) for place, blur in lines]
-    identity = _identity(runs).assign(preset=list(runs.frame.preset)).iloc[[place for place, _ in lines]]
-    numbers = {name: [measured(record, f"{band}.{name}") for record, band in bands] for name in VISIBLE}
-    blurs = [float(blur) if blur else math.nan for _, blur in lines]
-    return identity.assign(blur=blurs, **numbers).astype(dict.fromkeys(VISIBLE, float)).reset_index(drop=True)
-
-
-def _blurs(record: Record) -> Iterator[str]:
-    keys = {key.partition(".")[0] for key in record["metrics"] if key.startswith(f"{OUTLINE}_")}
-    yield from sorted((key.removeprefix(f"{OUTLINE}_") for key in keys), key=float) or [""]
+    begin = f"{OUTLINE}_"
+    keys = {key.partition(".")[0].removeprefix(begin) for key in runs.frame if key.startswith(begin)}
+    data = _of_bands(runs, [*(begin + blur for blur in sorted(keys, key=float)), OUTLINE], [*VISIBLE])
+    data.insert(data.columns.get_loc("band"), "blur", pd.to_numeric(data["band"].str.removeprefix(begin), "coerce"))
+    blurred = data["blur"].notna() & data[[*VISIBLE]].notna().any(axis=1)
+    sharp = data["blur"].isna() & ~data.index.isin(data.index[blurred])
+    return data[blurred | sharp].reset_index(drop=True)
 
 
 def _lines(data: pd.DataFrame) -> list[dict]:
@@ -175,49 +159,30 @@ def draw(data: pd.DataFrame) -> Figure:
     axes[2].axvline(1.0, color="#555555", lw=0.8, ls=":")
     axes[2].set(title=OUTLINE, xlabel="cosine and scale (exact: 1)", ylim=(len(names) - 0.5, -0.5))
     status = dict(zip(data["name"], data["status"], strict=True))
-    axes[0].set_yticks(range(len(names)), [_titled(name, status[name]) for name in names])
-    style.legend_of(figure, style.labelled(axes[0], axes[2]), columns=5)
+    failed = {name: f"{name} ({status[name].replace('_', ' ')})" for name in names if status[name] != "ok"}
+    axes[0].set_yticks(range(len(names)), [failed.get(name, name) for name in names])
+    style.legend_below(figure, axes[0], axes[2], columns=5)
     return figure
 
 
 @style.styled
 def draw_visibility(data: pd.DataFrame) -> Figure:
-    """Draws the error and the noise over the blur, and the error over the cost; a line per renderer."""
-    figure, (axes,) = chart.sheet(2.8, 1, 3)
-    by_blur, noise, by_cost = axes
-    for name, rows in data.groupby("name", sort=False):
-        preset, status = rows[["preset", "status"]].iloc[0]
-        look = style.look(preset)
-        chart.line(by_cost, preset, *_known(rows, "values_per_ray", "image_error"), label=_titled(str(name), status))
-        for axis, metric in ((by_blur, "image_error"), (noise, "image_spread")):
-            chart.line(axis, preset, *_known(rows, "blur", metric))
-            for value in rows.loc[rows["blur"].isna(), metric].dropna():
-                axis.axhline(value, color=look.colour, ls=look.line, lw=0.8)
-    _dress(by_blur, "blur (scene units)", "relative error of the gradient")
-    _dress(noise, "blur (scene units)", "noise of one ray (relative)")
-    _dress(by_cost, "field values per ray", "relative error of the gradient")
-    style.legend_below(figure, by_cost, columns=4)
+    """Draws cosine and scale over the blur, a line per renderer; those without a blur are a range."""
+    figure, (axes,) = chart.sheet(2.8, 1, 2)
+    sharp = data[data["blur"].isna() & data["image_cosine"].notna()]
+    for axis, name in zip(axes, OF_IMAGE, strict=True):
+        if len(sharp):
+            label = f"without a blur ({sharp['name'].nunique()} renderers)"
+            axis.axhspan(sharp[name].min(), sharp[name].max(), color="#bbbbbb", alpha=0.6, label=label)
+        for (row, preset), own in data.groupby(["name", "preset"], sort=False):
+            if own["blur"].notna().any():
+                chart.line(axis, preset, style.finite(own["blur"]), style.finite(own[name]), label=row)
+        axis.axhline(1.0, color="#555555", lw=0.8, ls=":", label="exact")
+        ends = min(0, data[name].min()), 1.1 * max(1, data[name].max())
+        axis.set(xlabel="blur (scene units)", ylabel=VISIBLE[name].lower(), ylim=ends)
+        style.log_axis(axis, "x", data["blur"])
+    style.legend_below(figure, axes[0])
     return figure
-
-
-def _titled(name: str, status: str) -> str:
-    return name if status == "ok" else f"{name} ({status.replace('_', ' ')})"
-
-
-def _dress(axis: Axes, across: str, up: str) -> None:
-    axis.set(xlabel=across, ylabel=up)
-    if not any(np.size(line.get_xdata()) for line in axis.lines if line.get_marker() != "None"):
-        chart.say(axis, "no numbers", va="baseline", color="#777777")
-        return
-    style.log_axis(axis, "x", [x for line in axis.lines if line.get_marker() != "None" for x in line.get_xdata()])
-    style.log_axis(axis, "y", [y for line in axis.lines for y in line.get_ydata()])
-
-
-def _known(rows: pd.DataFrame, *names: str) -> list[list[float]]:
-    """The values of two columns, where both are finite and above 0, so that logarithmic axes can show them."""
-    some = rows[[*names]]
-    some = some[((some > 0) & np.isfinite(some)).all(axis=1)]
-    return [some[name].tolist() for name in names]
 
 
 def _cosine(value: float | None) -> str:

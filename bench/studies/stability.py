@@ -7,16 +7,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
 from bench.records.read import curve_lines
-from bench.report.data.records import Record, Row, measured, median_of_known, row_of, setting
-from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import clopper_pearson, rank
-from bench.report.write import chart
-from bench.report.write.chart import panel_data, series
-from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, defined, text, to_data, to_table
+from bench.report.study import Result, Runs, Selection, chart, format, records, style
+from bench.report.write.table import IDENTITY, Column, defined, text, to_data
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
@@ -48,6 +42,10 @@ CURVE_NOTES = (
     "A cell of the page's atlas opens the curves of its axis.",
 )
 CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
+NUMBERS = (
+    *("level", "breakdown", "breakdown_low", "breakdown_high", "trials", "grid_trials", "evaluations_per_ray"),
+    *(f"{end}_{name}" for end in ENDS for name in ("successes", "trials")),
+)
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COSTS = (
     *(text("row", "Renderer"), Column("axes"), Column("rank", "Mean rank", show=defined)),
@@ -61,8 +59,9 @@ def make(runs: Runs) -> Result:
     cells = cells_of(runs)
     axes, rows = axes_of(cells), list(cells["row"].unique())
     task, trials = runs.requested().get("task"), cells["trials"].sum()
-    about = {name: float(setting(task, "criteria", name) or math.nan) for name in CRITERIA}
-    about |= {"resolution": setting(task, "resolution"), "share": 100 * trials / max(cells["grid_trials"].sum(), 1)}
+    about = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
+    about["resolution"] = records.setting(task, "resolution")
+    about["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
     table = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
     table.insert(0, "Axis", [title(axis) for axis in axes.index])
     table.insert(1, "Unit", list(axes["unit"]))
@@ -94,6 +93,7 @@ def make_cost(runs: Runs) -> Result:
     ranks = rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
+    lines["behind"] = lines.groupby(["cost", "rank"]).cumcount()  # of points at one place
     return Result(
         runs,
         "Robustness over cost.",
@@ -102,8 +102,8 @@ def make_cost(runs: Runs) -> Result:
         verdict=_verdict_cost(lines, len(shades)),
         n=f"{len(shades)} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
-        data=lines[[column.key for column in COSTS]],
-        table=to_table(COSTS, lines.to_dict("records")),
+        columns=COSTS,
+        lines=lines.to_dict("records"),
         figure=draw_cost(lines),
         chart=_chart_cost(lines),
     )
@@ -122,8 +122,8 @@ def make_curves(runs: Runs) -> Result:
             told = [
                 f"{s.successes:.0f} of {s.trials:.0f} succeed at {format.number(s.severity)}" for s in own.itertuples()
             ]
-            lines.append(series(row, preset, own["severity"], 100 * own["share"], dash="-", size=5, text=told))
-        panels.append(panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
+            lines.append(chart.series(row, preset, own["severity"], 100 * own["share"], dash="-", size=5, text=told))
+        panels.append(chart.panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
     return Result(
         runs,
         "Probability of success over severity.",
@@ -142,8 +142,28 @@ def title(axis: str) -> str:
 
 
 def cells_of(runs: Runs) -> pd.DataFrame:
-    """A line per run: its axis and row, whether its search finished, its breakdown as a number, shade and words."""
-    return pd.DataFrame([_cell(record, row_of(record)) for record in runs.records])
+    """A line per run: its axis and row, whether its search finished, its breakdown as a number, shade and words.
+
+    A level is 0 at the mild end of the sweep and 1 at the severe one; the shade is the level clipped to these.
+    """
+    cells = runs.frame[["row", "preset"]].assign(
+        axis=runs.frame["dataset"].astype(object),
+        **{key: [record[key] for record in runs.records] for key in ("status", "reason", "folder")},
+        **{key: runs.setting(f"task.stress.{key}") for key in ("group", "measure")},
+        unit=runs.setting("task.stress.sweep.unit"),
+        one_trial=runs.setting("task.stress.repeats") == "1",
+        **{key: runs.number(key) for key in NUMBERS},
+    )
+    level = cells["level"]
+    known = cells["status"].eq("ok") & level.notna() & cells["unit"].ne("")
+    mild, severe = ((cells[f"{end}_successes"] / cells[f"{end}_trials"]).fillna(0) for end in ENDS)
+    cells = cells.assign(known=known, at_once=known & (level < 0), never=known & (level > 1))
+    cells = cells.assign(shade=level.clip(0, 1).where(known), rises=known & (severe > mild))
+    return cells.assign(
+        short=[_told(cell, "")[0] for cell in cells.itertuples()],
+        words=[_told(cell, "")[1] for cell in cells.itertuples()],
+        full=[_told(cell, f" {cell.unit}")[1] for cell in cells.itertuples()],
+    )
 
 
 def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
@@ -153,59 +173,31 @@ def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
     return axes.iloc[np.argsort([groups.index(group) for group in axes["group"]], kind="stable")]
 
 
-def _cell(record: Record, row: Row) -> dict[str, Any]:
-    """A level is 0 at the mild end of the sweep and 1 at the severe one; the shade is the level clipped to these."""
-    stress = setting(record["config"], "task", "stress")
-    level = measured(record, "level")
-    known = record["status"] == "ok" and level is not None and isinstance(setting(stress, "sweep"), dict)
-    cell = {"axis": record["dataset"], "row": row.name, "preset": row.preset, "known": known, "level": level}
-    cell |= {key: record[key] for key in ("status", "reason", "folder")}
-    cell |= {key: str(setting(stress, key)) for key in ("group", "measure")}
-    cell |= {"unit": str(setting(stress, "sweep", "unit")), "one_trial": setting(stress, "repeats") == 1}
-    cell |= {key: measured(record, key) or 0 for key in ("trials", "grid_trials")}
-    cell |= {"cost": measured(record, "evaluations_per_ray")}
-    cell |= {"at_once": known and level < 0, "never": known and level > 1}
-    cell |= {"shade": min(max(level, 0.0), 1.0) if known else math.nan}
-    breakdown = [measured(record, f"breakdown{end}") for end in ("", "_low", "_high")]
-    ends = {end: [int(measured(record, f"{end}_{n}") or 0) for n in ("successes", "trials")] for end in ENDS}
-    words = {name: _full(cell, breakdown, ends, unit) for name, unit in (("words", ""), ("full", f" {cell['unit']}"))}
-    return cell | {"short": _short(cell, breakdown[0], ends)} | words
+def _told(cell: Any, unit: str) -> tuple[str, str]:
+    """The breakdown in a few characters; and with its interval, or the failures at an end of the sweep."""
+    mild, severe = (_failures(cell, end) for end in ENDS)
+    low, high = ("" if math.isnan(end) else format.number(end) for end in (cell.breakdown_low, cell.breakdown_high))
+    if not cell.known:
+        return (format.MISSING if cell.status == "unsupported" else cell.status,) * 2
+    if cell.rises:
+        return "rises", f"success rises with severity (mild: {mild}; severe: {severe})"
+    if cell.at_once:
+        return "at once", f"at once ({mild}{f', up to {high}{unit}' if high else ''})"
+    if cell.never:
+        return "none", f"none ({severe}{f', from {low}{unit}' if low else ''})"
+    short = format.number(cell.breakdown)
+    interval = "one trial" if cell.one_trial else f"{low or 'beyond'} to {high or 'beyond'}"
+    return short, f"{short}{unit} ({interval})"
 
 
-def _short(cell: dict[str, Any], breakdown: float | None, ends: dict[str, list[int]]) -> str:
-    """The breakdown in a few characters."""
-    if not cell["known"]:
-        return format.MISSING if cell["status"] == "unsupported" else cell["status"]
-    mild, severe = (successes / trials if trials else 0.0 for successes, trials in ends.values())
-    if severe > mild:
-        return "rises"
-    return "at once" if cell["at_once"] else "none" if cell["never"] else format.number(breakdown)
-
-
-def _full(cell: dict[str, Any], breakdown: list[float | None], ends: dict[str, list[int]], unit: str) -> str:
-    """The breakdown in its unit with its interval, or the failures at an end of the sweep."""
-    short, (_, low, high) = _short(cell, breakdown[0], ends), breakdown
-    mild, severe = (_failures(*ends[end], one_trial=cell["one_trial"]) for end in ENDS)
-    if not cell["known"]:
-        return short
-    if short == "rises":
-        return f"success rises with severity (mild: {mild}; severe: {severe})"
-    if cell["at_once"]:
-        return f"at once ({mild}{'' if high is None else f', up to {format.number(high)}{unit}'})"
-    if cell["never"]:
-        return f"none ({severe}{'' if low is None else f', from {format.number(low)}{unit}'})"
-    if cell["one_trial"]:
-        return f"{short}{unit} (one trial)"
-    return f"{short}{unit} ({' to '.join('beyond' if end is None else format.number(end) for end in (low, high))})"
-
-
-def _failures(successes: int, trials: int, *, one_trial: bool) -> str:
-    """The number of failed trials; where there are repeats, the interval of their share."""
-    if not trials:
+def _failures(cell: Any, end: str) -> str:
+    """The number of failed trials at an end of the sweep; where there are repeats, the interval of their share."""
+    successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
+    if not trials > 0:
         return "not tried"
     rate = clopper_pearson(1 - successes / trials, trials)
-    share = "" if one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
-    return f"{trials - successes} of {trials} failed{share}"
+    share = "" if cell.one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
+    return f"{trials - successes:.0f} of {trials:.0f} failed{share}"
 
 
 def _grid(cells: pd.DataFrame, axes: pd.DataFrame, values: str) -> pd.DataFrame:
@@ -265,7 +257,7 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
     figure, ((panel,),) = chart.sheet(0.19 * n + 1.7, width=width)
     image = panel.imshow(np.ma.masked_invalid(shades.to_numpy(float)), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
     panel.set_facecolor("#f2f2f2")
-    for line, place in np.argwhere(words.notna().to_numpy()):
+    for line, place in np.argwhere((words.notna() & ~words.isin(["at once", "none"])).to_numpy()):
         told, shade = words.iloc[line, place], shades.iloc[line, place]
         how = {"color": "white" if shade < 0.1 or shade > 0.9 else "black", "fontsize": 5.5 if len(told) < 8 else 4.5}
         panel.text(place, line, told, ha="center", va="center", **how)
@@ -277,15 +269,15 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
     for line in np.flatnonzero(axes["group"].to_numpy()[1:] != axes["group"].to_numpy()[:-1]):
         panel.axhline(line + 0.5, color="#222222", lw=0.8)
     bar = figure.colorbar(image, ax=panel, location="bottom", shrink=0.5, aspect=40, pad=0.02)
-    bar.set_ticks([0, 1], labels=["breaks at the mildest", "not at the severest"])
+    bar.set_ticks([0, 1], labels=["at once: breaks at the mildest", "none: not at the severest"])
     return figure
 
 
 def _cost(cells: pd.DataFrame, row: str, mean: float) -> dict[str, Any]:
     """The line of a renderer on the shared axes; where it breaks at once it may be cheap but find nothing."""
-    cost = median_of_known(cells.loc[~cells["at_once"], "cost"].dropna())
     ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
-    return {"row": row, "axes": len(cells), "rank": mean, **ends, "cost": math.nan if cost is None else cost}
+    cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
+    return {"row": row, "axes": len(cells), "rank": mean, **ends, "cost": cost}
 
 
 def _verdict_cost(lines: pd.DataFrame, axes: int) -> str:
@@ -306,8 +298,8 @@ def _verdict_cost(lines: pd.DataFrame, axes: int) -> str:
 def draw_cost(lines: pd.DataFrame) -> Figure:
     """Draws the mean rank over the field values per ray; later ones of equal points are smaller: none is hidden."""
     figure, ((axes,),) = chart.sheet(max(3.2, 0.17 * len(lines)))
-    for line, before in zip(lines.itertuples(), lines.groupby(["cost", "rank"]).cumcount(), strict=True):
-        chart.points(axes, line.preset, line.cost, line.rank, label=line.row, ms=7 / (1 + 0.4 * before))
+    for line in lines.itertuples():
+        chart.points(axes, line.preset, line.cost, line.rank, label=line.row, ms=7 / (1 + 0.4 * line.behind))
     style.log_axis(axes, "x", lines["cost"])
     axes.set(xlabel=COST_AXES[0], ylabel=COST_AXES[1], ylim=(max(1.0, lines["rank"].max()) + 0.5, 0.5))
     figure.legend(loc="outside right upper")
@@ -316,16 +308,15 @@ def draw_cost(lines: pd.DataFrame) -> Figure:
 
 def _chart_cost(lines: pd.DataFrame) -> dict[str, Any]:
     points = [
-        series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * before))
-        for line, before in zip(lines.itertuples(), lines.groupby(["cost", "rank"]).cumcount(), strict=True)
-        if not math.isnan(line.cost + line.rank)
+        chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
+        for line in lines.dropna(subset=["cost", "rank"]).itertuples()
     ]
-    panel = panel_data("", *COST_AXES, points, height=420)
+    panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"]["reversed"] = True
     return {"panels": [panel]}
 
 
-def _shares(runs: Runs, record: Record, cell: dict[str, Any]) -> pd.DataFrame:
+def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:
     """Successes, trials, their share and its interval for each level that a finished search tried, mild to severe."""
     lines = curve_lines(runs.folder(record)) if cell["known"] else None
     tried = pd.DataFrame(lines or [], columns=["level", "severity", "success"])
