@@ -5,11 +5,9 @@ from typing import Any
 
 import pandas as pd
 
-from bench.records import format
 from bench.report.data.records import Record, measured, setting
-from bench.report.data.runs import Runs, Selection
-from bench.report.write.result import Result
-from bench.report.write.table import Column, shown, text, to_data, to_table, together, whole
+from bench.report.study import Result, Runs, Selection, format
+from bench.report.write.table import Column, shown, text, together, whole
 
 PLACE = 15
 BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.ablation
@@ -51,8 +49,8 @@ def make(runs: Runs) -> Result:
         question="Which renderer is fastest, timed in turn in one process?",
         verdict=_verdict(pd.DataFrame(lines)),
         remarks=NOTES,
-        data=to_data(COLUMNS, lines),
-        table=to_table(COLUMNS, lines),
+        columns=COLUMNS,
+        lines=lines,
     )
 
 
@@ -81,19 +79,18 @@ def _place(record: Record) -> tuple[int, int]:
 
 def _lines(record: Record) -> list[dict[str, Any]]:
     """A line per renderer of a run."""
-    names = dict.fromkeys(name.split(".")[0] for name in record["metrics"] if "." in name)
-    return [_line(record, name) for name in names or [BASE]]
-
-
-def _line(record: Record, name: str) -> dict[str, Any]:
-    keys = [key.removeprefix(f"{name}.") for key in record["metrics"] if key.startswith(f"{name}.")]
+    numbers: dict[str, dict[str, Any]] = {}
+    for key in record["metrics"]:
+        name, _, metric = key.rpartition(".")
+        if name:
+            numbers.setdefault(name, {})[metric] = measured(record, key)
     size, threads = _place(record)
-    return {
-        **{"size": size, "threads": threads, "rounds": record["metrics"].get("rounds")},
-        **{"renderer": record["renderer"] if name == BASE else name, "first": name == BASE},
-        **{key: record[key] for key in ("status", "reason", "folder")},
-        **{key: measured(record, f"{name}.{key}") for key in keys},
-    }
+    about = {"size": size, "threads": threads, "rounds": record["metrics"].get("rounds")}
+    about |= {key: record[key] for key in ("status", "reason", "folder")}
+    return [
+        {**about, "renderer": record["renderer"] if name == BASE else name, "first": name == BASE, **own}
+        for name, own in (numbers or {BASE: {}}).items()
+    ]
 
 
 def _ratio(cost: str) -> Column:

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-from bench.report import gallery
+from bench.records.format import plural
 from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, middle, run_columns
 from bench.report.data.records import ONE_WAY, SCALE, Record, error, family, grouped, row_of, setting, solid
-from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import share
 from bench.report.gallery import FOUND, SHAPES, START, TRUE, Block, Scene
-from bench.report.medians import plural
-from bench.report.write.result import Result
-from bench.report.write.table import counted, text, to_data, to_table
+from bench.report.study import Result, Runs, Selection, gallery
+from bench.report.write.table import counted, shown
 
 PLACE = 55
 CONDITIONS = (
@@ -58,8 +56,9 @@ def make(runs: Runs) -> Result:
         interval=INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        data=to_data(RUNS, runs.records),
-        table=to_table((*NAMED, text("", "Success", lambda line: _successes(line["runs"])), *MEDIAN), lines + others),
+        columns=(*NAMED, shown("Success", lambda line: _successes(line["runs"])), *MEDIAN),
+        lines=lines + others,
+        run_columns=RUNS,
         figure=draw(lines, CONDITIONS, success=SUCCESS) if lines else None,
     )
 
@@ -84,10 +83,10 @@ def _verdict(runs: Runs) -> str:
 
 def pictures(runs: Runs) -> Result:
     """A block per family: the start over the displacement, and what each row found below it."""
-    shown = gallery.first_shapes(runs, 1)
-    scenes = {name: Scene(shown, records, SHAPES) for name, records in shown.families().items()}
+    first = gallery.first_shapes(runs, 1)
+    scenes = {name: Scene(first, records, SHAPES) for name, records in first.families().items()}
     return Result(
-        shown,
+        first,
         "Shapes from many views, misplaced at the start, in pictures.",
         "The shape with the least number of each family: where it began, and what each row found, over the "
         "displacement.",
@@ -98,8 +97,8 @@ def pictures(runs: Runs) -> Result:
             "DIST, Fig. 24, shows photographs of real chairs, and what PMO makes of them; these shapes are synthetic.",
             *gallery.missing(scenes.values()),
         ),
-        data=to_data(RUNS, shown.records),
-        figure=gallery.draw([_block(name, own, scenes[name]) for name, own in shown.families().items()]),
+        run_columns=RUNS,
+        figure=gallery.draw([_block(name, own, scenes[name]) for name, own in first.families().items()]),
     )
 
 

@@ -1,8 +1,6 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
-from bench.report import gallery
-from bench.report.data.runs import Runs, Selection
-from bench.report.write.result import Result
+from bench.report.study import Result, Runs, Selection, gallery
 from bench.report.write.table import IDENTITY, Column, metric, through, to_data
 
 PLACE = 210

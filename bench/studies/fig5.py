@@ -3,18 +3,14 @@
 import math
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.data import curves
 from bench.report.data.records import SCALE, Row, setting
-from bench.report.data.runs import Runs, Selection, shared_loss
-from bench.report.write import chart
-from bench.report.write.chart import panel_data, series
-from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, Column, text, thousandfold, to_data, to_table, whole
+from bench.report.data.runs import shared_loss
+from bench.report.study import Result, Runs, Selection, chart, curves, format, style
+from bench.report.write.table import IDENTITY, Column, text, thousandfold, to_data, whole
 
 PLACE = 220
 READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
@@ -46,7 +42,9 @@ def make(runs: Runs) -> Result:
         medians[row] = {name: curves.median(own, failed, name) for name in QUANTITIES}
         points = pd.concat(own, ignore_index=True).dropna(subset=[*QUANTITIES])
         correlation = {"spearman": curves.spearman(points, *QUANTITIES), "n": len(points)}
-        lines.append({"row": row.name, "runs": len(records), **_end(medians[row]["chamfer_l2"]), **correlation})
+        seconds = medians[row]["chamfer_l2"]["seconds"]
+        about = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
+        lines.append({**about, **_end(own, failed), **correlation})
     return Result(
         runs,
         "Loss and Chamfer distance as shapes are completed.",
@@ -55,22 +53,27 @@ def make(runs: Runs) -> Result:
         verdict=_verdict(lines),
         remarks=(*unread, _loss(runs), *NOTES),
         data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
-        table=to_table(COLUMNS, lines),
+        columns=COLUMNS,
+        lines=lines,
         figure=draw(medians),
         chart={"panels": [_panel(medians, name) for name in QUANTITIES]},
     )
 
 
-def _end(medians: pd.DataFrame) -> dict[str, Any]:
-    if medians.empty:
-        return {}
-    last = medians.iloc[-1]
-    return {"end": last["median"], "low": last["low"], "high": last["high"], "seconds": last["seconds"]}
+def _end(own: list[pd.DataFrame], failed: list[bool]) -> dict[str, Any]:
+    """The errors at the end of a row's runs, infinite of failed ones; nothing where one is not known."""
+    ends = []
+    for curve, lost in zip(own, failed, strict=True):
+        known = curve["chamfer_l2"].dropna()
+        if known.empty and not lost:
+            return {}
+        ends.append(math.inf if lost else known.iloc[-1])
+    return {"end": float(np.median(ends)), "low": min(ends), "high": max(ends)}
 
 
 def _verdict(lines: list[dict[str, Any]]) -> str:
     known = sorted((line for line in lines if "end" in line), key=lambda line: line["end"])
-    if not known:
+    if not known or not math.isfinite(known[0]["end"]):
         return ""
     best, last = known[0], known[-1]
     return (
@@ -111,10 +114,10 @@ def draw(medians: dict[Row, Medians]) -> Figure:
 def _panel(medians: dict[Row, Medians], name: str) -> dict[str, Any]:
     label, scale = QUANTITIES[name]
     lines = [
-        series(row.name, row.preset, own[name]["seconds"], scale * own[name]["median"], dash="-", symbol="")
+        chart.series(row.name, row.preset, own[name]["seconds"], scale * own[name]["median"], dash="-", symbol="")
         for row, own in medians.items()
     ]
-    return panel_data("", "time in the loop (seconds)", label.partition(" (")[0], lines)
+    return chart.panel_data("", "time in the loop (seconds)", label.partition(" (")[0], lines)
 
 
 def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:

@@ -1,16 +1,12 @@
 """Table 1 of DIST: the cost of each strategy of sphere tracing, measured and published."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pandas as pd
 
-from bench.records import format
 from bench.report.data.records import Record, measured, repeated, row_of, setting
-from bench.report.data.runs import Runs, Selection
-from bench.report.write.result import Result
-from bench.report.write.table import IDENTITY, configured, shown, to_data, to_table, together, whole
+from bench.report.study import Result, Runs, Selection, format
+from bench.report.write.table import IDENTITY, configured, metric, shown, text, to_data, together, whole
 
 PLACE = 10
 READS = (Selection("table1", alike=("dataset", "view", "prior", "task")),)
@@ -61,7 +57,8 @@ def make(runs: Runs) -> Result:
         verdict=_verdict(data),
         remarks=NOTES,
         data=data,
-        table=to_table(COLUMNS, runs.named()),
+        columns=COLUMNS,
+        lines=runs.named(),
     )
 
 
@@ -116,27 +113,22 @@ def _step(record: Record) -> str:
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
 
 
-def _metric(name: str, show: Callable[[Any], str]) -> Callable[[Record], str]:
-    """The text of a metric at the largest size that was finished."""
-    return lambda record: show(measured(record, name))
+def _published(record: Record, part: int) -> str:
+    return str(PUBLISHED.get(row_of(record).preset, ("",) * 4)[part])
 
 
-def _published(part: int) -> Callable[[Record], str]:
-    return lambda record: str(PUBLISHED.get(row_of(record).preset, ("",) * 4)[part])
-
-
-COLUMNS = (  # of a record, for readers
-    shown("Strategy", lambda record: record["name"]),
-    *(shown("Size", _size), configured("", "renderer", "steps", heading="Steps")),
+COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
+    *(text("name", "Strategy"), shown("Size", _size), configured("", "renderer", "steps", heading="Steps")),
     shown("Queries", lambda r: format.queries(measured(r, "queries"), measured(r, "coarse_queries"))),
-    shown("Forward", _metric("forward_seconds", format.seconds)),
-    shown("Backward", _metric("backward_seconds", format.seconds)),
+    metric("forward_seconds", "Forward", format.seconds),
+    metric("backward_seconds", "Backward", format.seconds),
     shown("Step", _step),
-    shown("Peak memory", _metric("peak_memory_bytes", format.size)),
-    shown("Hits", _metric("hits", whole)),
+    metric("peak_memory_bytes", "Peak memory", format.size),
+    metric("hits", "Hits", whole),
     shown("Missed / spurious / wrong depth", together(measured, whole, "lost", "false", "wrong")),
     shown("Depth error median / max", together(measured, format.number, "depth_error_median", "depth_error_max")),
-    *(shown("Published queries", _published(2)), shown("Published time", _published(3))),
+    shown("Published queries", lambda record: _published(record, 2)),
+    shown("Published time", lambda record: _published(record, 3)),
 )
 
 PAGES = {"table1": make}

@@ -148,13 +148,6 @@ def test_photographs_without_masks_have_no_overlap(tmp_path):
     assert line[["PSNR (dB)", "Mask IoU", "least"]].tolist() == ["20.0", "–", "–"]
 
 
-def test_a_failed_run_is_worst_in_every_score_of_photographs(tmp_path):
-    photographed(tmp_path, NEWTON, PHOTO_SCORES)
-    photographed(tmp_path, IDR, PHOTO_SCORES, status="diverged")
-    line = line_of(photos.make(chosen(tmp_path, photos)), IDR)
-    assert line[["PSNR (dB)", "SSIM", "Mask IoU", "least"]].tolist() == ["0"] * 4
-
-
 def images(folder, colour, size=8, **left_out):
     """Pictures of a square in one colour, whose photograph is grey."""
     hit = np.zeros((size, size), dtype=bool)
