@@ -58,7 +58,7 @@ def test_a_strip_alone_is_the_default(inputs, tmp_path):
         assert strip.width < 1.35 * 110 * (MOST + 1)
 
 
-@pytest.mark.parametrize("own", [1, 9, 3 * MOST - 2, 0])
+@pytest.mark.parametrize("own", [0, 1])
 def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, monkeypatch, own):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
@@ -99,8 +99,7 @@ def drawn_strip(inputs, tmp_path, monkeypatch, true: Shown) -> Figure:
     return drawn[0]
 
 
-@pytest.mark.parametrize("size", [(16, 16), (10, 20), (24, 15)])
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
 def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, monkeypatch, size, masked):
     figure = drawn_strip(inputs, tmp_path, monkeypatch, photograph(*size, masked=masked))
     axis = figure.axes[0]

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 import trimesh
+from matplotlib.figure import Figure
 
 from bench.config import load
-from bench.pictures.run_figures import save_gallery
+from bench.pictures.run_figures import ViewPair, _show_depth, save_gallery
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
@@ -48,6 +49,14 @@ def test_shapes_are_seen_by_two_cameras_and_depths_where_they_are_given(tmp_path
     assert 0 < found["found_hit"][0].sum() < 0.6 * front.sum()  # the smaller ball
     assert (found["found_normals"][1][found["found_hit"][1]][:, 2] < 0).mean() > 0.5  # its inside, from behind
     assert not found["start_hit"].any()
+
+
+def test_depths_are_coloured_from_the_nearest_to_the_farthest():
+    view = see(Truth(half_ball(0.6), closed=False), CAMERA)
+    pair = ViewPair("truth", view, view)
+    image = _show_depth(Figure().subplots(), pair, (pair,))
+    known = view.depth[view.mask]
+    assert image.get_clim() == (known.min(), known.max()) and known.min() < known.max()
 
 
 def test_a_run_writes_them_where_they_are_asked_for(isolated, tmp_path):
