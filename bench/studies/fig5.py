@@ -56,7 +56,6 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=lines,
         figure=draw(medians),
-        chart={"panels": [_panel(medians, name) for name in QUANTITIES]},
     )
 
 
@@ -109,15 +108,6 @@ def draw(medians: dict[Row, Medians]) -> Figure:
             style.log_axis(line[1], "x", pd.concat([own[name]["seconds"] for own in medians.values()]))
     style.legend_below(figure, axes[0, 0])
     return figure
-
-
-def _panel(medians: dict[Row, Medians], name: str) -> dict[str, Any]:
-    label, scale = QUANTITIES[name]
-    lines = [
-        chart.series(row.name, row.preset, own[name]["seconds"], scale * own[name]["median"], dash="-", symbol="")
-        for row, own in medians.items()
-    ]
-    return chart.panel_data("", "time in the loop (seconds)", label.partition(" (")[0], lines)
 
 
 def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:
