@@ -158,6 +158,7 @@ def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
     blurred = seen("1e-03", 0.3) | seen("3e-02", 0.2)
     own = {key.replace("_1e-03", ""): value for key, value in seen("1e-03", 0.9).items()}
     write_run(tmp_path, "gradients", None, metrics=bands() | own, renderer="idr")
+    write_run(tmp_path, "gradients", None, metrics=bands() | own | {"silhouette.image_cosine": 0.5}, renderer="dvr")
     write_run(tmp_path, "gradients", None, metrics=bands() | own | blurred, renderer="neus")
     write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
     page = made(tmp_path, "gradients", "gradients_visibility")
@@ -168,7 +169,9 @@ def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
     assert rows.loc["naive", "status"] == "oom"
     cosine, scale = page.figure.axes
     assert drawn(cosine, "neus") == [0.9, 0.9] and drawn(scale, "neus", "x") == [0.001, 0.03]
-    assert [patch.get_label() for patch in scale.patches] == ["without a blur (1 renderers)"]
+    (sharp,) = cosine.patches
+    assert sharp.get_label() == "without a blur (2 renderers)"
+    assert [sharp.get_y(), sharp.get_y() + sharp.get_height()] == pytest.approx([0.5, 0.9])
     assert page.verdict.startswith("neus has a cosine of *0.90* and a scale of 1.10 at a blur of 0.001 scene units; ")
 
 
