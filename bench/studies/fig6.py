@@ -71,9 +71,8 @@ def _poses(runs: Runs) -> pd.DataFrame:
 
 
 def _line(row: str, own: pd.DataFrame) -> dict[str, Any]:
-    """The runs of a method by their angle, and its median costs, None where they are not known."""
-    medians = own[["seconds", "evaluations"]].median().astype(object)
-    costs = medians.where(medians.notna(), None).to_dict()
+    """The runs of a method by their angle, and its median costs."""
+    costs = own[["seconds", "evaluations"]].median()
     return {"method": row, **costs, **{str(angle): of_angle for angle, of_angle in own.groupby("degrees")}}
 
 

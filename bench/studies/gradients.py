@@ -61,7 +61,7 @@ def make(runs: Runs) -> Result:
             f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else "",
         ),
         columns=COLUMNS,
-        lines=_lines(told),
+        lines=told.to_dict("records"),
         data=told.drop(columns=["name", "preset"]),
         figure=draw(told),
     )
@@ -79,7 +79,7 @@ def make_visibility(runs: Runs) -> Result:
         verdict=_verdict_visible(told),
         remarks=VISIBLE_NOTES,
         columns=COLUMNS_VISIBLE,
-        lines=_lines(told),
+        lines=told.to_dict("records"),
         data=told.drop(columns=["name", "preset", "band"]),
         figure=draw_visibility(told),
     )
@@ -101,11 +101,6 @@ def _by_blur(runs: Runs) -> pd.DataFrame:
     blurred = data["blur"].notna() & data[[*VISIBLE]].notna().any(axis=1)
     sharp = data["blur"].isna() & ~data.index.isin(data.index[blurred])
     return data[blurred | sharp].reset_index(drop=True)
-
-
-def _lines(data: pd.DataFrame) -> list[dict]:
-    """The lines of a table, None where a number is missing."""
-    return data.astype(object).where(data.notna(), None).to_dict("records")
 
 
 def _verdict(data: pd.DataFrame) -> str:

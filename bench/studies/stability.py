@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from bench.records.read import curve_lines
 from bench.report.data.statistics import clopper_pearson, rank
 from bench.report.study import Result, Runs, Selection, chart, format, records, style
-from bench.report.write.table import IDENTITY, Column, defined, text, to_data
+from bench.report.write.table import IDENTITY, Column, text, to_data
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
@@ -48,7 +48,7 @@ NUMBERS = (
 )
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COSTS = (
-    *(text("row", "Renderer"), Column("axes"), Column("rank", "Mean rank", show=defined)),
+    *(text("row", "Renderer"), Column("axes"), Column("rank", "Mean rank")),
     *(text("at_once", "At once"), text("never", "None"), Column("cost", "Field values per ray"), text("preset")),
 )
 

@@ -64,8 +64,11 @@ class Column:
         return line.get(self.key) if self.value is None else self.value(line)
 
     def text(self, line: Any) -> str:
-        """The text of a line for readers."""
-        return self.show(self.of(line)) if self.words is None else self.words(line)
+        """The text of a line for readers; what is not a number is missing."""
+        if self.words is not None:
+            return self.words(line)
+        value = self.of(line)
+        return self.show(None if isinstance(value, float) and math.isnan(value) else value)
 
 
 def to_data(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
