@@ -72,7 +72,7 @@ def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = No
         raise ValueError(f"path: must be one mesh file, found the folder '{path}'; list it with find_meshes")
     (path,) = find_meshes(path)
     try:
-        return repair(_read(path), close)
+        return repair(read_mesh(path), close)
     except ValueError as error:
         raise BadInput(f"mesh file '{path}': {error}") from None
 
@@ -162,8 +162,12 @@ def _check_rows(counts: dict[str, int], rows: list[str], properties: list[str]) 
         raise Truncated(f"its header claims {claims}, and it holds {len(rows)} of these {wanted} rows")
 
 
-def _read(path: Path) -> Mesh:
-    """Reads all triangles of a file, placed by its scene's transforms."""
+def read_mesh(path: Path) -> Mesh:
+    """All triangles of a file, open or closed, placed by its scene's transforms; `repairs` are doubts about the file.
+
+    Raises:
+        ValueError: for a file that is empty, truncated or broken, or holds no surface.
+    """
     import trimesh
 
     if path.stat().st_size == 0:
