@@ -1,22 +1,23 @@
 """The typed top level of a run's configuration, and the one place where a YAML node becomes an object."""
 
 import dataclasses
+import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
+from importlib import import_module
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any, cast, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.hints import nearest
-from bench.rows import LABEL, ROWS, register_resolvers
 from bench.tables import CONF as CONF
-from bench.tables import LOOK, choice, names, register_rows
-from bench.targets import LEAVE, find_class
+from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers, register_rows
 from datasets.dataset import SPLIT_STRIDE, Split
 
 LEAST = {
@@ -32,7 +33,18 @@ LEAST = {
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
-RESERVED = ("_target_", LEAVE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
+OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may always name
+PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
+RESERVED = ("_target_", PACKAGE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
+ROLES = {  # what the class of a node of the top level must be
+    "task": "bench.tasks.task.Task",
+    "renderer": "renderers.rendering.Renderer",
+    "dataset": "datasets.dataset.Dataset",
+    "silhouette": "renderers.silhouette.SilhouetteLoss",
+    "tracker": "bench.trackers.Tracker",
+    "supervision": "bench.single_view.training.Supervision",
+}
+WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 
 class Device(StrEnum):
@@ -145,7 +157,7 @@ def check_label(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
 def check_draw(config: DictConfig) -> None:
     """Raises ValueError where a draw is set that no value asks for; the configuration is not resolved yet."""
     if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
-        raise ValueError("draw is read by a method of method/space alone: add +method=space/NAME, or leave draw out")
+        raise ValueError("only a method of method/space reads draw: add +method=space/NAME, or remove draw")
 
 
 def check_names(config: Mapping[str, Any]) -> None:
@@ -162,8 +174,7 @@ def check_names(config: Mapping[str, Any]) -> None:
         *(task.get("supervision") or {}).get("losses", {}),
     }:
         raise ValueError(
-            "silhouette is read by task=completion, pose, capacity, stability, reconstruction and single_view alone: "
-            "leave it out"
+            "only task=completion, pose, capacity, stability, reconstruction and single_view read silhouette: remove it"
         )
 
 
@@ -179,11 +190,9 @@ def check_top_level(config: Mapping[str, Any]) -> None:
     if evaluation["film"] not in (None, "gif", "webp"):
         raise ValueError(f"evaluation.film must be gif, webp or null, not {evaluation['film']!r}")
     if not config["results_dir"].strip():
-        raise ValueError(
-            "results_dir must name a folder, and is empty: type results_dir=results/local, or leave it out"
-        )
+        raise ValueError("results_dir must name a folder, and is empty: type results_dir=results/local, or remove it")
     if config["stress"] is not None and "stress" not in config["task"]:
-        raise ValueError("stress is read by task=stability alone: leave it out, or set task=stability")
+        raise ValueError("only task=stability reads stress: remove it, or set task=stability")
     if evaluation["film"] is not None and evaluation["picture"] is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
     if config["index"] >= SPLIT_STRIDE:
@@ -206,13 +215,13 @@ def build(
 
     Args:
         node: the node. Of the renderer, its key `_package_` names one more package that its `_target_` may name.
-        name: what it is called in the configuration, for errors, and for what its class must be; see `bench.targets`.
-        packages: packages of the user's that a `_target_` may name, beside ours.
+        name: what it is called in the configuration, for errors, and for what its class must be; see `ROLES`.
+        packages: packages of the user's that a `_target_` may name, besides ours.
         target: the class of a node that has no `_target_`; that of one that has must be this class or extend it.
         role: what the class must be, where the name does not say it.
 
     Raises:
-        ValueError: for an unknown package, a class that may not be used, an unknown key or a value of the wrong type.
+        ValueError: for an unknown package, a class of another kind, an unknown key or a value of the wrong type.
     """
     if isinstance(node, DictConfig):
         node = cast(dict[Any, Any], OmegaConf.to_container(node, resolve=True, throw_on_missing=False))
@@ -223,14 +232,88 @@ def build(
             raise ValueError(
                 f"{name}.{key} must be given: set {name}.{key}={'PACKAGE.CLASS' if key[0] == '_' else '...'}"
             )
-    leave = [str(node[LEAVE])] if name == "renderer" and LEAVE in node else []
-    cls = find_class(node.get("_target_", target), name, [*packages, *leave], role)
+    own = [str(node[PACKAGE])] if name == "renderer" and PACKAGE in node else []
+    cls = find_class(node.get("_target_", target), name, [*packages, *own], role)
     arguments = {str(key): value for key, value in node.items() if key not in RESERVED}
     names = _argument_names(cls)
     for key in arguments:
         if names is not None and key not in names:
             raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
     return _typed(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
+
+
+def find_class(path: Any, name: str, packages: Sequence[str], role: type | None) -> type:
+    """The class at a dotted path; nothing is imported of a package that is not ours and not named by the user.
+
+    Args:
+        path: PACKAGE.CLASS, or PACKAGE.MODULE.CLASS.
+        name: of the node, for errors.
+        packages: that may be imported besides ours.
+        role: a Protocol whose methods the class must have, or a class that it must be or extend; None asks for that of
+            the node's name, see `ROLES`.
+
+    Raises:
+        ValueError: where the package is not allowed, or no such class is there.
+    """
+    module, _, last = str(path).rpartition(".")
+    if (package := module.partition(".")[0]) not in (*OURS, *packages):
+        remedy = f"type packages=[{package}] if you trust it" if package else "it must be PACKAGE.CLASS"
+        raise ValueError(f"{name}._target_ names {path!r}: {remedy}")
+    try:
+        cls = getattr(import_module(module), last)
+    except Exception as error:  # of the user's module, whatever it does
+        raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}") from error
+    if not isinstance(cls, type):
+        raise ValueError(f"{name}._target_ names {path!r}, which is no class: name the class of a component")
+    if role is None and name in ROLES:
+        role = find_class(ROLES[name], name, (), object)
+    if role is not None and (lacks := _lacking(cls, role)):
+        raise ValueError(f"{name}._target_ names {path!r}, which is no {role.__name__}: {lacks}")
+    return cls
+
+
+def _lacking(cls: type, role: type) -> str:
+    """What a class lacks of a role, in words; empty where it has all of it. Data may be set when it is made."""
+    if not getattr(role, "_is_protocol", False):
+        return "" if issubclass(cls, role) else f"name a class that extends {_path(role)}"
+    protocols = [base for base in role.__mro__ if getattr(base, "_is_protocol", False) and base is not Protocol]
+    methods = {name for base in protocols for name, value in vars(base).items() if callable(value)}
+    public = sorted(name for name in methods if not name.startswith("_") or name == "__call__")
+    own = {name for base in cls.__mro__ if base is not object for name, value in vars(base).items() if callable(value)}
+    missing = [name for name in public if name not in own]
+    return f"it lacks {', '.join(missing)}: see {role.__module__}" if missing else ""
+
+
+def is_foreign(node: Any) -> bool:
+    """Whether a configuration, or a part of it, names a class of a package that is not ours."""
+    if isinstance(node, list):
+        return any(map(is_foreign, node))
+    if not isinstance(node, Mapping):
+        return False
+    return str(node.get("_target_", OURS[0])).split(".")[0] not in OURS or any(map(is_foreign, node.values()))
+
+
+def build_once(
+    nodes: Mapping[str, Any], packages: Sequence[str], targets: Mapping[str, str], built: dict[str, Any]
+) -> list[Any]:
+    """The objects of nodes by name, as `build` makes them; equal nodes are built once.
+
+    Args:
+        nodes: the nodes.
+        packages: that a `_target_` may name, besides ours.
+        targets: classes of nodes without a `_target_`, by name.
+        built: objects and errors by the text of their nodes, which is extended.
+    """
+    texts = {name: json.dumps([name, packages, node], sort_keys=True, default=str) for name, node in nodes.items()}
+    for name, text in texts.items():
+        if text not in built:
+            try:
+                built[text] = build(nodes[name], name, packages, targets.get(name, ""))
+            except ValueError as error:
+                built[text] = error
+        if isinstance(built[text], ValueError):
+            raise built[text]
+    return [built[text] for text in texts.values()]
 
 
 def _argument_names(cls: type) -> list[str] | None:
@@ -283,12 +366,8 @@ def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[s
     try:
         flat = OmegaConf.merge(schema, given)
     except OmegaConfBaseException as error:
-        key = str(error.full_key).split(".")[0]
-        wanted = types.get(key, "")
-        if get_args(wanted)[1:] == (...,) and isinstance(arguments[key], str | int | float):
-            raise ValueError(f"{name}.{key} must be a list: write {name}.{key}=[{arguments[key]}]") from None
-        text = str(error).splitlines()[0]
-        raise ValueError(f"{name}.{error.full_key}: {text} (expected {_type_name(wanted)})") from None
+        key = re.split(r"[.\[]", str(error.full_key))[0]
+        raise ValueError(wrong_type(f"{name}.{error.full_key}", arguments[key], types[key])) from None
     values: Any = OmegaConf.to_container(flat)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
     values |= {
@@ -317,5 +396,27 @@ def _path(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _type_name(wanted: Any) -> str:
-    return getattr(wanted, "__name__", None) if isinstance(wanted, type) else str(wanted).replace("typing.", "")
+def wrong_type(key: str, value: Any, wanted: Any) -> str:
+    """One line on a value of the wrong type: the key, what it must be, the value found, and how a list is written."""
+    parts = get_args(wanted)
+    listed = get_origin(wanted) is list or parts[1:] == (...,)
+    remedy = f": write {key}=[{value}]" if listed and isinstance(value, str | int | float) else ""
+    return f"{key} must be {_in_words(wanted)}, not {value!r}{remedy}"
+
+
+def _in_words(wanted: Any) -> str:
+    """What a type hint asks for."""
+    parts, of = get_args(wanted), get_origin(wanted)
+    if isinstance(wanted, type) and issubclass(wanted, StrEnum):
+        return f"one of {', '.join(wanted)}"
+    if of in (list, tuple):
+        return f"a list of {len(parts)}" if len(parts) > 1 and parts[-1] is not ... else "a list"
+    if of is UnionType or of is Union:
+        return " or ".join(map(_in_words, parts))
+    return WORDS.get(wanted, "keys and values")
+
+
+def type_of(key: str) -> Any:
+    """The type that the top level asks for at a dotted key; None where a part says it by itself."""
+    outer, _, inner = key.partition(".")
+    return get_type_hints(EvaluationSettings if outer == "evaluation" else Config).get(inner or outer)

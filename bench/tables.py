@@ -1,18 +1,29 @@
-"""The choices of Hydra's groups in conf: files, and the rows of tables, which are choices like files.
+"""The choices of Hydra's groups in conf: files, and the rows of tables; and which of them an experiment sweeps over.
 
 A table is `conf/TABLE.yaml`, or a file of that name in the user's `--config-dir`, with `NAME: {key: value}` for each
 row. A row holds what a file of its group would. For short, `base: NAME` stands for `defaults: [NAME, _self_]`, and keys
 may be dotted. A method's row reads as a command line: `renderer: dist` chooses, `task.mask: false` sets.
+
+A renderer, a file or a row, may have keys that are no arguments: `_rows_` maps an experiment to the place of the
+renderer's row in its table, and `_label_` names the row. A renderer without `_rows_` has a row in every such
+experiment, after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`.
+
+A choice of `method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
+that dimension, of the Sobol point whose number is `draw`. An experiment sweeps over `+method: ${methods:space}`.
 """
 
-from collections.abc import Sequence
+import importlib.util
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
+from difflib import get_close_matches
 from functools import cache
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import yaml
 from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 METHOD, SPACE, TUNED = "method", "method/space", "method/tuned"
@@ -23,6 +34,11 @@ GROUPS = {  # by the table's name
 CHOICES = ("task", "renderer", "dataset", "stress", "silhouette", "supervision", "prior", "scale")  # of a method's row
 LOOK = "_look_"  # of a renderer or a method: its colour, marker and line in figures
 DROPPED = ("base", "space", "chosen")  # keys of a row that are no part of what it holds
+LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
+MISSING = "???"
+DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
+SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
+MANY = 20  # names, beyond which a message leaves variants out
 Node = dict[str, Any]
 
 
@@ -45,7 +61,7 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
             if folder == CONF:
                 _store_ours(path, group, _text(path))
                 continue
-            for of, name, _ in _rows(path, group, _text(path)):
+            for of, name, _ in _rows_of(path, group, _text(path)):
                 if of != TUNED and name in names(of):  # settings that were tuned again are meant to take the place
                     raise ValueError(f"{path}: {name} is a {group} of {CONF} already: give the row another name")
                 _REPLACED.append((of, f"{name}.yaml", _stored(of).get(f"{name}.yaml")))
@@ -68,7 +84,7 @@ def _stored(group: str) -> dict[str, Any]:
 
 
 def _store(path: Path, group: str, text: str) -> None:
-    for of, name, node in _rows(path, group, text):
+    for of, name, node in _rows_of(path, group, text):
         whole = of.startswith(METHOD) or node == {group: None}
         kept = {key: value for key, value in node.items() if key != LOOK or not whole}
         ConfigStore.instance().store(group=of, name=name, node=kept, package="_global_" if whole else None)
@@ -86,7 +102,7 @@ def read_rows(folder: Path) -> dict[str, dict[str, Node]]:
     found: dict[str, dict[str, Node]] = {group: {} for group in (*GROUPS.values(), SPACE)}
     for table, group in GROUPS.items():
         path = folder / f"{table}.yaml"
-        for of, name, node in _rows(path, group, _text(path)) if path.is_file() else ():
+        for of, name, node in _rows_of(path, group, _text(path)) if path.is_file() else ():
             found[of][name] = node
     return found
 
@@ -135,7 +151,7 @@ def _mapping(path: Path, text: str) -> Node:
 
 
 @cache
-def _rows(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
+def _rows_of(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
     """The group, the name and the content of each row of a table, and of the space of each method that has one."""
     found = []
     for name, row in _mapping(path, text).items():
@@ -187,3 +203,128 @@ def _nested(row: Node) -> Node:
             node = node.setdefault(part, {})
         node[last] = deepcopy(value)
     return found
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """A hint at the end of an error message: the nearest known names, or all of them."""
+    last = [name for name in known if "." not in word and name.rsplit(".", 1)[-1] == word]
+    folder = [name for name in known if "/" in word and name.startswith(word.rpartition("/")[0] + "/")]
+    variants = [name for name in known if name.startswith(f"{word}_")]
+
+    def alike(cutoff: float) -> list[str]:
+        return [name for name in get_close_matches(word, folder or known, n=3, cutoff=cutoff) if name != word]
+
+    close = last or alike(0.85) or variants or alike(0.5)
+    if close:
+        return f": did you mean {' or '.join(close)}?"
+    roots = [name for name in known if not any(name.startswith(f"{other}_") for other in known)]
+    shown = roots if len(known) > MANY else known
+    if not shown:
+        return ""
+    return f": it has {', '.join(sorted(shown))}" + (", and variants of these" if len(shown) < len(known) else "")
+
+
+def register_resolvers() -> None:
+    """Makes known to OmegaConf what values of the configuration may ask for."""
+    OmegaConf.register_new_resolver("rows", _rows, replace=True)
+    OmegaConf.register_new_resolver("methods", _methods, replace=True)
+    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
+    OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
+    OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
+
+
+def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[str, Any]:
+    """A resolved `renderer` node without `_rows_`, its look, and a `_label_` inherited from what it builds on.
+
+    Args:
+        renderer: the node.
+        choice: the name of its file or row.
+        runtime: `hydra.runtime`, which has the folders of configurations.
+    """
+    own = _choices("renderer", runtime).get(choice, {})
+    dropped = {ROWS, LOOK, LABEL} if "defaults" in own and LABEL not in own else {ROWS, LOOK}
+    return {key: value for key, value in renderer.items() if key not in dropped}
+
+
+def renderers_of(experiment: str, runtime: DictConfig) -> list[str]:
+    """The renderers that have a row in an experiment, in the order of their places, then by name."""
+    places = {}
+    for name, own in _choices("renderer", runtime).items():
+        place = own.get(ROWS, {experiment: inf}).get(experiment)
+        if place is not None and own.get("_target_") != MISSING:  # custom: its class is on the command line
+            places[name] = place
+    return sorted(places, key=lambda name: (places[name], name))
+
+
+def _rows(experiment: str, *, _root_: DictConfig) -> str:
+    runtime = _root_.hydra.runtime
+    if runtime.choices.get("method") is not None:  # a method sets its renderer
+        return runtime.choices["renderer"]
+    return ",".join(renderers_of(experiment, runtime))
+
+
+def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
+    """The methods with a search space, to be swept over: of the kind `space` the spaces.
+
+    Of the kind `tuned`, the settings that have been written for them, each behind its method.
+
+    Args:
+        without: names of methods that are left out.
+
+    Raises:
+        ValueError: for such a name that has no search space, and for another kind.
+    """
+    if kind not in ("space", "tuned"):
+        raise ValueError(f"${{methods:KIND}} has the kinds space and tuned, not {kind!r}")
+    spaces, tuned = (_choices(group, _root_.hydra.runtime) for group in (SPACE, TUNED))
+    if unknown := {*without} - {*spaces}:
+        raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
+    kept = [name for name in sorted(spaces) if name not in without]
+    if kind == "space":
+        return ",".join(f"space/{name}" for name in kept)
+    return ",".join(f"{name},tuned/{name}" for name in kept if name in tuned)
+
+
+def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:
+    """The value of draw `_root_.draw` in a range, even in its logarithm; a whole number for whole ends, else 3 digits.
+
+    Raises:
+        ValueError: without a draw, beyond the last one, or for a range or dimension that there is not.
+    """
+    draw = _root_.draw
+    if draw is None or not 0 <= draw < DRAWS:
+        raise ValueError(f"a method of method/space needs draw=0 to draw={DRAWS - 1}, found {draw}")
+    if not (0 < least < most and 0 <= dimension < DIMENSIONS):
+        raise ValueError(
+            f"${{drawn:{dimension},{least},{most}}} must have a dimension from 0 to {DIMENSIONS - 1} and ends above 0"
+        )
+    value = least * (most / least) ** sobol_points()[draw][dimension]
+    return round(value) if isinstance(least, int) and isinstance(most, int) else float(f"{value:.3g}")
+
+
+@cache
+def sobol_points() -> list[list[float]]:
+    """The points [DRAWS, DIMENSIONS] of a scrambled Sobol sequence in the unit cube, the same for every method."""
+    from scipy.stats import qmc  # only here: it takes a second
+
+    return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS).tolist()
+
+
+def _choices(group: str, runtime: DictConfig) -> dict[str, Node]:
+    """What each file or row of a group holds by itself; of two with the same name, the one that Hydra takes."""
+    folders, found = [*_folders(runtime)], dict[str, Node]()
+    for folder in folders:
+        for path in sorted((folder / group).glob("*.yaml")):
+            found.setdefault(path.stem, read_yaml(path))
+    for folder in reversed(folders):
+        found = read_rows(folder)[group] | found
+    return found
+
+
+def _folders(runtime: DictConfig) -> Iterator[Path]:
+    """The folders of configurations, in the order in which Hydra searches them."""
+    for source in runtime.config_sources:
+        if source.schema == "file":
+            yield Path(source.path)
+        elif source.schema == "pkg" and (found := importlib.util.find_spec(source.path.replace("/", "."))):
+            yield from map(Path, found.submodule_search_locations or [])

@@ -1,12 +1,13 @@
 """Exports finished runs to experiment trackers; never during a run, and a failed export loses no run."""
 
-import json
 import math
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from bench.records.names import flat
+from bench.records.read import curve_lines
 from bench.records.record import started
 from datasets.extras import install
 
@@ -96,12 +97,9 @@ def _check_installed(module: str, remedy: str) -> None:  # before the run, not a
         raise ValueError(f"tracker={module} needs {remedy}")
 
 
-def settings(node: dict[str, Any], prefix: str = "") -> dict[str, str]:
+def settings(config: dict[str, Any]) -> dict[str, str]:
     """A configuration as dotted keys and strings."""
-    flat: dict[str, str] = {}
-    for key, value in node.items():
-        flat |= settings(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": str(value)}
-    return flat
+    return {key: str(value) for key, value in flat(config).items()}
 
 
 def values(record: dict[str, Any]) -> dict[str, float]:
@@ -112,9 +110,7 @@ def values(record: dict[str, Any]) -> dict[str, float]:
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:
     """The lines of `curve.jsonl` as iteration and finite numbers by name; empty where there is no curve."""
-    path = folder / "curve.jsonl"
-    lines = map(json.loads, path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ()
-    return [(line.pop("iteration"), _finite(line)) for line in lines]
+    return [(line.pop("iteration"), _finite(line)) for line in curve_lines(folder) or () if line]
 
 
 def _finite(found: dict[str, Any]) -> dict[str, float]:

@@ -51,20 +51,8 @@ def _not_a_number(rendering: Rendering) -> Rendering:
     return Rendering(**{**vars(rendering), "distance": rendering.distance * float("nan")})
 
 
-def _nothing(rendering: Rendering) -> None:
-    return None
-
-
 def _short(rendering: Rendering) -> Rendering:
     return Rendering(**{part: getattr(rendering, part)[:-1] for part in PARTS})
-
-
-def _double(rendering: Rendering) -> Rendering:
-    return Rendering(**{**vars(rendering), "distance": rendering.distance.double()})
-
-
-def _detached(rendering: Rendering) -> Rendering:
-    return Rendering(**{**vars(rendering), "distance": rendering.distance.detach()})
 
 
 def _loop(rendering: Rendering) -> Rendering:
@@ -107,10 +95,7 @@ FAILURES = {
     "not": lambda rendering: rendering,
     "raise": _raise,
     "not_a_number": _not_a_number,
-    "nothing": _nothing,
     "short": _short,
-    "double": _double,
-    "detached": _detached,
     "loop": _loop,
     "native_loop": _native_loop,
     "leave": _leave,
@@ -118,12 +103,8 @@ FAILURES = {
     "terminate": _terminate,
     "segfault": _segfault,
     "hog": _hog,
-    "no_loss": lambda rendering: rendering,
-    "loss_per_ray": lambda rendering: rendering,
     "detached_loss": lambda rendering: rendering,
 }
 LOSSES = {
-    "no_loss": lambda loss: None,
-    "loss_per_ray": lambda loss: loss.expand(144),
     "detached_loss": lambda loss: loss.detach() + 1,
 }

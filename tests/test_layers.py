@@ -24,7 +24,7 @@ FORBIDDEN = {  # what the modules of a package may not import
 }
 # The rooms of bench in the order of imports: a room may use those before it, and none a command.
 ROOMS = (
-    "hints", "tables", "rows", "targets", "config", "progress", "records", "machine", "trackers", "shape_prior",
+    "tables", "config", "progress", "records", "machine", "trackers", "shape_prior",
     "setup", "evaluate", "pictures", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
     "run", "report", "studies",
 )  # fmt: skip
@@ -101,7 +101,8 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names):
             found.append("has a star import")
-        if isinstance(node, ast.Attribute) and ast.unparse(node) == "sys.path" and module not in PASSES_PATH_ON:
+        of_sys = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sys"
+        if of_sys and node.attr == "path" and module not in PASSES_PATH_ON:
             found.append("touches sys.path")
     return found + ["touches sys.path" for name in names if name == "sys.path"]
 
@@ -118,20 +119,8 @@ def named(path: Path) -> tuple[str, bool]:
 
 def test_imports_go_one_way():
     found = {str(path): wrongs(path.read_text(), *named(path)) for path in modules()}
+    assert {path.relative_to(ROOT).parts[0] for path in modules()} == {*OURS} and len(found) > 200
     assert {path: wrong for path, wrong in found.items() if wrong} == {}
-
-
-def test_every_package_is_looked_at():
-    seen = {named(path)[0] for path in modules()}
-    named_here = {
-        "renderers.fields.mlp",
-        "datasets.scene",
-        "bench",
-        "bench.report.__main__",
-        "conf",
-        "tests.test_layers",
-    }
-    assert seen >= named_here
 
 
 def test_every_room_has_its_place():
@@ -146,41 +135,29 @@ def test_conf_holds_yaml_only():
 
 
 WRONG = (
-    ("renderers.dist", "import datasets"),
     ("renderers.dist", "from datasets.scene import Scene"),
     ("renderers.dist", "def f():\n    from bench.config import build"),
     ("renderers.dist", "import numpy as np"),
     ("renderers.fields.mlp", "from ...bench import config"),
-    ("renderers.fields.mlp", "from torchvision import ops"),
     ("datasets.scene", "import bench.records"),
-    ("datasets.scene", "from bench import records"),
     ("datasets.scene", "if True:\n    import conf"),
     ("bench.run.run", "from tests.renderers.analytic_cases import CASES"),
     ("bench.run.run", "from bench.report.write.html import write_index"),
-    ("bench.solve.optimise", "from bench.tasks.task import Task"),
     ("bench.records.record", "def f():\n    import bench.report"),
     ("bench.records.record", "import torch"),
-    ("bench.config", "from bench.records.record import Record"),
     ("bench.run.run", "from bench.merge import merge"),
-    ("bench.report.write.html", "import torch.nn"),
     ("bench.report.write.html", "from torch import Tensor"),
-    ("bench.report.write.html", "from bench.solve.solve import COSTS"),
     ("bench.report.write.html", "from bench import solve"),
     ("bench.report.write.html", "from ...solve.solve import COSTS"),
-    ("bench.report.write.html", "from datasets.mesh import Mesh"),
     ("bench.report", "import renderers"),
     ("bench", "import torch"),
     ("conf", "from bench import config"),
     ("bench.run.run", "from os import *"),
     ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
-    ("tests.test_layers", "import sys\nsys.path += ['.']"),
     ("tests.test_layers", "from sys import path"),
-    ("bench.run.run", "from bench.studies import completion"),
     ("bench.__main__", "import bench.studies.completion"),
     ("bench.report.write.html", "from ...studies.completion import make"),
-    ("bench.studies.completion", "from bench.studies.table1 import make"),
     ("bench.studies.completion", "from .table1 import make"),
-    ("bench.studies.completion", "import torch"),
     ("bench.studies.completion", "from bench.tasks.task import Task"),
 )
 RIGHT = (
@@ -222,6 +199,7 @@ def test_types_and_shapes_are_checked_of_arguments_and_of_results():
         _first(torch.zeros(4, 3), 1)
 
 
+@pytest.mark.slow
 def test_make_test_types_checks_every_call_of_ours():
     code = "import tests.conftest, torch; from renderers.fields.analytic import sphere; sphere().rotate(torch.eye(4))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CHECK_TYPES": "1"}

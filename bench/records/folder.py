@@ -15,11 +15,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import Rerun
+from bench.config import OURS, Rerun
 from bench.records.files import digest, file_lock, leads_out, link_out, to_json
 from bench.records.record import NEUTRAL_KEYS, RunStatus, read_record
-from bench.rows import own_row
-from bench.targets import OURS
+from bench.tables import own_row
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (

@@ -125,7 +125,10 @@ def check_results(results_dir: Path) -> None:
         ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
     """
     if not results_dir.is_dir():
-        raise ValueError(f"results_dir must be an existing folder, found {results_dir}; make a run there first.")
+        raise ValueError(
+            f"results_dir={results_dir}: there is no such folder; name one that has runs, or make a run: "
+            f"python -m bench results_dir={results_dir}"
+        )
     check_links(results_dir)
 
 

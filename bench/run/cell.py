@@ -1,6 +1,5 @@
 """The one place where a configuration becomes objects: by the check of a sweep, and by each run."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +8,7 @@ from typing import Any
 
 import torch
 
-from bench.config import EvaluationSettings, build, check_top_level
+from bench.config import EvaluationSettings, build_once
 from bench.machine.environment import pick_device, using_threads
 from bench.progress import Report
 from bench.setup.auto import AUTO, Node, at_pixel_precision, resolved
@@ -102,32 +101,19 @@ def cell_of(config: Node, built: dict[str, Any] | None = None) -> Cell:
     """Builds everything that a configuration names, and checks all of it before the first slow step.
 
     Args:
-        config: of a run, resolved, as plain data.
+        config: of a run, resolved, as plain data; `bench.config.check_top_level` has checked it.
         built: objects and errors by the text of their nodes, which cells of a sweep share while they are checked.
 
     Raises:
         ValueError, OSError: for anything invalid in it.
     """
-    built = {} if built is None else built
-    packages = list(config["packages"])
-
-    def part(name: str, node: Any = None) -> Any:
-        """The object of a node; equal nodes are built once."""
-        node = config[name] if node is None else node
-        text = json.dumps([name, packages, node], sort_keys=True, default=str)
-        if text not in built:
-            try:
-                built[text] = build(node, name, packages, TARGETS.get(name, ""))
-            except ValueError as error:
-                built[text] = error
-        if isinstance(built[text], ValueError):
-            raise built[text]
-        return built[text]
+    packages, built = list(config["packages"]), {} if built is None else built
+    view, auto = build_once({"view": config["view"], "auto": config["auto"]}, packages, TARGETS, built)
 
     def renderer(requested: Node) -> Noted:
         """A renderer from its node, with a number for each `auto`, and notes on these."""
-        node, notes = resolved(requested, part("view"), part("auto"))
-        made = part("renderer", node)
+        node, notes = resolved(requested, view, auto)
+        (made,) = build_once({"renderer": node}, packages, TARGETS, built)
         if not isinstance(made, Renderer):
             name = type(made).__name__
             raise ValueError(
@@ -141,17 +127,20 @@ def cell_of(config: Node, built: dict[str, Any] | None = None) -> Cell:
             )
         return follow(made), notes
 
-    check_top_level(config)
+    noted = renderer(config["renderer"])
+    task, dataset, evaluation, prior, models = build_once(
+        {name: config[name] for name in ("task", "dataset", "evaluation", "prior", "models")}, packages, TARGETS, built
+    )
     cell = Cell(
-        task=part("task"),
+        task=task,
         device=pick_device(config["device"]),
-        views=part("view"),
-        renderer=renderer(config["renderer"]),
+        views=view,
+        renderer=noted,
         make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
-        dataset=part("dataset"),
-        evaluation=part("evaluation"),
-        prior=part("prior"),
-        field=FieldChoice(config["field"], part("models")),
+        dataset=dataset,
+        evaluation=evaluation,
+        prior=prior,
+        field=FieldChoice(config["field"], models),
         place=(Split(config["split"]), config["index"]),
         seed=config["seed"],
         threads=config["threads"],
@@ -169,7 +158,7 @@ def _check(cell: Cell) -> None:
     if isinstance(cell.dataset, Photographed) and index:
         raise ValueError(f"photographs show one object, with index=0, not {index}: give another dataset.path")
     if not cell.field.of_prior and not isinstance(cell.task, TakesField):
-        raise ValueError(f"the task {name} does not take field={cell.field.name}: leave it out")
+        raise ValueError(f"the task {name} does not take field={cell.field.name}: remove it")
     inputs = cell.inputs()
     if isinstance(cell.task, Checks):
         cell.task.check(inputs)

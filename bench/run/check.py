@@ -4,42 +4,37 @@ A configuration is built by the code that its run builds it with, `bench.run.cel
 """
 
 import io
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from multiprocessing.connection import Connection
 from typing import Any
 
 from omegaconf import DictConfig
 
-from bench.config import Isolation, build, check_draw, check_label, check_names, check_top_level
+from bench.config import Isolation, build, check_draw, check_label, check_names, check_top_level, is_foreign
 from bench.records.folder import Identity, identify
 from bench.records.read import Plan, PlannedCell
-from bench.run.messages import reason_of
-from bench.run.process import BOOT, INTERVAL, RunLimits, fork_server, raise_if_stopped, signals_delayed, warm_up
-from bench.targets import check_targets, has_foreign
+from bench.run.process import BOOT, RunLimits, fork_server, reason_of, signals_delayed, warm_up
 from bench.trackers import Tracker
 
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
 
 
-def identified(config: DictConfig, runtime: DictConfig, overrides: Sequence[str], typed: Sequence[str]) -> Identity:
-    """The run that a configuration describes, after all that can be told of it without torch has been checked.
+def identified(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) -> Identity:
+    """The run that a configuration describes, after all checks of it that need no torch.
 
     Args:
         config: without Hydra's own node.
         runtime: `hydra.runtime`.
         overrides: of the run.
-        typed: those that the command line has, by which alone packages are named.
 
     Raises:
-        ValueError: for a value that cannot be.
+        ValueError: for an invalid value.
     """
     check_draw(config)
     identity = identify(config, runtime)
     check_names(identity.config)
     check_label(identity.config, overrides)
-    check_targets(identity.config, typed, identity.choices["renderer"])
     check_top_level(identity.config)
     RunLimits.of(identity.config)
     tracker_of(identity.config)
@@ -59,7 +54,7 @@ def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     Args:
         configs: resolved, as plain data.
     """
-    if any(config["isolation"] == Isolation.process and has_foreign(config) for config in configs):
+    if any(config["isolation"] == Isolation.process and is_foreign(config) for config in configs):
         return _in_a_child(configs)
     built: dict[str, Any] = {}  # what they share
     return [refusal(config, built) for config in configs]
@@ -70,36 +65,22 @@ def _in_a_child(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     context = fork_server()
     ours, childs = context.Pipe(duplex=False)
     process = context.Process(target=_answer, args=(configs, childs), daemon=True)
-    reasons: list[str] = []
+    with signals_delayed():  # a request that breaks off would end the server
+        process.start()
+        childs.close()
     try:
-        with signals_delayed():  # a request that breaks off would end the server
-            process.start()
-            childs.close()
-        waited = 0.0
-        while len(reasons) < len(configs) and waited < BOOT:
-            raise_if_stopped()
-            waited = 0.0 if ours.poll(INTERVAL) else waited + INTERVAL
-            if not waited:
-                reasons.append(ours.recv())
-    except (EOFError, OSError):  # a class of the user's ended the process: its run will say how
-        pass
+        return ours.recv() if ours.poll(BOOT) else [""] * len(configs)
+    except EOFError:  # a class of the user's ended the process: its run will say how
+        return [""] * len(configs)
     finally:
+        process.kill()
+        process.join()
         ours.close()
-        if process.pid is not None:
-            process.kill()
-            process.join()
-    return reasons + [""] * (len(configs) - len(reasons))
 
 
 def _answer(configs: Sequence[Mapping[str, Any]], channel: Connection) -> None:
-    """Sends the reasons one by one, in a process of its own, which prints nothing."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, 1)
-    os.dup2(nothing, 2)
     built: dict[str, Any] = {}
-    with suppress(BrokenPipeError):
-        for config in configs:
-            channel.send(refusal(config, built))
+    channel.send([refusal(config, built) for config in configs])
 
 
 def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
@@ -130,7 +111,7 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
         reused: ids of the cells whose finished run is there already, so that they need not be checked.
 
     Raises:
-        ValueError: where a cell cannot be, with the cell and what is wrong with it.
+        ValueError: for an invalid cell, with the cell and what is wrong with it.
     """
     away = {} if launcher in HERE else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
@@ -141,7 +122,7 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
 
 
 def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
-    """One line on a sweep that is refused: its first cell that cannot be, why, and how many cannot."""
+    """One line on a sweep that is refused: its first invalid cell, why, and how many are invalid."""
     if count == len(plan.cells):
         return reason
     where = " ".join(plan.differing(cell)) or cell.id

@@ -16,15 +16,13 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, register
-from bench.hints import nearest
+from bench.config import CONF, register, type_of, wrong_type
 from bench.records.folder import Identity
-from bench.rows import register_resolvers
 from bench.run.check import identified
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
-from bench.tables import names
+from bench.tables import names, nearest, register_resolvers
 from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
@@ -56,9 +54,9 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
         runs: whether the cells of a sweep are runs, so that they have a plan.
 
     Returns:
-        the exit status: 0, or the status of a mistake that was told on standard error.
+        the exit status: 0, or the status of a mistake that was printed on standard error.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be told in one line
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be printed in one line
     begun: list[DictConfig] = []
     raised: list[OSError | ValueError] = []
 
@@ -70,8 +68,8 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
             raised.append(error)
 
-    if (told := _told(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
-        return _print(told)
+    if (text := _answer(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
+        return _print(text)
     catch_signals()
     Sweep.other = None if runs else job
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
@@ -85,7 +83,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
         before = "" if begun or Sweep.plan is not None else "; nothing was run"
         return _tell(stopped_by(error) + before, INTERRUPTED)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
-        return _tell(_explain(error), USAGE)
+        return _tell(_with_file(_explain(error)), USAGE)
     except BrokenPipeError:  # `| head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return FAILED
@@ -103,7 +101,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     return 0
 
 
-def _told(arguments: list[str], about: str) -> str | None:
+def _answer(arguments: list[str], about: str) -> str | None:
     """The text that a command line asks for in place of a run; None where it asks for none."""
     if {"--help", "-h", "help"} & {*arguments}:
         chosen = "\n".join(
@@ -128,23 +126,17 @@ def options_first(arguments: list[str]) -> list[str]:
     """The arguments with options, such as -m, before all `key=value`, as Hydra wants them.
 
     Raises:
-        ValueError: for an option that there is not.
+        ValueError: for an unknown option.
     """
-    known = {name: action for action in get_args_parser()._actions for name in action.option_strings}
-    options, others, rest = [], [], list(arguments)
-    while rest:
-        word = rest.pop(0)
-        if not word.startswith("-"):
-            others.append(word)
-            continue
-        action = known.get(word.partition("=")[0])
-        if action is None:
-            raise ValueError(f"unknown option {word!r}{nearest(word, sorted(known))}")
-        options.append(word)
-        given = rest and (action.nargs is None or (action.nargs == "?" and rest[0] in (action.choices or ())))
-        if given and "=" not in word:
-            options.append(rest.pop(0))
-    return [*options, *others]
+    parser = get_args_parser()
+    given, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        known = sorted(name for action in parser._actions for name in action.option_strings)
+        raise ValueError(f"unknown option {unknown[0]!r}{nearest(unknown[0], known)}")
+    options = list(arguments)
+    for override in given.overrides:
+        options.remove(override)
+    return [*options, *given.overrides]
 
 
 def own_folders(arguments: list[str]) -> list[Path]:
@@ -162,12 +154,12 @@ def unwritten(error: OSError, results_dir: str | None = None) -> str:
 
 
 def _identified(config: DictConfig) -> Identity:
-    """The run that a configuration describes; raises ValueError for what can be told of it without torch."""
+    """The run that a configuration describes; raises ValueError for what needs no torch to be found invalid."""
     register_resolvers()  # again, since a launcher's worker has not read the command line
     hydra = HydraConfig.get()
     if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
         config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
-    return identified(config, hydra.runtime, hydra.overrides.task, hydra.overrides.task)
+    return identified(config, hydra.runtime, hydra.overrides.task)
 
 
 def _call(program: Callable[[], None]) -> None:
@@ -210,6 +202,8 @@ def _explain(error: Exception) -> str:
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
             return what + nearest(name, known) + (own if "/" in name or "." in name else "")
     message = " ".join(str(error).split())
+    if found := re.search(r"Key '([^']+)' not in", message):  # of a row or a file
+        return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
     if found := re.match(r"Ambiguous value for argument '(.*?)=(.*)' 1\.", message):
         key, values = found.groups()
         quoted = f"or quote it where it is one value: '{key}=\"{values}\"'"
@@ -221,10 +215,21 @@ def _explain(error: Exception) -> str:
             return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
             return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))
+        if found := re.match(r"Error merging override \+*([\w.]+)=(.*)$", message):
+            return wrong_type(found[1], found[2], type_of(found[1]))
         if error.__cause__ is not None:
             detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
             return f"{message}: {detail}" if detail not in message else message
     return message
+
+
+def _with_file(message: str) -> str:
+    """A message on a mistyped key, with the file of the user's folder that has it; other messages as they are."""
+    if (found := re.search(r"(?:has no|unknown) key '([^']+)'", message)) is None:
+        return message
+    key = re.compile(rf"\b{re.escape(found[1])}\b[\w.]*\s*:")
+    files = [path for folder in own_folders(sys.argv[1:]) for path in sorted(folder.rglob("*.yaml"))]
+    return message + next((f" It is in {path}" for path in files if key.search(path.read_text("utf-8", "replace"))), "")
 
 
 def _unreadable(override: str) -> str:

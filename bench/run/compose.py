@@ -6,6 +6,7 @@ it in values alone, which are set in its place.
 
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +15,19 @@ from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import OverrideType
+from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
-from bench.progress import notice
 from bench.records.files import digest
 from bench.records.folder import Identity
-from bench.records.format import seconds
 from bench.records.read import Plan, PlannedCell
 from bench.run.check import identified
-from bench.targets import parsed
 
-COMPOSED = 0.01  # seconds that planning a cell takes
-SILENT = 3.0  # seconds above which a sweep says how long it plans
+
+@cache
+def parsed(override: str) -> Override:
+    """An override of the command line, as Hydra reads it."""
+    return OverridesParser.create().parse_override(override)
 
 
 class ReadOnce(CachingConfigRepository):
@@ -89,32 +90,37 @@ class Composer:
         return not any(other.startswith(f"{key}.") or key.startswith(f"{other}.") for other in others)
 
 
-def make_plan(config: DictConfig) -> Plan:
-    """All cells of the sweep that the command line describes.
+def swept_over(config: DictConfig) -> list[list[str]]:
+    """The overrides of each cell of the sweep that the command line describes.
 
     Raises:
-        HydraException, OmegaConfBaseException: where a cell cannot be composed.
         ValueError: where the sweep has no cell.
     """
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
-    typed = {_key(override) for override in config.hydra.overrides.task}  # what params sweep over may be of a YAML
     swept = combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task])
-    if len(swept) * COMPOSED > SILENT:
-        notice(f"planning {len(swept)} cells, about {seconds(len(swept) * COMPOSED)}")
-    composer, common = Composer(config), set.intersection(*map(set, swept)) if swept else set()
+    if not swept:
+        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
+    return swept
+
+
+def make_plan(config: DictConfig, swept: list[list[str]]) -> Plan:
+    """All cells of a sweep, from the overrides of each.
+
+    Raises:
+        HydraException, OmegaConfBaseException: where a cell cannot be composed.
+        ValueError: for an invalid cell.
+    """
+    composer, common = Composer(config), set.intersection(*map(set, swept))
     cells: list[PlannedCell] = []
     for number, overrides in enumerate(swept, 1):
         composed = composer.of(overrides)
-        by_hand = [override for override in overrides if _key(override) in typed]
         try:
-            identity = identified(composed.config, composed.runtime, overrides, by_hand)
+            identity = identified(composed.config, composed.runtime, overrides)
         except ValueError as error:
             differing = " ".join(override for override in overrides if override not in common)
             where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""
             raise ValueError(f"{where}{error}; nothing was run") from error
         cells.append(planned(identity, overrides))
-    if not cells:
-        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
     first = cells[0].config
     name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
     return Plan(name, Path(first["results_dir"]), cells)

@@ -19,7 +19,7 @@ from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
 from bench.run.cell import Cell, cell_of
-from bench.run.messages import Ended, Job, Notice, Started, Step, reason_of
+from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext
 from bench.solve.problem import Unsupported
 from renderers.checks import BadInput

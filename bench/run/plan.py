@@ -1,4 +1,4 @@
-"""What runs will take, by like runs: `plan=true`, which lists them and runs nothing, and the time left of a sweep."""
+"""What runs will take, by finished ones: `plan=true` lists runs and starts none; the time left of a sweep."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ class Shown(BaseException):
 
 
 class Estimates:
-    """The seconds of runs; like runs have the same task, renderer, method and scale."""
+    """The seconds of finished runs, by task, renderer, method and scale."""
 
     def __init__(self, records: Iterable[dict[str, Any]] = ()) -> None:
         self.known: dict[Any, list[float]] = defaultdict(list)
@@ -33,7 +33,7 @@ class Estimates:
             self.known[_kind(record)].append(total)
 
     def of(self, planned: dict[str, Any]) -> list[float]:
-        """The seconds that like runs took."""
+        """The seconds of the finished runs with the same task, renderer, method and scale."""
         return self.known.get(_kind(planned), [])
 
 
@@ -67,7 +67,7 @@ class Remaining:
                 self.estimates.add(record)
 
     def left(self, elapsed: float) -> float | None:
-        """Seconds left, `elapsed` seconds after the sweep began; None where no like run says anything."""
+        """Seconds left, `elapsed` seconds after the sweep began; None where no finished run is like one of them."""
         known = [median(like) for cell in self.cells.values() if (like := self.estimates.of(cell))]
         if not known and self.cells:
             return None
@@ -87,18 +87,18 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     left = remaining(plan, reused, workers)
     taken = {name: left.estimates.of(cell) for name, cell in left.cells.items()}
     for number, cell in enumerate(plan.cells, 1):
-        about = "reused" if cell.id in reused else told(taken[cell.id])
+        about = "reused" if cell.id in reused else about_as_long(taken[cell.id])
         print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
     parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]
     if reused:
         parts.append(f"{len(reused)} reused")
     if unknown := sum(not like for like in taken.values()):
-        parts.append(f"{unknown} without a like run")
+        parts.append(f"{unknown} of unknown time")
     text = ", ".join(parts) + ("" if taken else "; nothing is left to do")
     if known := [median(like) for like in taken.values() if like]:
         text += f"; about {seconds(sum(known) / left.workers)}, {left.workers} at a time"
-        text += f", and what the {unknown} take" if unknown else ""
-        text += "; a prior that has to be trained first comes on top"
+        text += f", without the {unknown} of unknown time" if unknown else ""
+        text += "; the training of a missing prior is not counted"
     print(text)
 
 
@@ -107,6 +107,8 @@ def named(cell: PlannedCell) -> str:
     return ", ".join((cell.task, row_name(cell.config, cell.renderer), cell.dataset))
 
 
-def told(like: list[float]) -> str:
-    """What a run will take, in words."""
-    return f"about {seconds(median(like))} ({len(like)} like run{'s' * (len(like) > 1)})" if like else "no like run"
+def about_as_long(like: list[float]) -> str:
+    """What a run will take, in words, by what runs like it took."""
+    if not like:
+        return "time unknown"
+    return f"about {seconds(median(like))} (median of {len(like)} finished run{'s' * (len(like) > 1)})"

@@ -20,9 +20,20 @@ from bench.records.record import Record, RunStatus, now, read_record
 from bench.run.check import refusals, tracker_of
 from bench.run.command import unwritten
 from bench.run.compose import planned
-from bench.run.messages import Job, Message, Notice, Started, Step, reason_of
 from bench.run.plan import show_plan
-from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by, warm_up
+from bench.run.process import (
+    Job,
+    Message,
+    Notice,
+    RunLimits,
+    Started,
+    Step,
+    reason_of,
+    run_isolated,
+    signals_delayed,
+    stopped_by,
+    warm_up,
+)
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
 

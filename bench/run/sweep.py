@@ -13,14 +13,14 @@ from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import Isolation, Rerun
-from bench.progress import display
+from bench.progress import display, notice
 from bench.records.folder import Identity, reusable
 from bench.records.format import number, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
 from bench.run.check import check_plan
-from bench.run.compose import identity_of, make_plan
+from bench.run.compose import identity_of, make_plan, swept_over
 from bench.run.plan import Remaining, Shown, remaining, show_plan
 from bench.run.process import warm_up
 
@@ -76,10 +76,15 @@ class Planner(Callback):
                 self.list_others(config, Sweep.other)
             return
         try:
+            swept, workers = swept_over(config), workers_of(config)
+            launcher = config.hydra.runtime.choices["hydra/launcher"]
+            if not config.plan:
+                runs = f"{len(swept)} run{'s' * (len(swept) > 1)}, {workers} at a time (hydra/launcher={launcher})"
+                notice(f"sweep: {runs}; a line follows as each ends")
             if config.isolation == Isolation.process:
                 warm_up()
-            plan, launcher = make_plan(config), config.hydra.runtime.choices["hydra/launcher"]
-            reused, workers = {cell.id for cell in plan.cells if is_reused(plan, cell)}, workers_of(config)
+            plan = make_plan(config, swept)
+            reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
             check_plan(plan, launcher, reused)
             if config.plan:
                 show_plan(plan, reused, workers)
@@ -92,7 +97,7 @@ class Planner(Callback):
     def list_others(self, config: DictConfig, tell: Callable[[Identity], None]) -> None:
         """Lists the cells of a sweep that are no runs, in this process."""
         try:
-            for cell in make_plan(config).cells:
+            for cell in make_plan(config, swept_over(config)).cells:
                 tell(identity_of(cell))
         except Exception as error:
             raise Refused(error) from error

@@ -3,8 +3,8 @@
 import re
 from dataclasses import dataclass
 
-from bench.hints import nearest
 from bench.setup.auto import AUTO
+from bench.tables import nearest
 from renderers.checks import check_at_least, check_choice, check_share
 
 PRIOR = "prior"

@@ -1,6 +1,6 @@
 """Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,17 +11,17 @@ from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, build, check_draw, check_names, load
-from bench.hints import nearest
 from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import combinations
-from bench.tables import GROUPS, choice, names, read_yaml
+from bench.tables import GROUPS, choice, names, nearest, read_yaml
 from bench.tasks.task import Task
 from datasets.dataset import Dataset
-from renderers import DIST, DVR, Naive
+from renderers import DIST, Naive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 from tests.composing import composed
+from tests.looped import each
 from tests.made_scans import write_scans
 
 IDR_ARGUMENTS = {
@@ -66,7 +66,7 @@ def names_of_groups() -> tuple[str, ...]:
 
 
 TOGETHER = together()
-METHODS = [*visible("method"), *(f"{kind}/{name}" for kind in ("space", "tuned") for name in visible(f"method/{kind}"))]
+METHODS = [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))]  # spaces: test_spaces
 
 
 @pytest.fixture(scope="session")
@@ -111,14 +111,6 @@ def test_a_table_has_no_row_twice_and_no_text_that_should_be_a_number(table):
     assert not {path.stem for path in (CONF / GROUPS[table]).glob("*.yaml")} & {*strict}
 
 
-def test_the_default_configuration_builds(compose_config):
-    config = compose_config()
-    for part in PARTS:
-        build_part(config, part)
-    build(config.view, "view", target="datasets.views.ViewSampler")
-    build(config.evaluation, "evaluation", target="bench.config.EvaluationSettings")
-
-
 def builds(config: DictConfig) -> None:
     """Asserts that all of a configuration resolves, and that its parts are what their places ask for."""
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -130,7 +122,7 @@ def builds(config: DictConfig) -> None:
 def test_every_choice_is_in_a_composition():
     for group in names_of_groups():
         assert {row[group] for row in TOGETHER} == {*visible(group)}
-    assert len(METHODS) > 80 and len({row["renderer"] for row in TOGETHER}) > 50
+    assert len(METHODS) > 60 and len({row["renderer"] for row in TOGETHER}) > 50
 
 
 @pytest.mark.parametrize("row", TOGETHER, ids=lambda row: " ".join(row.values()))
@@ -151,7 +143,7 @@ def test_every_choice_composes_and_builds(paths, row):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_composes_and_builds(name):
-    builds(composed(f"+method={name}", *(["draw=0"] if name.startswith("space/") else [])))
+    builds(composed(f"+method={name}"))
 
 
 @pytest.mark.parametrize("place", [0, -1], ids=["first", "last"])
@@ -226,40 +218,31 @@ TABLE1 = {  # each row of the paper adds one thing to the row before
 }
 
 
-@pytest.mark.parametrize("name", TABLE1)
-def test_a_row_of_table_1_is_that_of_the_paper(compose_config, name):
-    config = compose_config(f"renderer={name}")
-    assert (config.renderer._label_, build_part(config, "renderer")) == TABLE1[name]
-
-
 def test_table_1_begins_with_the_rows_of_the_paper():
+    for name, row in TABLE1.items():
+        config = composed(f"renderer={name}")
+        assert (config.renderer._label_, build_part(config, "renderer")) == row
     assert composed("+experiment=table1", hydra=True).hydra.sweeper.params.renderer.split(",")[:7] == [*TABLE1]
 
 
-def test_variants_of_our_own_are_what_they_are_called(compose_config):
-    def variant(name):
-        config = compose_config(f"renderer={name}")
-        return config.renderer._label_, build_part(config, "renderer")
-
-    dist, dvr = variant("dist")[1], variant("dvr")[1]
-    assert isinstance(dist, DIST) and isinstance(dvr, DVR)
+def test_variants_are_what_they_are_called():
+    dist, dvr = load("renderer", "dist"), load("renderer", "dvr")
     early, aggressive = replace(dvr, early_stop=True), replace(PAPER, coarse_to_fine=False)
-    assert variant("naive_parallel") == ("Naive, all rays at once", replace(FIRST, serial=False))
-    assert variant("dist_official_clamp") == ("DIST, official clamp", replace(PAPER, step_clamp=0.1))
-    assert variant("dist_capped") == ("+ aggressive, capped", replace(aggressive, extra_step_cap=0.01))
-    assert variant("dist_paper") == ("DIST, paper's", replace(PAPER, steps=100, n_gradient_samples=3))
-    official = {
-        "step_clamp": 0.1,
-        "n_gradient_samples": 5,
-        "silhouette_signed": True,
-        "silhouette_average": "violating",
-    }
-    assert variant("dist_official") == ("DIST, official code's", replace(PAPER, steps=100, **official))
-    assert variant("dvr_64") == ("DVR, n = 64", replace(dvr, n_ray_samples=64, doublings=(10, 30)))
-    assert variant("dvr_official_slope") == ("DVR, official slope", replace(dvr, keep_slope_sign=False))
-    assert variant("dvr_early_stop") == ("DVR, early stop", early)
-    assert variant("dvr_fixed_16") == ("DVR, n = 16 fixed", replace(early, n_ray_samples=16, doublings=()))
-    assert variant("dist_k_3") == ("DIST, K 3", replace(dist, n_gradient_samples=3))
+    official = {"step_clamp": 0.1, "n_gradient_samples": 5}
+    official |= {"silhouette_signed": True, "silhouette_average": "violating"}
+    for name, wanted in {
+        "naive_parallel": replace(FIRST, serial=False),
+        "dist_official_clamp": replace(PAPER, step_clamp=0.1),
+        "dist_capped": replace(aggressive, extra_step_cap=0.01),
+        "dist_paper": replace(PAPER, steps=100, n_gradient_samples=3),
+        "dist_official": replace(PAPER, steps=100, **official),
+        "dvr_64": replace(dvr, n_ray_samples=64, doublings=(10, 30)),
+        "dvr_official_slope": replace(dvr, keep_slope_sign=False),
+        "dvr_early_stop": early,
+        "dvr_fixed_16": replace(early, n_ray_samples=16, doublings=()),
+        "dist_k_3": replace(dist, n_gradient_samples=3),
+    }.items():
+        assert load("renderer", name) == wanted, name
 
 
 def test_every_renderer_has_a_label_of_its_own_and_says_where_it_has_a_row():
@@ -271,7 +254,7 @@ def test_every_renderer_has_a_label_of_its_own_and_says_where_it_has_a_row():
     assert {experiment for experiment, _ in places} == set(COMPARING)
 
 
-@pytest.mark.parametrize("name", COMPARING)
+@each("name", [*COMPARING])
 def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_places(name):
     rows = {renderer: choice("renderer", renderer).get("_rows_", {}) for renderer in names("renderer")}
     named = {renderer: places[name] for renderer, places in rows.items() if name in places}
@@ -281,7 +264,7 @@ def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_pl
     assert len(named) == COMPARING[name]
 
 
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour a class
+@each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
 def test_rows_of_an_experiment_are_told_apart_and_a_colour_is_of_one_class(name):
     params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
     rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
@@ -307,7 +290,7 @@ def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
     assert len(known) > 20 and not known & {*style._COLOURS}
 
 
-@pytest.mark.parametrize("name", [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))])
+@each("name", METHODS)
 def test_a_method_has_the_colour_of_its_renderer(name):
     renderers = renderers_of(name)
     assert not renderers or look(name).colour == look(renderers[-1]).colour
@@ -326,13 +309,15 @@ def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers
 
 
 def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_to(compose_config):
-    for name in ("table1", "fig4", "fig7", "gradients"):
-        for scale, size in (("smoke", 64), ("desk", 256), ("paper", 512)):
-            config = compose_config(f"+experiment={name}", f"scale={scale}")
-            prior = build_part(config, "prior")
-            assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
-            network = prior.network
-            assert (network.layers, network.width, network.code_length, network.skip) == (8, 512, 256, 4)  # DIST, B.1
+    for name, scale, size in (
+        ("table1", "smoke", 64), ("table1", "desk", 256), ("fig4", "paper", 512), ("fig7", "desk", 256),
+        ("gradients", "desk", 256),
+    ):  # fmt: skip
+        config = compose_config(f"+experiment={name}", f"scale={scale}")
+        prior = build_part(config, "prior")
+        assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
+        network = prior.network
+        assert (network.layers, network.width, network.code_length, network.skip) == (8, 512, 256, 4)  # DIST, B.1
 
 
 def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
@@ -341,29 +326,14 @@ def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
     assert config.label == "epsilon 0.005"
 
 
-def test_figure_5_looks_at_the_chamfer_distance_on_the_way(compose_config):
-    config = compose_config("+experiment=fig5", "renderer=idr")
-    assert (config.evaluation.every, config.task.points) == (20, "dense")
-    assert compose_config().evaluation.every == "doubling"
-
-
-def test_a_label_may_be_given(compose_config):
-    assert compose_config("label=my row").label == "my row"
-    assert (compose_config().label, compose_config().experiment) == (None, None)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "iterations"),
-    [
-        (["task=completion", "task.optimiser.iterations=37"], 37),
-        (["task=stability", "stress=depth_noise", "task.fit.iterations=38"], 38),
-        (["task=single_view", "task.training.steps=39"], 39),
-        (["task=ablation"], 100),
-    ],
-)
-@pytest.mark.parametrize("renderer", ["neus", "volsdf", "volsdf_budget", "unisurf"])
-def test_a_volume_is_sharp_at_the_end_of_whatever_it_optimises(compose_config, renderer, overrides, iterations):
-    assert compose_config(f"renderer={renderer}", *overrides).renderer.sharpening == iterations
+@each("overrides, iterations", [
+    (["task=completion", "task.optimiser.iterations=37", "renderer=neus"], 37),
+    (["task=stability", "stress=depth_noise", "task.fit.iterations=38", "renderer=volsdf"], 38),
+    (["task=single_view", "task.training.steps=39", "renderer=volsdf_budget"], 39),
+    (["task=ablation", "renderer=unisurf"], 100),
+])  # fmt: skip
+def test_a_volume_is_sharp_at_the_end_of_whatever_it_optimises(compose_config, overrides, iterations):
+    assert compose_config(*overrides).renderer.sharpening == iterations
 
 
 def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_config):
@@ -375,17 +345,6 @@ def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_
     assert build_part(compose_config(*practical, "renderer.n_gradient_samples=2"), "renderer").n_gradient_samples == 2
 
 
-@pytest.mark.parametrize("name", ["dist", "dvr_64_early_stop", "neus_budget", "custom"])
-def test_a_renderer_loads_as_a_library_with_its_arguments_changed(compose_config, name):
-    known = [field.name for field in fields(load("renderer", name))] if name != "custom" else ["steps"]
-    number = next(one for one in ("steps", "n_ray_samples", "samples", "grid", "most_segments") if one in known)
-    given = {"_target_": "renderers.IDR", **IDR_ARGUMENTS} if name == "custom" else {number: 7}
-    extra = CUSTOM if name == "custom" else [f"renderer.{number}=7"]
-    found = load("renderer", name, **given)
-    assert found == build_part(compose_config(f"renderer={name}", *extra), "renderer")
-    assert getattr(found, number) == 7
-
-
 def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, monkeypatch):
     (tmp_path / "mypkg_of_mine.py").write_text(
         "class Mine:\n    def __init__(self, size=1):\n        self.size = size\n"
@@ -393,8 +352,6 @@ def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, m
         "    def silhouette_loss(self, field, rays, rendering, mask): ...\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ValueError, match=r"renderer\._target_ must be given: set renderer\._target_=PACKAGE\.CLASS"):
-        build_part(compose_config("renderer=custom"), "renderer")
     with pytest.raises(ValueError, match=r"renderer\._target_ must be given"):
         load("renderer", "custom")
     with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
@@ -404,83 +361,40 @@ def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, m
     assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
     with pytest.raises(ValueError, match="renderer has no key 'sise': did you mean size"):
         load("renderer", "custom", _target_="mypkg_of_mine.Mine", sise=3)
-    with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': add its package"):
-        other = compose_config(  # leave for the renderer is not leave for all
-            "renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "dataset._target_=mypkg_of_mine.Mine"
-        )
-        build_part(other, "dataset")
+    with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': type packages="):
+        build({"_target_": "mypkg_of_mine.Mine"}, "dataset")  # only the renderer names its package by its class
 
 
-def test_a_variant_loads_as_a_library_with_what_it_builds_on():
+def test_a_choice_loads_as_a_library_with_what_it_builds_on_and_says_what_is_wrong():
     assert load("renderer", "dist_coarse_to_fine") == PAPER
-    assert load("renderer", "naive_practical_parallel", steps=7) == replace(
-        FIRST, gradient="practical", n_gradient_samples=1, serial=False, steps=7)  # fmt: skip
-    with pytest.raises(ValueError, match=r"renderer has no key 'samples': did you mean .*n_gradient_samples"):
-        load("renderer", "dist_aggressive", samples=3)
+    practical = replace(FIRST, gradient="practical", n_gradient_samples=1, serial=False, steps=7)
+    assert load("renderer", "naive_practical_parallel", steps=7) == practical
+    for wrong, name, more in (
+        ("renderer has no key 'samples': did you mean .*n_gradient_samples", "dist_aggressive", {"samples": 3}),
+        ("unknown renderer 'dits': did you mean dist", "dits", {}),
+        ("renderer has no key 'step': did you mean steps", "dist", {"step": 7}),
+    ):
+        with pytest.raises(ValueError, match=wrong):
+            load("renderer", name, **more)
 
 
-def test_loading_tells_of_mistakes():
-    with pytest.raises(ValueError, match="unknown renderer 'dits': did you mean dist"):
-        load("renderer", "dits")
-    with pytest.raises(ValueError, match="renderer has no key 'step': did you mean steps"):
-        load("renderer", "dist", step=7)
-
-
-def test_a_dataset_of_meshes_asks_for_its_path(compose_config):
-    with pytest.raises(ValueError, match=r"dataset\.path must be given: set dataset\.path="):
-        build_part(compose_config("dataset=mesh"), "dataset")
-
-
-@pytest.mark.parametrize(
-    ("part", "override", "message"),
-    [
-        ("renderer", "+renderer.stepz=3", r"renderer has no key 'stepz': did you mean steps"),
-        ("renderer", "+renderer.epsilom=1", r"renderer has no key 'epsilom': did you mean epsilon"),
-        ("task", "+task.silhouete_weight=1", r"task has no key 'silhouete_weight': did you mean silhouette_weight"),
-        ("dataset", "+dataset.resolutions=1", r"dataset has no key 'resolutions': did you mean resolution"),
-        ("prior", "+scale.network.widht=1", r"prior\.network has no key 'widht': did you mean width"),
-        ("renderer", "+renderer.xyzzy=1", r"renderer has no key 'xyzzy': it has active_only, alpha, .*steps"),
-    ],
-)
-def test_an_unknown_key_is_told_with_the_nearest(compose_config, part, override, message):
-    with pytest.raises(ValueError, match=message):
-        build_part(compose_config(override), part)
-
-
-@pytest.mark.parametrize(
-    ("part", "override", "message"),
-    [
-        ("renderer", "renderer.steps=many", r"renderer\.steps: .*'many'.*expected int"),
-        ("renderer", "renderer.steps=1.5", r"renderer\.steps: .*expected int"),
-        ("renderer", "renderer.alpha=[1]", r"renderer\.alpha: .*expected float"),
-        ("renderer", "renderer.epsilon=null", r"renderer\.epsilon: .*expected float"),
-        ("renderer", "renderer.active_only=perhaps", r"renderer\.active_only: .*expected bool"),
-        ("renderer", "renderer.extra_step_cap=wide", r"renderer\.extra_step_cap: .*expected float \| None"),
-        ("dataset", "dataset.ranges=7", r"dataset\.ranges: .*expected dict"),
-        ("prior", "scale.network.width=wide", r"prior\.network\.width: .*expected int"),
-    ],
-)
-def test_a_value_of_the_wrong_type_is_told_with_its_key(compose_config, part, override, message):
-    with pytest.raises(ValueError, match=message):
-        build_part(compose_config(override), part)
-
-
-@pytest.mark.parametrize(
-    ("part", "override", "message"),
-    [
-        ("renderer", "renderer.steps=0", "steps must be at least 1, not 0"),
-        ("renderer", "renderer.alpha=0.5", "alpha must be at least 1, not 0.5"),
-        ("renderer", "renderer.epsilon=0", "epsilon must be positive, not 0"),
-        ("renderer", "renderer.epsilon=nan", "epsilon must be positive, not nan"),
-        ("renderer", "renderer.n_gradient_samples=0", "n_gradient_samples must be at least 1, not 0"),
-        ("renderer", "renderer.step_clamp=-1", "step_clamp must be positive, not -1.0: step_clamp=null"),
-        ("renderer", "renderer.sphere_radius=-1", "sphere_radius must be positive"),
-        ("renderer", "renderer.silhouette_average=some", "silhouette_average must be one of all, violating"),
-        ("task", "task.code.average=median", "task.code.average must be one of sum, mean, not 'median'"),
-        ("dataset", "dataset.resolution=1", "resolution must be at least 16, not 1"),
-    ],
-)  # fmt: skip
-def test_a_value_out_of_range_is_told_with_the_remedy(compose_config, part, override, message):
+@each("part, override, message", [
+    ("renderer", "+renderer.epsilom=1", r"renderer has no key 'epsilom': did you mean epsilon"),
+    ("prior", "+scale.network.widht=1", r"prior\.network has no key 'widht': did you mean width"),
+    ("renderer", "+renderer.xyzzy=1", r"renderer has no key 'xyzzy': it has active_only, alpha, .*steps"),
+    ("renderer", "renderer.steps=1.5", r"renderer\.steps must be a whole number, not 1\.5"),
+    ("renderer", "renderer.alpha=[1]", r"renderer\.alpha must be a number, not \[1\]"),
+    ("renderer", "renderer.epsilon=null", r"renderer\.epsilon must be a number, not None"),
+    ("renderer", "renderer.active_only=perhaps", r"renderer\.active_only must be true or false, not 'perhaps'"),
+    ("renderer", "renderer.extra_step_cap=wide", r"renderer\.extra_step_cap must be a number or null, not 'wide'"),
+    ("dataset", "dataset.ranges=7", r"dataset\.ranges must be keys and values, not 7"),
+    ("prior", "scale.network.width=wide", r"prior\.network\.width must be a whole number, not 'wide'"),
+    ("renderer", "renderer.alpha=0.5", "alpha must be at least 1, not 0.5"),
+    ("renderer", "renderer.silhouette_average=some", "silhouette_average must be one of all, violating"),
+    ("task", "task.code.average=median", r"task\.code\.average must be one of sum, mean, not 'median'"),
+    ("task", "task.silhouette=hinge", r"task\.silhouette must have a _target_, not be 'hinge'"),
+])  # fmt: skip
+def test_a_wrong_key_or_value_is_an_error_with_the_remedy(compose_config, part, override, message):
     with pytest.raises(ValueError, match=message):
         build_part(compose_config(override), part)
 
@@ -490,32 +404,15 @@ def test_a_setting_within_another_says_where_it_stands(compose_config):
         build_part(compose_config("task=multiview", "task.images.noise=-1"), "task")
 
 
-def test_naive_checks_its_numbers_as_dist_does(compose_config):
-    for override in ("steps=0", "epsilon=0", "sphere_radius=0", "silhouette_average=some"):
-        with pytest.raises(ValueError, match=override.split("=")[0]):
-            build_part(compose_config("renderer=naive", f"renderer.{override}"), "renderer")
-
-
-def test_a_target_outside_our_packages_needs_leave(compose_config):
-    config = compose_config("renderer._target_=os.system")
-    with pytest.raises(ValueError, match=r"renderer\._target_ names 'os\.system': os is of Python's standard library"):
-        build_part(config, "renderer")
-    for target in ("renderers.DISTT", "renderers.nowhere.DIST"):
-        with pytest.raises(ValueError, match=rf"renderer\._target_ names '{target}', which cannot be imported"):
-            build_part(compose_config(f"renderer._target_={target}"), "renderer")
-
-
 def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
-    with pytest.raises(
-        ValueError, match=r"silhouette is read by task=completion, .*reconstruction and single_view alone"
-    ):
+    with pytest.raises(ValueError, match=r"only task=completion, .*reconstruction and single_view read silhouette"):
         check_names(compose_config("task=gradients", "silhouette=hinge"))
-    for task in ("completion", "pose", "capacity", "stability", "gradients"):
+    for task in ("completion", "stability", "gradients"):
         check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
 
 
 def test_a_draw_is_refused_where_no_setting_is_drawn(compose_config):
-    with pytest.raises(ValueError, match=r"draw is read by a method of method/space alone: add \+method=space/NAME"):
+    with pytest.raises(ValueError, match=r"only a method of method/space reads draw: add \+method=space/NAME"):
         check_draw(compose_config("renderer=dist", "draw=3"))
     check_draw(compose_config("+method=space/dist_mask", "draw=3"))
 
@@ -524,8 +421,3 @@ def test_a_name_of_a_folder_is_compared_with_the_names_there():
     known = ["dist_mask", "tuned/dist_mask", "tuned/idr_mask", "space/dist_mask"]
     assert nearest("tuned/dist_masc", known).startswith(": did you mean tuned/dist_mask")
     assert "did you mean dist_mask" in nearest("dist_masc", known)
-
-
-def test_a_mask_loss_is_a_file_and_no_name(compose_config):
-    with pytest.raises(ValueError, match=r"task\.silhouette must have a _target_, not be 'hinge'"):
-        build(compose_config("task.silhouette=hinge").task, "task")

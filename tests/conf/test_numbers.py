@@ -1,6 +1,6 @@
 """Numbers of the papers that stand in YAML, typed a second time."""
 
-import pytest
+from tests.looped import each
 
 # Override of the default configuration, key, value, and where the paper states it.
 STATED = [
@@ -33,7 +33,7 @@ STATED = [
 ]
 
 
-@pytest.mark.parametrize(("override", "key", "value", "where"), STATED, ids=[f"{o} {k}" for o, k, _, _ in STATED])
+@each("override, key, value, where", STATED)
 def test_a_number_of_a_paper_is_as_stated(compose_config, override, key, value, where):
     node = compose_config(override)
     for part in key.split("."):

@@ -12,9 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, build
-from bench.records.files import to_json, write_text
-from bench.records.read import read_records
-from bench.records.record import Record, row_name
+from bench.records.record import row_name
 from bench.run import sweep
 from bench.run.command import command_line
 from bench.tables import names, register_rows
@@ -146,29 +144,9 @@ def test_combinations_are_those_that_hydra_runs(swept):
     ]
 
 
-def test_a_renderer_file_that_is_no_mapping_is_named(swept, tmp_path, capsys):
-    (tmp_path / "conf/renderer").mkdir(parents=True)
-    (tmp_path / "conf/renderer/list.yaml").write_text("- 1\n")
-    with pytest.raises(IndexError):  # there is no plan
-        swept("+experiment=table1", folder=tmp_path / "conf")
-    assert "renderer/list.yaml must hold keys and values" in capsys.readouterr().err
-
-
-def test_records_and_plans_without_a_method_are_read(tmp_path):
-    (tmp_path / "runs").mkdir()
-    folder = tmp_path / "sweeps/old"
-    folder.mkdir(parents=True)
-    cell = {"id": "a", "overrides": [], "task": "pose", "renderer": "dist", "dataset": "car", "seed": 0, "config": {}}
-    write_text(folder / "plan.json", to_json({"schema": 1, "name": "old", "asked": "2026-01-01", "cells": [cell]}))
-    planned, problems = read_records(tmp_path)
-    assert ([one["method"] for one in planned], problems) == ([""], [])
-    record = Record("a", "pose", "dist", "car", 0, {"renderer": {"_label_": "DIST"}}, method="pose_dist")
-    assert record.name == "DIST"
-    old = {key: value for key, value in record.__dict__.items() if key != "method"}
-    assert Record.of(old).method == ""
-    assert OmegaConf.create(record.config).renderer._label_ == "DIST"
-
-
+MINE = (
+    "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}\n"
+)
 SPACE = "label: Mine\ntask:\n  silhouette_weight: ${drawn:0,1.0,100.0}\n"
 
 
@@ -193,20 +171,19 @@ def test_methods_of_ones_own_may_be_rows_of_tables(swept, tmp_path):
     assert plan.cells[0].config["label"] == "Mine" and 1 < plan.cells[0].config["renderer"]["alpha"] < 2
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("mine: 3\n", r"variants\.yaml: mine must be a row, \{key: value\}, not 3"),
-        ("- mine\n", r"variants\.yaml must hold keys and values"),
-        ("mine: {a: 1\n", r"variants\.yaml cannot be read: while parsing"),
-    ],
-)
-def test_a_table_that_is_none_is_named(swept, tmp_path, capsys, text, told):
-    (tmp_path / "own").mkdir()
-    (tmp_path / "own/variants.yaml").write_text(text)
+@pytest.mark.parametrize(("file", "text", "message"), [
+    ("variants.yaml", "mine: 3\n", "variants.yaml: mine must be a row, {key: value}, not 3"),
+    ("variants.yaml", "- mine\n", "variants.yaml must hold keys and values"),
+    ("variants.yaml", "mine: {a: 1\n", "variants.yaml cannot be read: while parsing"),
+    ("renderer/list.yaml", "- 1\n", "renderer/list.yaml must hold keys and values"),
+    ("experiment/mine.yaml", MINE, "${methods:space,...} leaves out neus: not in method/space"),
+])  # fmt: skip
+def test_a_broken_file_of_the_users_is_named(swept, tmp_path, capsys, file, text, message):
+    (tmp_path / "own" / file).parent.mkdir(parents=True)
+    (tmp_path / "own" / file).write_text(text)
     with pytest.raises(IndexError):  # there is no plan
-        swept("seed=0,1", folder=tmp_path / "own")
-    assert re.search(told, capsys.readouterr().err)
+        swept("+experiment=mine" if "experiment" in file else "+experiment=table1", folder=tmp_path / "own")
+    assert message in capsys.readouterr().err
 
 
 def own_methods(folder: Path) -> None:
@@ -240,16 +217,6 @@ def test_slow_methods_join_the_tuning_by_the_command_that_its_file_names(swept):
     assert {cell.config["experiment"] for cell in plan.cells} == {"tuning"}
 
 
-def test_a_method_without_a_space_cannot_be_left_out(swept, tmp_path, capsys):
-    path = tmp_path / "own/experiment/mine.yaml"
-    path.parent.mkdir(parents=True)
-    sweep_over = "hydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}"
-    path.write_text(f"# @package _global_\ndefaults: [tuning, _self_]\n{sweep_over}\n")
-    with pytest.raises(IndexError):  # there is no plan
-        swept("+experiment=mine", folder=tmp_path / "own")
-    assert "${methods:space,...} leaves out neus: not in method/space" in capsys.readouterr().err
-
-
 def test_a_sweep_composes_its_choices_once_for_the_plan_and_each_cell_once_to_run_it(swept, monkeypatch):
     composed, compose = [], ConfigLoaderImpl.load_sweep_config
 
@@ -263,21 +230,13 @@ def test_a_sweep_composes_its_choices_once_for_the_plan_and_each_cell_once_to_ru
     assert len(composed) == 1 + 3
 
 
-def test_a_row_without_masks_is_not_named_by_a_loss_of_them():
-    config = {"label": "Newton, RGB", "silhouette": {"_label_": "IDR's mask loss"}, "task": {"masks": False}}
-    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
-    config["task"]["masks"] = True
-    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, IDR's mask loss"
-
-
-@pytest.mark.parametrize(("file", "text"), [
-    ("variants.yaml", "dist: {base: idr, steps: 3}\n"),
-    ("methods.yaml", "dist_mask: {renderer: idr, label: DIST with mask}\n"),
-    ("renderer/dist_aggressive.yaml", "defaults: [dist, _self_]\n"),
-])  # fmt: skip
-def test_a_choice_of_a_user_takes_no_name_of_ours(tmp_path, file, text):
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    (tmp_path / file).write_text(text)
-    with pytest.raises(ValueError, match=r"already: give the (row|file) another name"):
-        register_rows([tmp_path])
+def test_a_choice_of_a_user_takes_no_name_of_ours(tmp_path):
+    for number, (file, text) in enumerate(
+        {"variants.yaml": "dist: {base: idr}\n", "renderer/dist_aggressive.yaml": "defaults: [dist, _self_]\n"}.items()
+    ):
+        path = tmp_path / str(number) / file
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"already: give the (row|file) another name"):
+            register_rows([tmp_path / str(number)])
     register_rows()

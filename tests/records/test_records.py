@@ -4,8 +4,6 @@ import errno
 import json
 import math
 import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -48,6 +46,24 @@ def test_a_status_that_there_is_not_is_not_read(tmp_path):
     records, (problem,) = read_records(tmp_path)
     assert records == []
     assert "status in record.json must be one of ok, " in problem and "found 'splendid'" in problem
+
+
+def test_records_and_plans_without_a_method_are_read(tmp_path):
+    folder = tmp_path / "sweeps/old"
+    folder.mkdir(parents=True)
+    (tmp_path / "runs").mkdir()
+    cell = {"id": "a", "overrides": [], "task": "pose", "renderer": "dist", "dataset": "car", "seed": 0, "config": {}}
+    write_text(folder / "plan.json", to_json({"schema": 1, "name": "old", "asked": "2026-01-01", "cells": [cell]}))
+    planned, problems = read_records(tmp_path)
+    assert ([one["method"] for one in planned], problems) == ([""], [])
+    assert Record.of({key: value for key, value in make_record().__dict__.items() if key != "method"}).method == ""
+
+
+def test_a_row_is_named_by_its_loss_of_the_mask_unless_it_has_no_masks():
+    config = {"label": "Newton, RGB", "silhouette": {"_label_": "IDR's mask loss"}, "task": {"masks": False}}
+    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
+    config["task"]["masks"] = True
+    assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, IDR's mask loss"
 
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
@@ -98,20 +114,6 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
         assert metrics["fscore"] == 0.5
     assert math.isnan(read["gemm_fraction"])
     assert read["flops"] is None
-
-
-def test_odd_numbers_deep_inside_are_written_too():
-    text = to_json({"a": [1, (math.nan, {"b": math.inf})], 3: "ünïcode"})
-    assert json.loads(text, parse_constant=pytest.fail) == {"a": [1, ["nan", {"b": "inf"}]], "3": "ünïcode"}
-
-
-def test_files_are_utf_8_whatever_the_locale(tmp_path):
-    code = "import sys, pathlib; from bench.records.files import write_text; write_text(pathlib.Path(sys.argv[1]), 'ü')"
-    options = ["-X", "utf8=0", "-X", "warn_default_encoding", "-W", "error::EncodingWarning"]
-    command = [sys.executable, *options, "-c", code, str(tmp_path / "text")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2], check=False)
-    assert "EncodingWarning" not in done.stderr, "write_text takes the encoding of the locale"
-    assert (tmp_path / "text").read_bytes() == "ü".encode()
 
 
 def test_a_digest_knows_data_and_not_the_order_of_its_keys():

@@ -9,7 +9,7 @@ import torch
 from bench.config import load
 from bench.records.record import Record
 from bench.run.execute import execute
-from bench.run.messages import Job
+from bench.run.process import Job
 from bench.setup.auto import samples
 from renderers.adaptive_samples import Following, Seen, at_max_samples, follow, thickness, thinnest
 from renderers.field import Kind, Meter

@@ -79,7 +79,7 @@ def test_a_record_from_elsewhere_with_an_odd_value_leaves_the_table_whole(result
 
 def test_no_runs_are_a_table_and_no_folder_an_error(tmp_path):
     assert [path.name for path in write_frame([], tmp_path)] == ["runs.csv", "results.parquet"]
-    with pytest.raises(ValueError, match="must be an existing folder"):
+    with pytest.raises(ValueError, match="there is no such folder"):
         bench.load(tmp_path / "nowhere")
 
 

@@ -208,7 +208,7 @@ def test_command_prints_the_page_last(results):
 @pytest.mark.parametrize(
     ("argument", "named"),
     [
-        ("results_dir=/no/such/folder", "results_dir must be an existing folder"),
+        ("results_dir=/no/such/folder", "there is no such folder; name one that has runs, or make a run"),
         ("result_dir=x", "results_dir"),
         ("results_dir=", "results_dir"),
         ("meshes=many", "a number of runs or all"),

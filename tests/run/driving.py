@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
+import torch
 from hydra.core.global_hydra import GlobalHydra
 
 from bench.__main__ import main
+from bench.machine.environment import using_threads
 from bench.run import process
 
 ROOT = Path(__file__).parents[2]
@@ -35,6 +37,11 @@ class Outcome(NamedTuple):
     err: str
 
 
+def errors(err: str) -> list[str]:
+    """The lines of an output of errors, without that by which a sweep says what it does."""
+    return [line for line in err.splitlines() if not line.startswith("sweep: ")]
+
+
 def record_of(out: str) -> dict:
     """The record in the run folder that is the last line of an output."""
     return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
@@ -45,6 +52,7 @@ def command(*arguments: str) -> Outcome:
     GlobalHydra.instance().clear()
     out, err = io.StringIO(), io.StringIO()
     with (
+        using_threads(torch.get_num_threads()),
         mock.patch.dict(os.environ),  # what the command sets is put back
         mock.patch.object(sys, "argv", ["bench", *arguments]),
         contextlib.redirect_stdout(out),

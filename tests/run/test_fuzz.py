@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,9 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.__main__ import main
 from bench.config import CONF, register
 from bench.run.command import USAGE, _dotted
-from tests.run.driving import FAILING
+from tests.run.driving import FAILING, command
 
 LIMITS = ("time_limit=3", "memory_limit=2")
 FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit", "rerun", "tracker", "verbose", "label"}
@@ -48,12 +46,8 @@ def results(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-def check(capsys, monkeypatch, results: Path, overrides: list[str]) -> None:
-    GlobalHydra.instance().clear()
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    monkeypatch.setattr(sys, "argv", ["bench", *FAILING_DIST, *LIMITS, *overrides, f"results_dir={results}"])
-    code = main()
-    out, err = capsys.readouterr()
+def check(results: Path, overrides: list[str]) -> None:
+    code, out, err = command(*FAILING_DIST, *LIMITS, *overrides, f"results_dir={results}")
     assert "Traceback" not in out + err, overrides
     if code == USAGE:
         assert len(err.strip().splitlines()) == 1, (overrides, err)
@@ -79,15 +73,15 @@ RELAXED = settings(
 )
 
 
-@settings(RELAXED, max_examples=20)
+@settings(RELAXED, max_examples=10)
 @given(overrides=st.lists(OVERRIDES, min_size=1, max_size=2))
-def test_twenty_command_lines(capsys, monkeypatch, results, overrides):
-    check(capsys, monkeypatch, results, overrides)
+def test_ten_command_lines(results, overrides):
+    check(results, overrides)
 
 
 @pytest.mark.slow
 @seed(3)
 @settings(RELAXED, max_examples=300, derandomize=False)
 @given(overrides=st.lists(OVERRIDES, min_size=1, max_size=2))
-def test_three_hundred_command_lines(capsys, monkeypatch, results, overrides):
-    check(capsys, monkeypatch, results, overrides)
+def test_three_hundred_command_lines(results, overrides):
+    check(results, overrides)

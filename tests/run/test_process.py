@@ -2,19 +2,17 @@
 
 import json
 import multiprocessing
-import os
 import signal
 import subprocess
-import sys
 import time
 from types import SimpleNamespace
 
 import pytest
 
 from bench.run import process
-from bench.run.messages import Started, Step
-from bench.run.process import RunLimits, _watch
-from tests.run.driving import FAILING, ROOT, at_work, driver, lines_of_curves, record_of, wait_for
+from bench.run.process import RunLimits, Started, Step, _watch
+from tests.looped import each
+from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
 # How it fails, with which limits; the status that must come of it, and words of the reason.
@@ -57,93 +55,58 @@ def test_a_run_that_ends_badly_says_how(request, isolated, tmp_path, how):
     assert "Traceback" not in err
     assert record["reason"] in " ".join(err.split())
     assert at_work(tmp_path) == []  # its process is gone, whatever it was busy with
+    assert how != "raise" or "RuntimeError: it failed on request" in "\n".join(record["log"])
 
 
-@pytest.mark.parametrize(("steps", "when"), [
+@each("steps, when", [
     ([], "while setting up"),
     ([("training the prior", 50, 6500), ("training the prior", 100, 6500)], "while training the prior (100 of 6500)"),
     ([("training the prior", 6500, 6500), ("optimising", 3, 20)], "while optimising (3 of 20)"),
     ([("optimising", 20, 20)], "after optimising (20 of 20)"),
 ])  # fmt: skip
-@pytest.mark.parametrize(("limits", "what"), [
-    (RunLimits(seconds=0.01, memory=None), "more than time_limit=0.01 s, "),
-    (RunLimits(seconds=None, memory=1e-6), "more than 1e-06 GiB of memory (memory_limit), "),
-])  # fmt: skip
-def test_a_limit_says_in_which_phase_it_was_reached(limits, what, steps, when):
-    ours, childs = multiprocessing.Pipe()
-    child = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
-    child.start()
-    try:
+def test_a_limit_says_in_which_phase_it_was_reached(child, steps, when):
+    for limits, what in (
+        (RunLimits(seconds=0.01, memory=None), "more than time_limit=0.01 s, "),
+        (RunLimits(seconds=None, memory=1e-6), "more than 1e-06 GiB of memory (memory_limit), "),
+    ):
+        ours, childs = multiprocessing.Pipe()
         for message in (Started(), *(Step(*step, loss=None) for step in steps)):
             childs.send(message)
         ending = _watch(child, ours, limits, lambda message: None)
-    finally:
-        child.kill()
-        child.join()
-    assert ending is not None and ending.reason == what + when
+        assert ending is not None and ending.reason == what + when
 
 
-def test_a_crash_leaves_the_end_of_its_log_in_the_record(isolated):
-    _, out, _ = isolated(*FAILING, "+renderer.how=raise")
-    log = "\n".join(record_of(out)["log"])
-    assert "Traceback" in log
-    assert "RuntimeError: it failed on request" in log
-
-
-def test_without_isolation_it_runs_in_this_process(isolated):
-    code, out, _ = isolated(*FAILING, "+renderer.how=raise", "isolation=off")
-    assert code == 1
-    assert record_of(out)["reason"] == "it failed on request"
+@pytest.fixture
+def child(monkeypatch):
+    """A process that does nothing; it is not killed at a limit."""
+    started = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    started.start()
+    kill = started.kill
+    monkeypatch.setattr(started, "kill", lambda: None)
+    yield started
+    kill()
+    started.join()
 
 
 @pytest.mark.parametrize(("how", "words"), [
-    ("nothing", "Failing.render must return a Rendering, not None"),
+    ("raise", "it failed on request"),
     ("short", "Failing.render: distance must have the shape [12, 12], not [11, 12]"),
-    ("double", "Failing.render: distance must be float32, as the rays are, not float64"),
-    ("detached", "Failing.capabilities.field_gradient is True, but the distances of its hits carry no gradient"),
-    ("no_loss", "Failing.silhouette_loss must return a tensor with one number, not None"),
-    ("loss_per_ray", "Failing.silhouette_loss must return one floating-point number of shape [], not float32 of shape"),
     ("detached_loss", "Failing.capabilities.field_gradient is True, but its silhouette loss carries no gradient"),
 ])  # fmt: skip
-def test_a_renderer_that_breaks_its_contract_ends_the_run_with_what_it_broke(isolated, how, words):
-    code, out, _ = isolated(*FAILING, f"+renderer.how={how}", "isolation=off", "evaluation.picture=null")
+def test_without_isolation_it_fails_in_this_process_and_says_how(isolated, how, words):
+    code, out, _ = isolated(*FAILING, f"+renderer.how={how}", "isolation=off")
     record = record_of(out)
     assert code == 1
     assert (record["status"], words in record["reason"]) == ("crashed", True), record["reason"]
     assert record["metrics_start"]["chamfer_l2"] > 0  # what was known before is kept
 
 
-@pytest.mark.parametrize(("argument", "words"), [
-    ("time_limit=0", "time_limit must be positive"),
-    ("memory_limit=-1", "memory_limit must be positive"),
-    ("isolation=maybe", "isolation"),
-    ("rerun=sometimes", "rerun"),
-])  # fmt: skip
-def test_a_limit_that_cannot_be_is_told(isolated, argument, words):
-    code, _, err = isolated(*FAILING, argument)
-    assert code != 0
-    assert words in err
-    assert len(err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("own", [True, False], ids=["with its server", "its server lives on"])
-def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path, own):
-    """A run is forked from a server of processes, which dies with its driver unless others use it."""
+def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
     arguments = (*FAILING, "+renderer.how=native_loop", f"results_dir={tmp_path / 'r'}")
-    if own:
-        command = [sys.executable, "-m", "bench", *arguments]
-        running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            wait_for(lambda: lines_of_curves(tmp_path / "r") or running.poll() is not None)
-            assert at_work(tmp_path)
-        finally:
-            running.kill()
-            running.wait()
-    else:
-        with driver(tmp_path / "output", *arguments) as forked:
-            wait_for(lambda: lines_of_curves(tmp_path / "r"), forked)
-            assert at_work(tmp_path)
-            assert forked.send(signal.SIGKILL).code == -signal.SIGKILL
+    with driver(tmp_path / "output", *arguments) as forked:
+        wait_for(lambda: lines_of_curves(tmp_path / "r"), forked)
+        assert at_work(tmp_path)
+        assert forked.send(signal.SIGKILL).code == -signal.SIGKILL
     wait_for(lambda: not at_work(tmp_path))
 
 
@@ -168,12 +131,3 @@ def test_a_disk_that_fills_up_leaves_a_record_that_says_so(isolated, small_disk)
     assert record["status"] == "crashed"
     assert "No space left on device" in record["reason"]
     assert record["metrics"]["chamfer_l2"] > 0  # what was measured before is kept
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_cannot_be_written_is_told(isolated, tmp_path):
-    (tmp_path / "r" / "runs").mkdir(parents=True)
-    (tmp_path / "r" / "runs").chmod(0o500)
-    code, _, err = isolated(*FAILING, "+renderer.how=not")
-    assert code == 1
-    assert "set results_dir to a folder you can write" in err

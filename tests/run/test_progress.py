@@ -1,13 +1,13 @@
 """What is said of the progress where there is no terminal."""
 
 import io
-import re
 
 import pytest
 from rich.console import Console
 from rich.progress import Progress
 
 from bench import progress
+from tests.looped import each
 
 
 @pytest.fixture
@@ -24,7 +24,9 @@ def test_a_phase_that_takes_long_says_now_and_then_how_far_it_is(clock, capsys):
         for done in range(1, 101):
             clock[0] += 0.5
             report("training the prior", done, 100, 0.25)
-    assert capsys.readouterr().err.splitlines() == [
+    said = capsys.readouterr()
+    assert said.out == "" and all(letter.isprintable() or letter == "\n" for letter in said.err)
+    assert said.err.splitlines() == [
         "DIST: training the prior, 31%, about 33 s left",
         "DIST: training the prior, 61%, about 19 s left",
         "DIST: training the prior, 91%, about 4 s left",
@@ -40,7 +42,7 @@ def test_short_phases_say_nothing(clock, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("width", [40, 79, 80, 120])
+@each("width", [40, 79, 80, 120])
 def test_a_line_of_progress_fits_its_terminal(width):
     file = io.StringIO()
     console = Console(width=width, force_terminal=True, color_system=None, file=file)
@@ -51,28 +53,3 @@ def test_a_line_of_progress_fits_its_terminal(width):
     assert len(line) <= width
     assert "20/200" in line and "1:02:05" in line
     assert ("3 failed" in line) is (width >= 80)
-
-
-def test_what_is_piped_has_no_control_character(clock, capsys, monkeypatch):
-    monkeypatch.setenv("NO_COLOR", "1")
-    with progress.run_progress("DIST") as report:
-        for done in range(1, 101):
-            clock[0] += 0.5
-            report("training the prior", done, 100)
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err and all(letter.isprintable() or letter == "\n" for letter in said.err)
-
-
-@pytest.mark.parametrize("unwanted", [True, False])
-def test_colours_are_left_out_where_they_are_not_wanted(monkeypatch, unwanted):
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    if unwanted:
-        monkeypatch.setenv("NO_COLOR", "1")
-    file = io.StringIO()
-    console = Console(width=80, force_terminal=True, color_system="truecolor", file=file)
-    shown = Progress(*progress.columns(80), console=console)
-    shown.add_task("sweep", total=200, completed=20, said="")
-    console.print(shown.get_renderable())
-    coloured = re.search(r"\x1b\[[0-9;]*\b(3[0-7]|38|9[0-7])\b[0-9;]*m", file.getvalue())
-    assert (coloured is None) is unwanted

@@ -63,7 +63,7 @@ def test_a_sweep_of_30_killed_at_20_moments_ends_as_one_that_was_not(tmp_path):
 def test_what_is_finished_is_reused_and_failures_are_tried_again_on_request(isolated, tmp_path):
     times = []
     for more in ((), (), ("rerun=failed",), ("rerun=all",)):
-        isolated("-m", *FAILING, "+renderer.how=not,raise", *more)
+        isolated("-m", *FAILING, "+renderer.how=not,raise", "isolation=off", *more)
         records = {r["config"]["renderer"]["how"]: r for r in read_records(tmp_path / "r")[0]}
         times.append(
             {how: (record["ended"], record["seconds"]["total"], record["reused"]) for how, record in records.items()}
@@ -88,7 +88,7 @@ def test_other_code_is_no_reason_to_reuse(isolated, tmp_path, monkeypatch):
         with (package / "mypkg.py").open("a") as file:
             file.write(change)
         _package.cache_clear()  # a command looks at the code once
-        outputs.append(isolated(*FAILING, "renderer._target_=mypkg.Failing", "+renderer.how=not").out)
+        outputs.append(isolated(*FAILING, "renderer._target_=mypkg.Failing", "isolation=off").out)
     assert ["reused: the run of" in output for output in outputs] == [False, True, False]
     assert len({output.splitlines()[-1] for output in outputs}) == 1
 
@@ -104,26 +104,26 @@ def test_two_launches_at_once_run_a_cell_once(tmp_path):
 
 def test_what_had_not_quite_ended_is_not_reused(isolated, tmp_path):
     """The driver may be killed after a run's last word, and before it wrote what that came to."""
-    isolated(*FAILING, "+renderer.how=not")
+    isolated(*FAILING, "isolation=off")
     (path,) = (tmp_path / "r").glob("runs/*/record.json")
     record = json.loads(path.read_text())
     path.write_text(json.dumps(record | {"ended": ""}))
-    _, out, _ = isolated(*FAILING, "+renderer.how=not")
+    _, out, _ = isolated(*FAILING, "isolation=off")
     assert "reused" not in out
     assert json.loads(path.read_text())["ended"]
 
 
-@pytest.mark.parametrize("damage", ['{"schema": 99}', "[" * 100_000])
-def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path, damage):
-    isolated(*FAILING, "+renderer.how=raise")
+def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path):
+    failing = (*FAILING, "+renderer.how=raise", "isolation=off")
+    isolated(*failing)
     (path,) = (tmp_path / "r").glob("runs/*/record.json")
-    path.write_text(damage)
-    code, out, err = isolated(*FAILING, "+renderer.how=raise")
-    assert code == 1
-    assert "Traceback" not in out + err
-    assert json.loads(path.read_text())["status"] == "crashed"
-    (aside,) = (tmp_path / "r" / "earlier").iterdir()
-    assert (aside / "record.json").read_text() == damage
+    for number, damage in enumerate(('{"schema": 99}', "[" * 100_000), 1):
+        path.write_text(damage)
+        code, out, err = isolated(*failing)
+        assert code == 1 and "Traceback" not in out + err
+        assert json.loads(path.read_text())["status"] == "crashed"
+        aside = [folder / "record.json" for folder in (tmp_path / "r" / "earlier").iterdir()]
+        assert len(aside) == number and damage in [file.read_text() for file in aside]
 
 
 def test_a_run_that_failed_by_a_limit_is_run_again_under_another(isolated):

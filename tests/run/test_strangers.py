@@ -2,178 +2,72 @@
 
 import json
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
-from omegaconf import DictConfig, OmegaConf
 
-from bench.config import build, load
+from bench.config import build, find_class, load
 from bench.merge import merge
 from bench.records import folder as run_folder
 from bench.records.read import Plan, PlannedCell, check_links, read_plans, read_records
 from bench.records.record import SCHEMA, Record, RunStatus
 from bench.report.write.html import write_index
-from bench.targets import check_targets, find_class
 from bench.turntable import main as turntable
-from tests.run.driving import command
+from tests.looped import each
+from tests.run.driving import command, errors
 
 MODULE = """
 from pathlib import Path
 Path({mark!r}).touch()
 class Renderer:
-    def __init__(self, *_, **__): Path({made!r}).touch()
+    def __init__(self, *_, **__): pass
     def render(self, field, rays): ...
     def silhouette_loss(self, field, rays, rendering, mask): ...
-class Other:
-    def __init__(self, *_, **__): Path({made!r}).touch()
-class Borrowed(Renderer): __module__ = "elsewhere.renderers"
-def call(*_, **__): Path({made!r}).touch()
+class Other: ...
+def call(*_, **__): ...
 """
+PARTS = {"prior": "bench.shape_prior.autodecoder.PriorSettings", "view": "datasets.views.ViewSampler"}
 
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
-    """A module that leaves a mark when it is imported, and another when something of it is called."""
+    """A module that leaves a mark when it is imported."""
     name = f"strange_{tmp_path.name}"
-    text = MODULE.format(mark=str(tmp_path / "imported"), made=str(tmp_path / "made"))
-    (tmp_path / f"{name}.py").write_text(text)
+    (tmp_path / f"{name}.py").write_text(MODULE.format(mark=str(tmp_path / "imported")))
     monkeypatch.syspath_prepend(tmp_path)
     yield name
     sys.modules.pop(name, None)
 
 
-def attacks(name: str, mark: Path) -> dict[str, tuple[str, ...]]:
-    touch = ("touch", str(mark))
-    program, shell = f"+renderer.args=[{','.join(touch)}]", f"+renderer.command='{' '.join(touch)}'"
-    return {
-        "a program": ("renderer._target_=subprocess.Popen", program),
-        "a program, as a renderer of one's own": ("renderer=custom", "renderer._target_=subprocess.Popen", program),
-        "a program with leave": ("packages=[subprocess]", "renderer._target_=subprocess.Popen", program),
-        "a shell": ("renderer._target_=os.system", shell),
-        "a shell, as a renderer of one's own": ("renderer=custom", "renderer._target_=os.system", shell),
-        "a built-in": ("renderer._target_=builtins.eval", "+renderer.source='1'"),
-        "a module behind ours": ("renderer._target_=bench.records.folder.os.system", shell),
-        "a class behind ours": ("renderer._target_=bench.run.process.multiprocessing.context.Process",),
-        "a function behind ours": ("renderer._target_=renderers.camera.torch.load", f"+renderer.f={mark}"),
-        "a function of ours": ("renderer._target_=bench.config.build",),
-        "a class of ours that is no renderer": ("renderer._target_=bench.records.record.Record",),
-        "a class of another package behind ours": ("renderer._target_=bench.records.folder.Path",),
-        "a task as a tracker": ("tracker._target_=bench.tasks.completion.Completion",),
-        "a tracker": (f"tracker._target_={name}.Other",),
-        "a prior": (f"+prior._target_={name}.Other",),
-        "a setting of a view": (f"+view._target_={name}.Other",),
-        "a nested node": (f"+task.code._target_={name}.Other",),
-        "a nested loss": (f"task.silhouette={{_target_:{name}.Other}}",),
-        "a package smuggled in": (f"renderer._target_={name}.Renderer", f"+renderer._package_={name}"),
-        "a package smuggled into a task": (f"task._target_={name}.Other", f"+task._package_={name}"),
-        "a package under another's name": (
-            "renderer=custom", "renderer._target_=renderers.IDR", f"renderer._package_={name}",
-        ),
-        "no path": ("renderer._target_=Popen",),
-        "no text": ("renderer._target_=[os,system]",),
-        "an empty part": ("renderer._target_=renderers..IDR",),
-    }  # fmt: skip
-
-
-PARTS = {"prior": "bench.shape_prior.autodecoder.PriorSettings", "view": "datasets.views.ViewSampler"}
-
-
-BEHIND_OURS = {  # their package is ours: what they name must be looked at
-    *("a module behind ours", "a class behind ours", "a function behind ours", "a function of ours"),
-    *("a class of ours that is no renderer", "a class of another package behind ours", "a task as a tracker"),
-}
-SMUGGLED = {"a package smuggled in", "a package under another's name"}
-
-
-@pytest.mark.parametrize("how", attacks("", Path()))
-def test_nothing_runs_before_it_is_refused(compose_config, stranger, tmp_path, how):
-    overrides = attacks(stranger, tmp_path / "made")[how]
-    config = plain(compose_config(*overrides))
-    first = refusals([lambda: check_targets(config, overrides, "custom" if "renderer=custom" in overrides else "dist")])
-    assert bool(first) is (how not in BEHIND_OURS)
-    if how in SMUGGLED:  # only the first guard knows the command line
-        return
-    parts = ("renderer", "task", "tracker", *PARTS)
-    second = refusals([lambda p=p: build(config[p], p, config["packages"], PARTS.get(p, "")) for p in parts])
-    assert len(second) == 1
-    assert "\n" not in second[0]
-    assert not (tmp_path / "made").exists()
-    assert not (tmp_path / "imported").exists()
-    assert stranger not in sys.modules
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration as a run's identity has it."""
-    found: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    return found
-
-
-def refusals(calls: Sequence[Callable[[], object]]) -> list[str]:
-    found = []
-    for call in calls:
-        try:
-            call()
-        except ValueError as error:
-            found.append(str(error))
-    return found
-
-
-@pytest.mark.parametrize("how", ["a program, as a renderer of one's own", "a package smuggled in", "a tracker"])
-@pytest.mark.parametrize("multirun", [(), ("-m",)], ids=["one run", "a sweep"])
-def test_the_command_refuses_before_anything_runs(stranger, tmp_path, how, multirun):
-    overrides = attacks(stranger, tmp_path / "made")[how]
-    done = command(*multirun, *overrides, "isolation=off", "scale=smoke", f"results_dir={tmp_path / 'r'}")
-    assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("error: ") and len(done.err.splitlines()) == 1
-    assert not (tmp_path / "made").exists() and not (tmp_path / "imported").exists()
-    assert stranger not in sys.modules
-    assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.parametrize("text", [
-    "# @package _global_\npackages: [{name}]\nrenderer:\n  _target_: {name}.Renderer\n",
-    "# @package _global_\ndefaults:\n  - override /renderer: custom\nrenderer:\n  _target_: {name}.Renderer\n",
-    "# @package _global_\nhydra:\n  sweeper:\n    params:\n      packages: '[{name}]'\n"
-    "      renderer._target_: {name}.Renderer\n",
-    "# @package _global_\nrenderer:\n  _target_: {name}.Renderer\n  _package_: {name}\n",
+@each("part, key", [
+    ("renderer", "renderer._target_"), ("task", "task._target_"), ("prior", "+prior._target_"),
+    ("view", "+view._target_"), ("task", "+task.code._target_"), ("tracker", "tracker._target_"),
 ])  # fmt: skip
-def test_a_yaml_of_a_stranger_grants_no_leave(stranger, tmp_path, text):
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    (tmp_path / "conf" / "experiment" / "theirs.yaml").write_text(text.format(name=stranger))
-    options = ("-m", "--config-dir", str(tmp_path / "conf"), "+experiment=theirs", "seed=0,1", "isolation=off")
-    done = command(*options, f"results_dir={tmp_path / 'r'}")
-    assert done.code == 2, done
-    assert stranger in done.err
-    assert not (tmp_path / "made").exists() and not (tmp_path / "imported").exists()
-    assert not (tmp_path / "r").exists()
+def test_a_package_that_is_not_named_is_not_imported(compose_config, stranger, tmp_path, part, key):
+    config = compose_config(f"{key}={stranger}.Renderer")
+    with pytest.raises(ValueError, match=rf"_target_ names '{stranger}.Renderer': type packages=\[{stranger}\]"):
+        build(config[part], part, [], PARTS.get(part, ""))
+    assert not (tmp_path / "imported").exists() and stranger not in sys.modules
 
 
-def test_a_package_that_the_user_names_is_used(compose_config, stranger, tmp_path):
-    overrides = ("renderer=custom", f"renderer._target_={stranger}.Renderer")
-    config = plain(compose_config(*overrides))
-    check_targets(config, overrides, "custom")
-    assert type(build(config["renderer"], "renderer")).__name__ == "Renderer"
+def test_the_command_refuses_it_before_anything_runs(stranger, tmp_path):
+    for multirun in ((), ("-m",)):
+        done = command(*multirun, f"renderer._target_={stranger}.Renderer", "scale=smoke", f"results_dir={tmp_path}/r")
+        assert (done.code, done.out) == (2, "") and len(errors(done.err)) == 1
+        assert "if you trust it" in done.err and not (tmp_path / "imported").exists()
+        assert not (tmp_path / "r").exists()
+
+
+def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(compose_config, stranger):
+    config = compose_config("renderer=custom", f"renderer._target_={stranger}.Renderer")
+    assert type(build(config.renderer, "renderer")).__name__ == "Renderer"
     assert type(load("renderer", "custom", _target_=f"{stranger}.Renderer")).__name__ == "Renderer"
-    (tmp_path / "made").unlink()
-    for wrong, words in (
-        ("Borrowed", "a class of elsewhere: add its package"),
-        ("Other", "no Renderer: it lacks render, silhouette_loss"),
-        ("call", "which is no class"),
-    ):
+    for wrong, words in (("Other", "no Renderer: it lacks render, silhouette_loss"), ("call", "which is no class")):
         with pytest.raises(ValueError, match=words):
             find_class(f"{stranger}.{wrong}", "renderer", [stranger], None)
-    assert not (tmp_path / "made").exists()
-
-
-def test_each_target_of_a_sweep_may_be_typed(compose_config, stranger):
-    typed = ("renderer=custom", f"renderer._target_={stranger}.Renderer,renderers.IDR")
-    config = plain(compose_config("renderer=custom", f"renderer._target_={stranger}.Renderer"))
-    check_targets(config, typed, "custom")
-    with pytest.raises(ValueError, match="gives no leave"):
-        check_targets(config, ("renderer=custom", "renderer._target_=renderers.IDR"), "custom")
+    with pytest.raises(ValueError, match=r"no PriorSettings: name a class that extends bench\.shape_prior"):
+        build({"_target_": f"{stranger}.Other"}, "prior", [stranger], PARTS["prior"])
 
 
 def write_run(results: Path, name: str) -> Path:
@@ -253,26 +147,20 @@ def test_a_run_is_not_resumed_through_a_link(theirs, tmp_path, place):
     assert (tmp_path / "mine" / "secret.png").read_text() == "secret"
 
 
-@pytest.mark.parametrize("name", ["../../mine", "/etc", "..", ".hidden", "a/b", 3, None])
-def test_a_planned_cell_has_the_name_of_a_folder(theirs, name):
-    cell = {"id": name, "overrides": [], "task": "t", "renderer": "r", "dataset": "d", "seed": 0, "config": {}}
-    plan = {"schema": SCHEMA, "name": "p", "asked": "2026-01-01T00:00:00+00:00", "cells": [cell]}
-    (theirs / "sweeps" / "p").mkdir(parents=True)
-    (theirs / "sweeps" / "p" / "plan.json").write_text(json.dumps(plan))
-    assert read_plans(theirs)[0] == []
-    assert [record["folder"] for record in read_records(theirs)[0]] == ["sound"]
-    (theirs / "sweeps" / "p" / "plan.json").write_text(json.dumps(plan | {"cells": [cell | {"id": "sound-2"}]}))
-    assert len(read_plans(theirs)[0]) == 1
-
-
-@pytest.mark.parametrize("name", ["../../mine", "/etc", "other", 5, None])
-def test_a_plan_has_the_name_of_its_folder(theirs, name):
+def test_a_plan_and_its_cells_have_names_of_folders(theirs):
     cell = {"id": "sound-2", "overrides": [], "task": "t", "renderer": "r", "dataset": "d", "seed": 0, "config": {}}
-    plan = {"schema": SCHEMA, "name": name, "asked": "2026-01-01T00:00:00+00:00", "cells": [cell]}
-    (theirs / "sweeps" / "p").mkdir(parents=True)
-    (theirs / "sweeps" / "p" / "plan.json").write_text(json.dumps(plan))
-    plans, problems = read_plans(theirs)
-    assert plans == [] and "its name must be that of its folder" in problems[0]
+    plan = {"schema": SCHEMA, "name": "p", "asked": "2026-01-01T00:00:00+00:00", "cells": [cell]}
+    path = theirs / "sweeps" / "p" / "plan.json"
+    path.parent.mkdir(parents=True)
+    for name in ("../../mine", "/etc", "..", ".hidden", "a/b", 3, None):
+        path.write_text(json.dumps(plan | {"cells": [cell | {"id": name}]}))
+        assert read_plans(theirs)[0] == [], name
+        assert [record["folder"] for record in read_records(theirs)[0]] == ["sound"]
+        path.write_text(json.dumps(plan | {"name": name}))
+        plans, problems = read_plans(theirs)
+        assert plans == [] and "its name must be that of its folder" in problems[0]
+    path.write_text(json.dumps(plan))
+    assert len(read_plans(theirs)[0]) == 1
 
 
 def test_a_configuration_in_a_run_folder_is_only_text(theirs, stranger, tmp_path):

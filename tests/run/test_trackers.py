@@ -2,11 +2,11 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
+from bench import trackers
 from bench.records.record import read_record
 from bench.trackers import MLflow, TensorBoard, curve, settings, values
 from datasets.extras import install
@@ -39,11 +39,8 @@ def test_content_is_what_the_run_folder_says(finished):
         "metrics.chamfer_l2": 0.002, "metrics_start.chamfer_l2": 0.01, "evaluations.value": 1000.0,
         "seconds.total": 12.5, "flops": 10.0, "gemm_fraction": 0.5,
     }  # fmt: skip
+    assert curve(finished / "none") == []
     assert curve(finished) == [(0, {"seconds": 0.1, "total": 3.0}), (1, {"seconds": 0.2}), (2, {"total": 1.0})]
-
-
-def test_a_run_without_a_curve_has_none(tmp_path):
-    assert curve(tmp_path) == []
 
 
 @pytest.mark.filterwarnings("ignore")  # of MLflow's own libraries
@@ -76,33 +73,23 @@ def test_tensorboard_has_the_run(finished, tmp_path):
     assert events.Scalars("metrics/chamfer_l2")[0].value == pytest.approx(0.002)
 
 
-@pytest.mark.parametrize(("cls", "package"), [(MLflow, "mlflow"), (TensorBoard, "tensorboard")])
-def test_a_tracker_that_is_not_installed_is_told_before_the_run(monkeypatch, cls, package):
-    monkeypatch.setattr(sys.modules[cls.__module__], "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=re.escape(f": {install(package)}")):
-        cls(*("sqlite:///x.db", "e", "a") if cls is MLflow else ("folder",))
+def test_a_tracker_that_is_not_installed_is_an_error_before_the_run(monkeypatch):
+    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=re.escape(f": {install('mlflow')}")):
+        MLflow("sqlite:///x.db", "e", "a")
 
 
-def tracked(monkeypatch, export) -> tuple[str, ...]:
-    """Overrides that choose a tracker whose export is replaced."""
-    monkeypatch.setattr(sys.modules[TensorBoard.__module__], "find_spec", lambda name: True)
-    monkeypatch.setattr(TensorBoard, "export", export)
-    return ("tracker=tensorboard",)
+def test_a_tracker_that_fails_is_noted_and_costs_no_run_and_a_reused_run_is_not_exported_again(isolated, monkeypatch):
+    exported = []
 
-
-def test_a_tracker_that_fails_is_noted_and_costs_no_run(isolated, monkeypatch):
     def fail(self, folder, record):
+        exported.append(folder)
         raise ConnectionError("the server\nis away")
 
-    _, out, _ = isolated(*FAILING, "+renderer.how=not", *tracked(monkeypatch, fail))
-    record = record_of(out)
-    assert record["notes"][-1] == "not exported to the tracker: the server is away"
-    assert record["metrics"]
-
-
-def test_what_is_reused_is_not_exported_again(isolated, monkeypatch):
-    exported = []
-    tracker = tracked(monkeypatch, lambda self, folder, record: exported.append(folder.name))
+    monkeypatch.setattr(trackers, "find_spec", lambda name: True)
+    monkeypatch.setattr(TensorBoard, "export", fail)
     for _ in range(2):
-        isolated(*FAILING, "+renderer.how=not", *tracker)
-    assert len(exported) == 1
+        _, out, _ = isolated(*FAILING, "+renderer.how=not", "isolation=off", "tracker=tensorboard")
+        record = record_of(out)
+        assert record["notes"][-1] == "not exported to the tracker: the server is away"
+        assert record["metrics"] and len(exported) == 1

@@ -13,10 +13,12 @@ from datasets.views import ViewSampler
 from renderers import Meter
 from renderers.field import Field
 from renderers.fields.analytic import box, sphere
+from tests.looped import each
 from tests.tiny import cell_from
 
 VIEW = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 128)
 TEN = AutoSettings(10.0, spurious=0.01, area_over_perimeter=0.07)
+BOX = box((0.4, 0.3, 0.5))
 FAMILIES = ("sofa", "plane", "table", "car")
 
 
@@ -33,8 +35,8 @@ def test_steps_are_those_of_the_papers_example():
     assert steps(VIEW, {"epsilon": 5e-5, "alpha": 1.5}, TEN) == 33
 
 
-@pytest.mark.parametrize(
-    ("alpha", "grazing", "expected"),
+@each(
+    "alpha, grazing, expected",
     [(1.5, 30.0, 15), (1.5, 41.81, 15), (1.0, 90.0, 1), (1.0, 30.0, 15), (0.5, 90.0, 15), (1.0, 89.9, 1)],
 )
 def test_steps_reach_every_surface_that_is_met_at_the_angle_or_above(alpha, grazing, expected):
@@ -86,9 +88,9 @@ def hits(name: str, shape: Field, resolution: int, **settings: float) -> tuple[T
     return load("renderer", name, **settings).render(meter, rays).hit, meter.counts.value
 
 
-@pytest.mark.parametrize("resolution", [48, 128])
-@pytest.mark.parametrize("name", ["dist", "idr", "naive"])
-@pytest.mark.parametrize("shape", [sphere(0.6), box((0.4, 0.3, 0.5))], ids=["sphere", "box"])
+@each("name, shape, resolution", [
+    ("dist", sphere(0.6), 128), ("dist", BOX, 48), ("idr", BOX, 48), ("naive", sphere(0.6), 48),
+])  # fmt: skip
 def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name, shape, resolution):
     fine, values = hits(name, shape, resolution)
     auto = epsilon(replace(VIEW, resolution=resolution), {}, TEN)
@@ -100,7 +102,7 @@ def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name
         assert fewer <= 0.9 * values
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@each("family", FAMILIES)
 def test_epsilon_auto_holds_on_the_families(family):
     shape = load("dataset", family).formula(Split.VALIDATION, 0)
     exact, _ = hits("idr", shape, 64, steps=300)

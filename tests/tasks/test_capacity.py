@@ -17,7 +17,7 @@ from bench.models.model import Evidence, Size
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus, read_record
 from bench.run.execute import execute
-from bench.run.messages import Job
+from bench.run.process import Job
 from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.solve.problem import Unsupported
@@ -224,7 +224,7 @@ def test_photographs_evaluate_a_field_on_held_out_pairs(compose_config, tmp_path
 @pytest.mark.parametrize(
     ("overrides", "status", "message"),
     [
-        (("task=gradients", "+experiment=fitted", "field=auto"), "refused", "does not take field=auto: leave it out"),
+        (("task=gradients", "+experiment=fitted", "field=auto"), "refused", "does not take field=auto: remove it"),
         (("task=completion", "field=spere"), "refused", "unknown field 'spere': did you mean sphere"),
         (("task=capacity", "task.frugal_rays=0"), "refused", "frugal_rays must be above 0"),
         (  # found by the run, when it pairs its photographs
