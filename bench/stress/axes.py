@@ -11,7 +11,7 @@ import torch
 from bench.machine.limits import LimitReached
 from bench.records.record import RunStatus
 from bench.solve.problem import Unsupported
-from bench.stress.fit import FITS, FitTrial, judge_fit
+from bench.stress.fit import FITS, judge_fit
 from bench.stress.gradient import judge_gradient
 from bench.stress.rendering import judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
@@ -118,6 +118,6 @@ class Stress:
     def _judge(self, renderer: Renderer, severity: float, draw: np.random.Generator, conditions: Conditions) -> Outcome:
         stressed = self.stressed(renderer, severity)
         if self.measure == "fit":
-            return judge_fit(FitTrial(self.scene, conditions.fit, severity, draw), stressed, conditions)
+            return judge_fit(self.scene, severity, draw, renderer=stressed, conditions=conditions)
         exam = SCENES[self.scene](severity, draw, conditions.resolution)
         return (judge_rendering if self.measure == "rendering" else judge_gradient)(exam, stressed, conditions)

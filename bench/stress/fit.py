@@ -16,7 +16,7 @@ from bench.records.record import RunStatus
 from bench.solve.observed_view import GivenView
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import OptimiserSettings, check_field_gradient
-from bench.stress.trial import Conditions, Failure, FitSettings, Outcome
+from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.scene import View
 from datasets.stress.observations import DISTURBANCES, Observation
 from datasets.stress.solids import Solid, sphere_solid
@@ -32,17 +32,30 @@ DEFINITIONS = {
 }
 
 
-def judge_fit(trial: "FitTrial", renderer: Renderer, conditions: Conditions) -> Outcome:
-    """Fits the sphere of a trial to its disturbed observations.
+def judge_fit(
+    name: str, severity: float, draw: np.random.Generator, *, renderer: Renderer, conditions: Conditions
+) -> Outcome:
+    """Fits a sphere to observations, of which the severity is a disturbance or one of the fit's settings.
+
+    Args:
+        name: of the fit, in `FITS`.
+        severity: of what it names.
+        draw: of spheres, camera and disturbance.
+        renderer: that is tested.
+        conditions: of all trials.
 
     Raises:
         Unsupported: where the renderer has no gradient towards the field.
         LimitReached: where the fit exceeds its values or memory.
     """
     check_field_gradient(renderer)
-    fit, draw = trial.settings(), trial.draw
+    fit = conditions.fit
+    if name in SETTINGS:
+        fit = replace(fit, **{SETTINGS[name]: severity})
     true, start = _draw_spheres(draw, fit.offset)
-    given = trial.disturbed(_observe(_sphere(true), fit.resolution, draw))
+    given = _observe(_sphere(true), fit.resolution, draw)
+    if name in DISTURBANCES:
+        given = DISTURBANCES[name](given, severity, draw)
     view = View(given.camera, given.depth, torch.zeros(*given.depth.shape, 3), given.mask)
     compared = GivenView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=conditions.device)
     problem = SphereProblem(start.to(conditions.device).requires_grad_(), compared, conditions.limits)
@@ -55,27 +68,6 @@ def judge_fit(trial: "FitTrial", renderer: Renderer, conditions: Conditions) -> 
         _failure(history, error, conditions.criteria.surface_error),
         {"surface_error": error, "evaluations_per_ray": spent},
     )
-
-
-@dataclass(frozen=True)
-class FitTrial:
-    """A fit by its name in `FITS`, its severity, and its random generator."""
-
-    name: str
-    fit: FitSettings
-    severity: float
-    draw: np.random.Generator
-
-    def settings(self) -> FitSettings:
-        """The fit's settings, with the one that the severity replaces."""
-        if self.name not in SETTINGS:
-            return self.fit
-        return replace(self.fit, **{SETTINGS[self.name]: self.severity})
-
-    def disturbed(self, given: Observation) -> Observation:
-        """The observations under the trial's disturbance, if it has one."""
-        disturb = DISTURBANCES.get(self.name)
-        return given if disturb is None else disturb(given, self.severity, self.draw)
 
 
 @dataclass

@@ -19,8 +19,6 @@ DEFINITIONS = {
     "the cosine of the angle of incidence",
     "hits": "true hits",
     "evaluations_per_ray": "field values computed, divided by rays",
-    "surface_moved": "mean distance of the true hits from the undisturbed surface, in scene units, where a disturbance "
-    "moves it: an effect on the shape, not on the renderer, which is judged by the moved surface",
 }
 
 
@@ -46,9 +44,6 @@ def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> O
     counts = {"lost": missed, "false": spurious, "wrong": wrong, "nan": nan, "hits": true.hit}
     numbers = {name: float(which.sum()) for name, which in counts.items()}
     numbers["evaluations_per_ray"] = meter.counts.value / max(hit.numel(), 1)
-    if exam.undisturbed is not None:
-        points = camera.double().rays().flat().at(true.distance)[true.hit]
-        numbers["surface_moved"] = float(exam.undisturbed(points).abs().mean())
     kinds = torch.zeros(hit.shape, dtype=torch.uint8)  # 1 correct hit, 2 missed, 3 spurious, 4 wrong
     for kind, which in enumerate((both, missed, spurious, wrong | nan), start=1):
         kinds[which] = kind

@@ -38,16 +38,6 @@ class SearchSettings:
         check_at_least("task.search.levels", self.levels, 3, "33 resolve a fifth of a decade over six decades")
         check_at_least("task.search.repeats", self.repeats, 2, "5 are little: 0 of 5 still allows 43 %")
 
-    @property
-    def grid(self) -> int:
-        """Number of trials of the full grid."""
-        return self.levels * self.repeats
-
-    @property
-    def most(self) -> int:
-        """Largest number of trials of the search."""
-        return self.grid // 2
-
 
 @dataclass(frozen=True)
 class Breakdown:
@@ -68,20 +58,12 @@ class Search:
     def __init__(self, settings: SearchSettings) -> None:
         self.settings = settings
         self.levels = np.linspace(0.0, 1.0, settings.levels)
+        self.grid = settings.levels * settings.repeats  # trials of the full grid
+        self.most = self.grid // 2
         step = 1.0 / (settings.levels - 1) / FINENESS
         self.middles = np.arange(-BEYOND, 1.0 + BEYOND + step / 2, step)
         self.probabilities = np.full((len(self.middles), len(WIDTHS)), 1.0 / len(self.middles) / len(WIDTHS))
         self.trials: list[tuple[int, bool]] = []  # the index of the level, and whether it succeeded
-
-    @property
-    def most(self) -> int:
-        """Largest number of trials."""
-        return self.settings.most
-
-    @property
-    def grid(self) -> int:
-        """Number of trials of the full grid."""
-        return self.settings.grid
 
     @cached_property
     def _success(self) -> np.ndarray:
@@ -122,11 +104,6 @@ class Search:
         low, high = self._interval()
         return Breakdown(self._quantile(0.5), low, high, WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
 
-    def counts(self, index: int) -> tuple[int, int]:
-        """How many trials at the level of an index succeeded, and how many there were."""
-        outcomes = [success for at, success in self.trials if at == index]
-        return sum(outcomes), len(outcomes)
-
     def _interval(self) -> tuple[float, float]:
         return self._quantile((1 - CERTAIN) / 2), self._quantile((1 + CERTAIN) / 2)
 
@@ -155,16 +132,8 @@ class Bisection:
         self.settings = settings
         self.levels = np.linspace(0.0, 1.0, settings.levels)
         self.outcomes: dict[int, bool] = {}  # of each level that was tried, by its index
-
-    @property
-    def most(self) -> int:
-        """Largest number of trials: both ends, and one per halving."""
-        return 2 + (self.settings.levels - 2).bit_length()
-
-    @property
-    def grid(self) -> int:
-        """Number of trials of the full grid."""
-        return self.settings.levels
+        self.grid = settings.levels
+        self.most = 2 + (settings.levels - 2).bit_length()  # both ends, and one per halving
 
     def next(self) -> int | None:
         """The index of the next trial's level, the two ends first; None where the breakdown lies between neighbours."""
@@ -185,10 +154,6 @@ class Bisection:
         """The middle between the last success and the first failure; half a step outside where an end decides."""
         success, failure = self._around()
         return Breakdown((success + failure) / 2 / (self.settings.levels - 1))
-
-    def counts(self, index: int) -> tuple[int, int]:
-        """How many trials at the level of an index succeeded, and how many there were: one at most."""
-        return int(self.outcomes.get(index, False)), int(index in self.outcomes)
 
     def _around(self) -> tuple[int, int]:
         """The indices of the last success before the first failure and of that failure; beyond an end without one."""

@@ -78,7 +78,7 @@ class Stability:
         with curve_file(run.folder) as write_line:
             while (index := search.next()) is not None:
                 level = float(search.levels[index])
-                outcome = self.stress.trial(renderer, level, search.counts(index)[1], conditions)
+                outcome = self.stress.trial(renderer, level, trials.at(level)[1], conditions)
                 search.note(index, outcome.success)
                 trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
                 write_line(trials.line())
@@ -109,10 +109,10 @@ class Stability:
         return self.stress.sweep.unit
 
     def _metrics(self, search: Search | Bisection, trials: "_Trials") -> dict[str, float | None]:
-        found, last = search.result(), self._settings.levels - 1
+        found = search.result()
         levels = {"": found.level, "_low": found.low, "_high": found.high}
         within = {end: self._severity(level) for end, level in levels.items()}
-        (mild, milds), (severe, severes) = search.counts(0), search.counts(last)
+        (mild, milds), (severe, severes) = trials.at(0), trials.at(1)
         failed = Counter(trial.outcome.failure for trial in trials.all)
         return {
             **{f"breakdown{end}": severity for end, severity in within.items()},
@@ -125,7 +125,6 @@ class Stability:
             "severe_successes": severe,
             "severe_trials": severes,
             "evaluations_per_ray": trials.spent(),
-            **trials.moved(found.level),
             **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
         }
 
@@ -158,14 +157,15 @@ class _Trials:
         """Reasons to doubt the breakdown: trials that raised errors, or success that grows with severity."""
         raised = [trial.outcome.message for trial in self.all if trial.outcome.failure is Failure.CRASHED]
         found = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
-        if not self.decreases():
+        (mild, milds), (severe, severes) = self.at(0), self.at(1)
+        if severe * milds > mild * severes:
             found.append("success does not fall with severity: more trials succeed at the severe end than at the mild")
         return found
 
-    def decreases(self) -> bool:
-        """Whether no larger share of the trials succeeds at the severe end than at the mild one."""
-        shares = [np.mean([t.outcome.success for t in self.all if t.level == end] or [0.0]) for end in (1.0, 0.0)]
-        return bool(shares[0] <= shares[1])
+    def at(self, level: float) -> tuple[int, int]:
+        """How many trials at a level succeeded, and how many there were."""
+        outcomes = [trial.outcome.success for trial in self.all if trial.level == level]
+        return sum(outcomes), len(outcomes)
 
     def line(self) -> dict[str, object]:
         """The last trial as a line of the curve."""
@@ -179,9 +179,3 @@ class _Trials:
         costs = [trial.outcome.numbers.get("evaluations_per_ray") for trial in self.all if trial.level == 0]
         known = [cost for cost in costs if cost is not None]
         return float(np.median(known)) if known else None
-
-    def moved(self, level: float) -> dict[str, float]:
-        """How far a disturbance moved the surface at the level nearest to the breakdown; empty where it moved none."""
-        known = {trial.level: trial.outcome.numbers.get("surface_moved") for trial in self.all}
-        known = {at: moved for at, moved in known.items() if moved is not None}
-        return {"surface_moved": known[min(known, key=lambda at: abs(at - level))]} if known else {}

@@ -42,7 +42,6 @@ class Exam:
         truth: of the field: where a disturbance moves its surface, the moved one.
         solid: gives the solid of parameters, where gradients towards them are tested; else None.
         parameters: at which these gradients are taken.
-        undisturbed: the field before a disturbance that moved its surface; else None.
     """
 
     field: Field
@@ -50,7 +49,6 @@ class Exam:
     truth: Truth
     solid: Callable[[Tensor], Solid] | None = None
     parameters: Float[Tensor, " n"] | None = None
-    undisturbed: Field | None = None
 
 
 Scene = Callable[[float, np.random.Generator, int], Exam]  # of severity, random generator, and W of W x W pixels
@@ -189,8 +187,7 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
         cube = box((CUBE,) * 3)
         camera = _cube(draw, resolution).camera
         made = distortion(cube, severity, draw)
-        undisturbed = None if made.surface is None else cube.field
-        return Exam(made.field, camera, made.surface or cube, undisturbed=undisturbed)
+        return Exam(made.field, camera, made.surface or cube)
 
     return scene
 
