@@ -23,53 +23,6 @@ BEFORE = 256  # samples of the ray up to there
 
 
 @dataclass(frozen=True)
-class Differences:
-    """Derivatives of the distance along m rays, and where they hold: where visibility does not change."""
-
-    code: Float[Tensor, "m directions"]
-    camera: Float[Tensor, "m 6"]
-    valid: Bool[Tensor, " m"]
-
-
-def differences(
-    decoder: Decoder,
-    code: Float[Tensor, " code_length"],
-    directions: Float[Tensor, "code_length directions"],
-    *,
-    camera: Camera,
-    pixels: Int[Tensor, " m"],
-    distance: Float[Tensor, " m"],
-) -> Differences:
-    """Central differences of the distance to the surface that the rays of some pixels hit.
-
-    Args:
-        decoder, code: in float64.
-        directions: of the code, as unit columns.
-        camera: in float64; its six derivatives are towards `Camera.moved`'s twist.
-        pixels: indices into the flattened image.
-        distance: to the hits.
-    """
-    rays = camera.rays().flat()[pixels]
-    with torch.no_grad():
-        shifts = STEP * torch.cat([directions.T, -directions.T])
-        moved, found = _roots(decoder.at(code + shifts), rays, distance)
-        by_code = ((moved[: len(shifts) // 2] - moved[len(shifts) // 2 :]) / (2 * STEP)).T
-        hits = rays.at(distance)
-        change = decoder.at(code + shifts)(hits.expand(len(shifts), -1, -1)) - decoder.at(code)(hits)
-        margin = 4 * change.abs().max()  # of the field, not of the distance, which moves far near grazing
-        valid = found.all(dim=0) & _clear(decoder.at(code), rays, distance, margin=margin)
-        columns = []
-        for twist in STEP * torch.eye(6, dtype=torch.float64):
-            (ahead, ok), (behind, ok_too) = (
-                _roots(decoder.at(code[None]), camera.moved(sign * twist).rays().flat()[pixels], distance)
-                for sign in (1, -1)
-            )
-            columns.append((ahead - behind)[0] / (2 * STEP))
-            valid &= ok[0] & ok_too[0]
-    return Differences(by_code, torch.stack(columns, dim=1), valid)
-
-
-@dataclass(frozen=True)
 class Paint:
     """Smooth colours of points and normals, of a small network with given weights, in float64.
 
@@ -95,55 +48,68 @@ class Paint:
 
 
 @dataclass(frozen=True)
-class ColourDifferences:
-    """Derivatives of the three colours of m pixels, a row for each, and which pixels they hold for."""
+class Differences:
+    """Derivatives of what m pixels see, a distance or three colours, and where they hold.
 
-    code: Float[Tensor, "m 3 directions"]
-    camera: Float[Tensor, "m 3 6"]
-    texture: Float[Tensor, "m 3 weights"]
+    They hold where visibility does not change and, of colours, where normals do not jump.
+    """
+
+    code: Float[Tensor, "m seen directions"]
+    camera: Float[Tensor, "m seen 6"]
+    texture: Float[Tensor, "m seen weights"] | None
     valid: Bool[Tensor, " m"]
 
 
-def colour_differences(
+def differences(
     decoder: Decoder,
     code: Float[Tensor, " code_length"],
     directions: Float[Tensor, "code_length directions"],
-    paint: Paint,
     *,
     camera: Camera,
     pixels: Int[Tensor, " m"],
     distance: Float[Tensor, " m"],
-) -> ColourDifferences:
-    """Central differences of the colours at the hits, which move and turn with the code and the camera.
+    paint: Paint | None = None,
+) -> Differences:
+    """Central differences of the distance to the surface that the rays of some pixels hit, or of the colours there.
 
     Args:
-        decoder, code, directions, camera, pixels, distance: see `differences`.
-        paint: of the surface.
+        decoder, code: in float64.
+        directions: of the code, as unit columns.
+        camera: in float64; its six derivatives are towards `Camera.moved`'s twist.
+        pixels: indices into the flattened image.
+        distance: to the hits.
+        paint: of the surface, whose colours move and turn with the code and the camera; None for distances.
     """
-    rays = camera.rays().flat()[pixels]
-    truth = differences(decoder, code, directions, camera=camera, pixels=pixels, distance=distance)
-    shifts = STEP * torch.cat([directions.T, -directions.T])
-    moved, _ = _roots(decoder.at(code + shifts), rays, distance)
-    seen = paint(*_hits(decoder.at(code + shifts), rays, moved))
-    hits = _hits(decoder.at(code[None]), rays, distance[None])
-    here = paint(*hits)
-    ahead, behind = seen[: len(shifts) // 2], seen[len(shifts) // 2 :]
-    by_code, smooth = (ahead - behind) / (2 * STEP), _smooth(ahead, here, behind)
+    rays, still = camera.rays().flat()[pixels], decoder.at(code[None])
+    moved = decoder.at(code + STEP * torch.cat([directions.T, -directions.T]))
+
+    def seen(field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"]) -> Float[Tensor, "codes m seen"]:
+        return distance[..., None] if paint is None else paint(*_hits(field, rays, distance))
+
+    def smooth(ahead: Float[Tensor, "codes m seen"], behind: Float[Tensor, "codes m seen"]) -> Bool[Tensor, " m"]:
+        """Which normals do not jump within the step, as those of a network of ReLUs do at its kinks."""
+        return ((ahead + behind - 2 * here).abs() < JUMP).all(-1).all(0) | (paint is None)
+
+    here = seen(still, rays, distance[None])
+    roots, found = _roots(moved, rays, distance)
+    ahead, behind = seen(moved, rays, roots).chunk(2)
+    by_code = (ahead - behind) / (2 * STEP)
+    hits = rays.at(distance)
+    change = moved(hits.expand(len(roots), -1, -1)) - decoder.at(code)(hits)
+    margin = 4 * change.abs().max()  # of the field, not of the distance, which moves far near grazing
+    valid = found.all(dim=0) & smooth(ahead, behind) & _clear(decoder.at(code), rays, distance, margin=margin)
     by_camera = []
     for twist in STEP * torch.eye(6, dtype=torch.float64):
         ends = []
         for sign in (1, -1):
             turned = camera.moved(sign * twist).rays().flat()[pixels]
-            found, _ = _roots(decoder.at(code[None]), turned, distance)
-            ends.append(paint(*_hits(decoder.at(code[None]), turned, found))[0])
-        by_camera.append((ends[0] - ends[1]) / (2 * STEP))
-        smooth &= _smooth(ends[0][None], here, ends[1][None])
-    by_weight = []
-    for weight in STEP * torch.eye(Paint.size, dtype=torch.float64):
-        ends = [Paint(paint.weights + sign * weight)(*hits)[0] for sign in (1, -1)]
-        by_weight.append((ends[0] - ends[1]) / (2 * STEP))
-    columns = (by_code.permute(1, 2, 0), *(torch.stack(by, dim=-1) for by in (by_camera, by_weight)))
-    return ColourDifferences(*columns, truth.valid & smooth)
+            roots, found = _roots(still, turned, distance)
+            ends.append(seen(still, turned, roots))
+            valid &= found[0]
+        by_camera.append((ends[0] - ends[1])[0] / (2 * STEP))
+        valid &= smooth(*ends)
+    texture = None if paint is None else _by_weight(paint, *_hits(still, rays, distance[None]))
+    return Differences(by_code.permute(1, 2, 0), torch.stack(by_camera, dim=-1), texture, valid)
 
 
 def image_differences(
@@ -252,11 +218,15 @@ def _hits(
     return points.detach(), autograd_gradients(field, points)
 
 
-def _smooth(
-    ahead: Float[Tensor, "codes m 3"], here: Float[Tensor, "1 m 3"], behind: Float[Tensor, "codes m 3"]
-) -> Bool[Tensor, " m"]:
-    """Which pixels' normals do not jump within the step, as those of a network of ReLUs do at its kinks."""
-    return ((ahead + behind - 2 * here).abs() < JUMP).all(-1).all(0)
+def _by_weight(
+    paint: Paint, points: Float[Tensor, "1 m 3"], normals: Float[Tensor, "1 m 3"]
+) -> Float[Tensor, "m 3 weights"]:
+    """Central differences of colours towards the weights of the paint."""
+    columns = []
+    for weight in STEP * torch.eye(Paint.size, dtype=torch.float64):
+        ahead, behind = (Paint(paint.weights + sign * weight)(points, normals)[0] for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * STEP))
+    return torch.stack(columns, dim=-1)
 
 
 def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:

@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.evaluate.finite_differences import (
-    Differences,
     Paint,
-    colour_differences,
     differences,
     image_differences,
     outline_steps,
@@ -123,7 +121,8 @@ class Gradients:
         metrics |= self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         run.progress("comparing gradients", len(BANDS) + 1, len(BANDS) + 2)
         seen = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
-        numbers = self._evaluate_colours(subject, seen, reference.distance.flatten()[seen], directions, generator)
+        paint = Paint.drawn(generator)
+        numbers = self._evaluate(subject, seen, reference.distance.flatten()[seen], directions, paint)
         record.metrics = metrics | {f"colour.{name}": value for name, value in numbers.items()}
         record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}
         record.status, record.reason = RunStatus.OK, ""
@@ -134,40 +133,27 @@ class Gradients:
         pixels: Int[Tensor, " m"],
         distance: Float[Tensor, " m"],
         directions: Float[Tensor, "code_length directions"],
+        paint: Paint | None = None,
     ) -> dict[str, float]:
-        """The metrics of distances in one band."""
+        """The metrics of distances in one band, or of colours at the hits."""
         if not pixels.numel():
             return _compared({}, pixels.bool())
-        truth: Differences = differences(
-            subject.decoder, subject.code, directions, camera=subject.camera, pixels=pixels, distance=distance
+        truth = differences(
+            subject.decoder,
+            subject.code,
+            directions,
+            camera=subject.camera,
+            pixels=pixels,
+            distance=distance,
+            paint=paint,
         )
-        (by_code, by_camera), found, hit = subject.gradients(pixels)
+        (by_code, by_camera, *by_weight), found, hit = subject.gradients(pixels, paint)
         valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
-        pairs = {"code": (by_code.squeeze(1) @ directions, truth.code)}
-        if subject.renderer.capabilities.ray_gradient:
-            pairs["camera"] = (by_camera.squeeze(1), truth.camera)
-        return _compared(pairs, valid)
-
-    def _evaluate_colours(
-        self,
-        subject: "Subject",
-        pixels: Int[Tensor, " m"],
-        distance: Float[Tensor, " m"],
-        directions: Float[Tensor, "code_length directions"],
-        generator: torch.Generator,
-    ) -> dict[str, float]:
-        """The metrics of colours at the hits."""
-        if not pixels.numel():
-            return _compared({}, pixels.bool())
-        paint = Paint.drawn(generator)
-        truth = colour_differences(
-            subject.decoder, subject.code, directions, paint, camera=subject.camera, pixels=pixels, distance=distance
-        )
-        (by_code, by_camera, by_weight), found, hit = subject.gradients(pixels, paint)
-        valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
-        pairs = {"code": (by_code @ directions, truth.code), "texture": (by_weight, truth.texture)}
+        pairs = {"code": (by_code @ directions, truth.code)}
         if subject.renderer.capabilities.ray_gradient:
             pairs["camera"] = (by_camera, truth.camera)
+        if by_weight:
+            pairs["texture"] = (by_weight[0], truth.texture)
         return _compared(pairs, valid)
 
     def _evaluate_outline(

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.reference import Reference, in_float64, make_reference
+from bench.evaluate.reference import Reference, in_float64
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.problem import Unsupported
 from bench.tasks.gradients import BANDS, DEFINITIONS, NEAR, Gradients, Subject, _bands, _draw, _outline
-from renderers.boundary import BrokenContract
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
 from renderers.rendering import Capabilities, Renderer, Rendering
+from tests.looped import each
 from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 
 BLURS = (0.003, 0.03)
@@ -77,13 +77,6 @@ def test_the_bias_of_dist_is_that_of_its_colours(tmp_path):
     assert metrics["colour.texture_pooled_scale"] == pytest.approx(1, abs=1e-5)
 
 
-def test_the_gradient_of_hits_is_not_that_of_the_image_at_the_outline(exact):
-    metrics = exact.record.metrics
-    assert metrics["silhouette.pixels"] == SETTINGS.outline
-    assert 0 < metrics["silhouette.image_cosine"] < 0.9
-    assert 0 < metrics["silhouette.image_scale"] < 0.9
-
-
 def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
     prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5).double()
     numbers = {}
@@ -112,20 +105,14 @@ def outline_numbers(renderer: Renderer, supersampling: int) -> dict[str, float]:
 
 def test_a_band_carries_the_gradient_of_the_image_at_the_outline_and_hits_do_not():
     """With many rays per pixel; the narrower band has less bias and more noise in each ray."""
-    band = outline_numbers(load("renderer", "relaxed_boundary", band=0.03), 24)
+    band = outline_numbers(load("renderer", "relaxed_boundary", band=0.03), 12)
     assert band["silhouette_3e-02.image_cosine"] == band["silhouette.image_cosine"] > 0.95
     assert 0.8 < band["silhouette.image_scale"] < 1.2
     assert band["silhouette_3e-03.image_spread"] > 2 * band["silhouette_3e-02.image_spread"]
-    hits = outline_numbers(EXACT["idr"], 24)
+    hits = outline_numbers(EXACT["idr"], 12)
     assert hits["silhouette.image_cosine"] < 0.9
     assert hits["silhouette.image_error"] > 2 * band["silhouette.image_error"]
     assert "silhouette_3e-02.image_cosine" not in hits
-
-
-def test_an_opacity_carries_it_too():
-    numbers = outline_numbers(load("renderer", "neus_budget"), 8)
-    assert numbers["silhouette_3e-02.image_cosine"] > 0.9
-    assert numbers["silhouette.values_per_ray"] > 30
 
 
 def test_every_number_has_a_definition_and_every_definition_a_number(exact):
@@ -151,8 +138,7 @@ def plane_prior(angle: float, slope: float) -> Prior:
     return Prior(plane_decoder(normal.tolist(), weights.tolist(), 0.0), torch.zeros(1, 3).double())
 
 
-@pytest.mark.parametrize("slope", [1.0, 0.8])
-@pytest.mark.parametrize(("angle", "band"), [(10.0, "frontal"), (50.0, "oblique"), (80.0, "grazing")])
+@each("slope, angle, band", [(1.0, 10.0, "frontal"), (0.8, 50.0, "oblique"), (0.8, 80.0, "grazing")])
 def test_the_scale_of_dist_is_alpha_times_the_cosine_times_the_slope(tmp_path, angle, band, slope):
     dist = load("renderer", "dist", alpha=ALPHA, extra_step_cap=None, epsilon=1e-9, steps=600)
     metrics = judged(tmp_path, dist, plane_prior(angle, slope), camera_of(8, field_of_view=0.5)).record.metrics
@@ -210,9 +196,8 @@ def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_p
 
 def test_hits_that_are_off_on_the_same_surface_count(tmp_path):
     """A bias is an error of the renderer; only what is behind or in front of something else is not compared."""
-    off = judged(tmp_path / "off", Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * NEAR)).record.metrics
-    exact = judged(tmp_path / "exact", EXACT["idr"]).record.metrics
-    assert [off[f"{band}.pixels"] for band in HITS] == [exact[f"{band}.pixels"] for band in HITS]
+    off = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * NEAR)).record.metrics
+    assert min(off[f"{band}.pixels"] for band in HITS) >= SETTINGS.pixels - 3
 
 
 def test_where_no_pixel_of_a_band_counts_it_has_no_other_numbers(tmp_path):
@@ -230,16 +215,6 @@ def test_renderers_that_cannot_are_unsupported(tmp_path):
         judged(tmp_path, Changed(inner, Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
     with pytest.raises(Unsupported, match="Changed needs a level field, not a distance field"):
         judged(tmp_path, Changed(inner, Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True)))
-
-
-def test_a_gradient_towards_the_code_that_is_claimed_and_lacking_is_told(tmp_path):
-    class TowardsRaysOnly(Changed):
-        def render(self, field: Any, rays: Rays) -> Rendering:
-            found = super().render(field, rays)
-            return replace(found, distance=found.distance.detach() + 0 * rays.origins.sum(-1))
-
-    with pytest.raises(BrokenContract, match=r"capabilities\.field_gradient is True, but the distances of its hits"):
-        judged(tmp_path, TowardsRaysOnly(EXACT["idr"], EXACT["idr"].capabilities))
 
 
 def test_bands_are_of_the_angle_between_ray_and_inward_normal():
@@ -269,40 +244,7 @@ def test_the_outline_is_beside_the_outline():
 
 def test_pixels_are_drawn_without_repetition_and_by_the_seed():
     pixels = torch.arange(100, 200)
-    drawn = [_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1)]
-    assert drawn[0] == drawn[1] != drawn[2]
-    assert len(set(drawn[0])) == 30
-    assert drawn[0] == sorted(drawn[0])
-    assert set(drawn[0]) <= set(range(100, 200))
-    assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()
-
-
-def test_numbers_of_a_run_follow_its_seed(tmp_path):
-    def numbers(folder: Any, seed: int) -> dict[str, float]:
-        run = run_of(folder, EXACT["idr"], PRIOR, camera_of(SIZE), seed=seed)
-        SETTINGS.execute(run)
-        return run.record.metrics
-
-    first, again, other = numbers(tmp_path, 0), numbers(tmp_path, 0), numbers(tmp_path, 1)
+    first, again, other = (_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1))
     assert first == again != other
-
-
-def test_the_reference_of_a_plane_is_that_plane():
-    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5)
-    twin = in_float64(prior)
-    reference = make_reference(twin.decoder.at(twin.codes[0]), camera)
-    normal = torch.tensor([sqrt(1 - cos(radians(50.0)) ** 2), 0.0, cos(radians(50.0))]).double()
-    rays = camera.double().rays()
-    assert torch.allclose(reference.distance, -(rays.origins @ normal) / (rays.directions @ normal), rtol=1e-7)
-    assert torch.allclose(reference.normals, normal.expand(8, 8, 3), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["pixels", "directions", "outline", "outline_directions", "supersampling"])
-def test_counts_that_cannot_be_are_refused(name):
-    with pytest.raises(ValueError, match=rf"task\.{name} must be at least 1, not 0"):
-        replace(SETTINGS, **{name: 0})
-
-
-def test_a_step_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match=r"task\.outline_shift must be positive, not -0\.1"):
-        replace(SETTINGS, outline_shift=-0.1)
+    assert first == sorted(set(first)) and len(first) == 30
+    assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()
