@@ -27,7 +27,6 @@ from renderers.fields.mlp import BoundDecoder, Decoder
 LEARNING_RATE = 0.01  # of Adam: what one step may change, in scene units, radians or shares of a size
 MIN_HALF_SIZE = 0.01  # scene units: least half size of a part at its start
 MAX_POINTS, MAX_CLUSTER_POINTS = 3000, 200  # most points that are clustered, and most of one cluster for its box
-CUBE_HALF_SIZE = 0.3  # scene units: of the cube whose corners are used where too few points are known
 CLUSTERINGS = 6  # each is a start of a union
 MISSED_QUANTILE = 0.75  # of the errors of a smaller union: new parts begin at the points above it
 ROUND_LOGIT, EDGED_LOGIT = 0.0, -1.5  # initial rounding of a box: logit of radius over least half size
@@ -40,28 +39,12 @@ BAND = 2.0  # cells to both sides of the surface whose samples are fitted
 GRID_RATE = 2e-3  # scene units
 
 
-def sphere_part(parameters: Float[Tensor, "4"]) -> Shape:
-    """A sphere from its centre and the logarithm of its radius."""
-    return sphere(parameters[3].exp(), parameters[:3])
-
-
-def ellipsoid(parameters: Float[Tensor, "9"]) -> Shape:
-    """An ellipsoid from its pose, see `_placed`, and the logarithms of its half axes."""
-    return _placed(sphere(1.0).stretch(parameters[6:9].exp()), parameters)
-
-
-def box(parameters: Float[Tensor, "9"]) -> Shape:
-    """A box from its pose, see `_placed`, and the logarithms of its half sizes."""
-    return _placed(exact_box(parameters[6:9].exp()), parameters)
-
-
-def rounded(parameters: Float[Tensor, "10"]) -> Shape:
-    """A rounded box: as a box, then the logit of its edges' radius over its least half size; at 1 it is a capsule."""
-    return union(parameters[None])
-
-
 def union(parameters: Float[Tensor, "parts 10"]) -> Shape:
-    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long."""
+    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long.
+
+    Each has its pose, see `_placed`, the logarithms of its half sizes, and the logit of its edges' radius over the
+    least of these; at 1 it is a capsule.
+    """
     sizes = parameters[:, 6:9].exp()
     radii = torch.sigmoid(parameters[:, 9]) * sizes.amin(-1)
     turns = _turn(parameters)
@@ -94,11 +77,11 @@ class Part:
     flops: int
 
 
-PARTS = {
-    "sphere": Part(sphere_part, (), 4, 10),
-    "ellipsoid": Part(ellipsoid, (), 9, 50),
-    "box": Part(box, (), 9, 50),
-    "rounded_box": Part(rounded, (ROUND_LOGIT,), 10, 55),
+PARTS = {  # all but a sphere begin with their pose, see `_placed`, and the logarithms of three half sizes
+    "sphere": Part(lambda p: sphere(p[3].exp(), p[:3]), (), 4, 10),  # centre, logarithm of the radius
+    "ellipsoid": Part(lambda p: _placed(sphere(1.0).stretch(p[6:9].exp()), p), (), 9, 50),
+    "box": Part(lambda p: _placed(exact_box(p[6:9].exp()), p), (), 9, 50),
+    "rounded_box": Part(lambda p: union(p[None]), (ROUND_LOGIT,), 10, 55),
     "superquadric": Part(quadric, (0.0, 0.0), 11, 110),
 }
 
@@ -141,13 +124,10 @@ class UnionOf:
     smaller union, and adds parts about clusters of the points that this union is furthest from.
     """
 
+    name: str
     count: int
     follows: ClassVar[bool] = False
     tries: ClassVar[int] = CLUSTERINGS + 1
-
-    @property
-    def name(self) -> str:
-        return f"union_{self.count}"
 
     @property
     def stored(self) -> int:
@@ -161,15 +141,12 @@ class UnionOf:
         """One start for each clustering, and one from the previous union, if there is one."""
         old = [] if seen.previous is None else _parts_of(seen.previous)
         kept = old if len(old) < self.count else []
-        if not len(seen.points):
-            choices = [[*kept, *_random_boxes(self.count - len(kept), seen.seed)]]
-        else:
-            points = _subsampled(seen.points)
-            choices = [_cluster_boxes(points, self.count, seen.seed + start) for start in range(CLUSTERINGS)]
-            if kept:
-                error = seen.previous_values(points).abs()
-                missed = points[error >= error.quantile(MISSED_QUANTILE)]
-                choices.append([*kept, *_cluster_boxes(missed, self.count - len(kept), seen.seed)])
+        points = _subsampled(seen.points)
+        choices = [_cluster_boxes(points, self.count, seen.seed + start) for start in range(CLUSTERINGS)]
+        if kept:
+            error = seen.previous_values(points).abs()
+            missed = points[error >= error.quantile(MISSED_QUANTILE)]
+            choices.append([*kept, *_cluster_boxes(missed, self.count - len(kept), seen.seed)])
         return [
             _model(self.name, torch.stack(parts), lambda parameters: union(parameters[0]), self.flops, seen)
             for parts in choices
@@ -180,14 +157,11 @@ class UnionOf:
 class Network:
     """Fully connected ReLU layers from a point to a distance (see `renderers.fields.mlp.Decoder`, without a code)."""
 
+    name: str
     layers: int
     width: int
     follows: ClassVar[bool] = True
     tries: ClassVar[int] = 1
-
-    @property
-    def name(self) -> str:
-        return f"network_{self.layers}x{self.width}"
 
     @cached_property
     def stored(self) -> int:
@@ -222,13 +196,10 @@ class Network:
 class NarrowBand:
     """A grid of distances: those near the surface are fitted, the others keep the values of the previous field."""
 
+    name: str
     resolution: int
     follows: ClassVar[bool] = True
     tries: ClassVar[int] = 1
-
-    @property
-    def name(self) -> str:
-        return f"grid_{self.resolution}"
 
     @property
     def stored(self) -> int:
@@ -279,7 +250,7 @@ class NarrowBand:
 
 
 SIZED: dict[str, Callable[..., Candidate]] = {"union": UnionOf, "network": Network, "grid": NarrowBand}
-PAPERS = Network(8, 512)  # that of DeepSDF and DIST, without a code
+PAPERS = Network("network_8x512", 8, 512)  # that of DeepSDF and DIST, without a code
 
 
 def candidate(name: str) -> Candidate:
@@ -292,7 +263,7 @@ def candidate(name: str) -> Candidate:
     kind, sizes = parsed(name)
     if sizes and kind not in SIZED:
         raise BadInput(f"field={name} is learnt from images alone: set task=reconstruction, or another field")
-    return SIZED[kind](*sizes) if sizes else OnePart(name)
+    return SIZED[kind](name, *sizes) if sizes else OnePart(name)
 
 
 def by_size(names: tuple[str, ...], measure: str) -> list[Candidate]:
@@ -329,11 +300,8 @@ def _turn(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
 
 
 def _subsampled(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-    """At most about `MAX_POINTS` of the points; the corners of a cube at the origin where there are fewer than four."""
-    if len(points) < 4:
-        return CUBE_HALF_SIZE * torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    every = max(len(points) // MAX_POINTS, 1)
-    return points[::every].cpu()
+    """At most about `MAX_POINTS` of the points."""
+    return points[:: max(len(points) // MAX_POINTS, 1)].cpu()
 
 
 def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
@@ -367,14 +335,6 @@ def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) ->
         return _fitting_box(cluster[:: -(-len(cluster) // MAX_CLUSTER_POINTS)])
     middle = cluster.mean(0) if len(cluster) else points.mean(0)
     return torch.cat([middle, torch.zeros(3), torch.full((3,), MIN_HALF_SIZE).log()])
-
-
-def _random_boxes(count: int, seed: int) -> list[Float[Tensor, "10"]]:
-    """Rounded boxes at random places, for where no point is known."""
-    draw = torch.Generator().manual_seed(seed)
-    sizes = torch.full((3,), CUBE_HALF_SIZE).log()
-    places = CUBE_HALF_SIZE * (2 * torch.rand(count, 3, generator=draw) - 1)
-    return [torch.cat([place, torch.zeros(3), sizes, torch.tensor([EDGED_LOGIT])]) for place in places]
 
 
 def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:

@@ -9,19 +9,15 @@ from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
 from bench.models.candidates import by_size
 from bench.models.fit import FitProblem, Fitter
 from bench.models.growth import Growth, grow
-from bench.models.observations import Observations
-from bench.models.views import Views
+from bench.models.observations import RayObservations
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.solve.observed_view import Weights
 from bench.solve.problem import InverseTask, check_field_gradient
 from bench.solve.solve import COSTS, draw, note_costs, note_result
 from datasets.scene import Scene
-from datasets.truth import Truth
-from renderers.field import Field
 from renderers.rendering import Renderer
 
 SIZES = (
@@ -33,9 +29,9 @@ ENDED = {
     "field": "the candidate that field=auto ended on, or the one that was requested",
     "field_free, field_stored, field_bytes": SIZES,
     "field_error, field_standard_error": "of the held-out observations: as NAME.error of task=capacity, in "
-    "scene units; of photographs the mean difference of colours from 0 to 1; through the renderer as configured, "
+    "scene units; through the renderer as configured, "
     "so that what renderer.epsilon=auto adds to a surface is not in it",
-    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends; 0 for photographs",
+    "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends",
     "field_overhead": "seconds of all fits, also of candidates without improvement, over those of the last one's; "
     "without checkpoints on what is held out",
     "field_overhead_judged": "the same with checkpoints and with finding the starts",
@@ -49,7 +45,7 @@ class ShapeTask(InverseTask, Protocol):
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[Observations, Given]:
+    ) -> tuple[RayObservations, Given]:
         """The observations that a field is fitted to, some of them held out, and what pictures show of them."""
         ...
 
@@ -80,41 +76,12 @@ def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
         first, last = growth.first, growth.fitted.model.frozen()
         record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
         metrics, notes = after.metrics | ended(growth), tuple(growth.summary(choice.name))
-        status, reason = verdict(growth, after)
-        note_result(run, Evaluation(metrics, after.mesh, None if status is RunStatus.OK else (status, reason), notes))
+        note_result(run, Evaluation(metrics, after.mesh, failure_of(growth, after), notes))
         curve = rendered(lines, growth.fitted.evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")
         for name, field in growth.fields.items():
             filmstrip.add(name, field)
         draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
-
-
-def fitted_shape(run: RunContext, weights: Weights) -> Field:
-    """The scene's true shape as a field that is fitted to it, for a task with another unknown.
-
-    Args:
-        run: its record notes what was fitted.
-        weights: of a view's loss.
-
-    Raises:
-        Unsupported: where the renderer has no gradient towards the field.
-        ValueError: where no field could be fitted.
-    """
-    inputs, choice, settings = run.inputs, run.inputs.field, run.inputs.field.models
-    check_field_gradient(inputs.renderer)
-    truth = Truth(inputs.scene.mesh)
-    views = Views(truth, inputs.views, settings.views, weights, inputs.renderer, inputs.device)
-
-    def on_line(name: str, line: dict[str, Any]) -> None:
-        run.progress(f"fitting {name}", line["iteration"] + 1, settings.fit.iterations, line["total"])
-
-    fitter = Fitter(views.observations(inputs.seed), settings.fit, inputs.seed, inputs.device, on_line)
-    growth = grow(fitter, by_size(choice.candidates, settings.size), settings.growth)
-    if growth.fitted.failed:
-        reason = growth.fitted.evidence.reason
-        raise ValueError(f"no field was found for the known shape: {reason}; field=prior takes the shape itself")
-    run.record.notes = [*run.record.notes, *growth.summary(choice.name)]
-    return growth.fitted.model.frozen()
 
 
 def rendered(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:
@@ -143,8 +110,8 @@ def ended(growth: Growth) -> dict[str, Any]:
     }
 
 
-def verdict(growth: Growth, after: Evaluation) -> tuple[RunStatus, str]:
-    """How the run ended: a fit that does not improve on its warm start has not failed, one that gets worse has."""
+def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | None:
+    """Why the run failed, or None: a fit that does not improve on its warm start has not, one that gets worse has."""
     evidence, initial = growth.fitted.evidence, growth.initial_error
     if evidence.error is None:
         return RunStatus(evidence.status), evidence.reason
@@ -155,7 +122,7 @@ def verdict(growth: Growth, after: Evaluation) -> tuple[RunStatus, str]:
         if evidence.mean - initial.mean > noise:
             ends = f"{initial.mean:.4g} before the first fit, {evidence.mean:.4g} at the end"
             return RunStatus.NOT_REACHED, f"the held-out error rose by more than its noise: {ends}"
-    return RunStatus.OK, ""
+    return None
 
 
 def _note_growth(run: RunContext, fitter: Fitter, growth: Growth, *, observed: int) -> None:

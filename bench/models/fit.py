@@ -13,7 +13,7 @@ from torch import Tensor
 from bench.models.candidates import OnePart
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence, Model, Seen
-from bench.models.observations import Observations, generator
+from bench.models.observations import RayObservations, generator
 from bench.models.warm_start import WarmStart, scattered
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
@@ -72,7 +72,7 @@ class Fitter:
         part: of the run that the lines belong to.
     """
 
-    observations: Observations
+    observations: RayObservations
     settings: FitSettings
     seed: int
     device: torch.device
@@ -91,8 +91,10 @@ class Fitter:
         models = candidate.starts(seen)
         placing = time.perf_counter() - started
         target = previous.frozen() if candidate.follows and previous is not None else None
-        free = self.observations.free
-        starts = [(self._fitted(candidate, model, previous), self._start(model, free, target)) for model in models]
+        known, count = (points, self.observations.free, target), self.settings.warm_points
+        starts = [
+            (self._fitted(candidate, model, previous), WarmStart(model, *known, count, self.seed)) for model in models
+        ]
         screened = self.settings.warm_iterations // SCREENING if len(starts) > 1 else 0
         for fitted, start in starts:
             self._warm_start(fitted, start, screened)
@@ -111,9 +113,6 @@ class Fitter:
             fitted.initial_error = fitted.evidence.error
         fitted.evidence.wall += time.perf_counter() - clock
         return fitted
-
-    def _start(self, model: Model, free: Float[Tensor, "n 3"], target: Field | None) -> WarmStart:
-        return WarmStart(model, self.observations.points, free, target, self.settings.warm_points, self.seed)
 
     def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:
         """A candidate's model as a Fitted; it has failed where the renderer does not support its kind of field."""
@@ -185,7 +184,7 @@ class FitProblem:
     """Fits the parameters of a candidate with a renderer; see `bench.solve.problem.Objective`."""
 
     model: Model
-    observations: Observations
+    observations: RayObservations
     settings: FitSettings
     iterations_before: int  # iterations before this part of the fit
     share: float = 0.0  # of the rays that the last iteration used

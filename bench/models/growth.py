@@ -87,7 +87,7 @@ class Growth:
         error = self.fitted.evidence.mean
         path, size = " -> ".join(self.fields), self.fitted.model.size
         found = f"field={requested}: {path}, {size}, held-out error {error:.3g}"
-        if not self.footprint or error <= self.footprint:
+        if error <= self.footprint:
             return [found, *final_notes(self.fitted.renderer)]
         above = f"above half a pixel ({self.footprint:.3g}): {self.end}; more iterations may help"
         return [f"{found}, {above}", *final_notes(self.fitted.renderer)]

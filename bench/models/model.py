@@ -90,7 +90,7 @@ class Seen:
     """What a candidate's start may use.
 
     Args:
-        points: observed points of the surface; may be empty.
+        points: observed points of the surface.
         previous: the best model so far, if there is one.
         seed: of random draws.
         device: of the parameters.
@@ -113,28 +113,11 @@ class Seen:
 class Candidate(Protocol):
     """A kind of field, of a certain size."""
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def stored(self) -> int:
-        """Its stored numbers, see `Size`, which are known before its start; the free ones of a grid are not."""
-        ...
-
-    @property
-    def flops(self) -> int:
-        """Floating-point operations per value."""
-        ...
-
-    @property
-    def tries(self) -> int:
-        """The largest number of starts."""
-        ...
-
-    @property
-    def follows(self) -> bool:
-        """Whether it begins with the previous field, not with the observed points."""
-        ...
+    name: str
+    stored: int  # numbers, see `Size`, which are known before its start; the free ones of a grid are not
+    flops: int  # floating-point operations per value
+    tries: int  # the largest number of starts
+    follows: bool  # whether it begins with the previous field, not with the observed points
 
     def starts(self, seen: Seen) -> list[Model]:
         """Models to start from; the one with the least loss after a short warm start is fitted."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, nan
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,50 +19,6 @@ from renderers.rendering import Renderer
 
 TILES = 4  # of a view along each side
 FREE = 4  # points known to lie outside, on each ray that has some
-
-
-@runtime_checkable
-class Observations(Protocol):
-    """Observations that a field is fitted to through a renderer, and held-out ones."""
-
-    @property
-    def renderer(self) -> Renderer: ...
-
-    @property
-    def footprint(self) -> float:
-        """Half a pixel, in scene units (DIST, Eq. 10), the error to reach; 0 where errors have another unit."""
-        ...
-
-    @property
-    def rays(self) -> int:
-        """Number of rays rendered in an iteration."""
-        ...
-
-    @property
-    def points(self) -> Float[Tensor, "n 3"]:
-        """Known points of the surface; may be empty."""
-        ...
-
-    @property
-    def free(self) -> Float[Tensor, "n 3"]:
-        """Points that are known to lie outside."""
-        ...
-
-    def through(self, renderer: Renderer) -> "Observations":
-        """The same, compared through another renderer."""
-        ...
-
-    def terms(self, field: Field, iteration: int, share: float) -> Terms:
-        """The weighted terms of an iteration's loss, over a share of its rays."""
-        ...
-
-    def depth_error(self, terms: Terms) -> float:
-        """The depth error of an iteration's terms, in scene units; NaN where they have another unit."""
-        ...
-
-    def error(self, field: Field) -> HeldOutError:
-        """The error of a field on the held-out observations."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -63,18 +63,16 @@ class WarmStart:
             with torch.no_grad():
                 wanted = Meter(self.target, self.target_counts)(points)
             return near_surface_first((shape(points) - wanted).abs(), wanted, SURFACE_WIDTH).mean()
-        off = [shape(_some(self.surface, self.count, draw)).abs()] if len(self.surface) else []
-        inside = [(-shape(_some(self.free, self.count, draw))).clamp_min(0)] if len(self.free) else []
-        return sum((part.mean() for part in [*off, *inside]), 0 * self.parameters[0].sum())
+        off = shape(_some(self.surface, self.count, draw)).abs().mean()
+        inside = (-shape(_some(self.free, self.count, draw))).clamp_min(0).mean()
+        return off + inside
 
 
 def scattered(surface: Float[Tensor, "n 3"], count: int, draw: torch.Generator) -> Float[Tensor, "count 3"]:
     """Points, half of them near points of a surface, the others anywhere in a sphere that holds the scene."""
-    near = count // 2 if len(surface) else 0
+    near = count // 2
     around = torch.nn.functional.normalize(torch.randn(count - near, 3, generator=draw), dim=-1)
     around *= RADIUS * torch.rand(count - near, 1, generator=draw) ** (1 / 3)
-    if not near:
-        return around.to(surface.device)
     noise = NEAR * torch.randn(near, 3, generator=draw)
     return torch.cat([_some(surface, near, draw) + noise.to(surface.device), around.to(surface.device)])
 

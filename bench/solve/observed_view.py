@@ -58,17 +58,10 @@ def slopes_over(field: Field, points: Float[Tensor, "n 3"], width: float) -> Flo
 class Weights(Protocol):
     """The terms of a view's loss and their weights."""
 
-    @property
-    def depth_loss(self) -> str: ...
-
-    @property
-    def depth_weight(self) -> float: ...
-
-    @property
-    def silhouette_weight(self) -> float: ...
-
-    @property
-    def silhouette(self) -> SilhouetteLoss: ...
+    depth_loss: str
+    depth_weight: float
+    silhouette_weight: float
+    silhouette: SilhouetteLoss
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bench.models.field import solve_by_growth
-from bench.models.observations import Holdout, Observations, hold_out, tiles, together
+from bench.models.observations import Holdout, RayObservations, hold_out, tiles, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
@@ -87,7 +87,7 @@ class Completion:
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[Observations, Given]:
+    ) -> tuple[RayObservations, Given]:
         """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
         view, observed = self._given(scene, renderer, seed=seed, device=device)
         camera = scene.view.camera

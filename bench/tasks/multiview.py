@@ -2,23 +2,18 @@
 
 from dataclasses import dataclass
 from math import radians
-from typing import ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.models.field import solve_by_growth
-from bench.models.observations import Observations
-from bench.pictures.run_figures import Given
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.optimise import StartSettings
 from bench.solve.problem import OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
-from bench.tasks.photographs import GivenPhotographs, PhotographObservations
+from bench.tasks.photographs import GivenPhotographs
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.truth import Truth
@@ -68,8 +63,6 @@ class Multiview:
     similarity: bool
     optimiser: OptimiserSettings
 
-    takes_field: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
@@ -100,29 +93,12 @@ class Multiview:
         return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
 
     def execute(self, run: RunContext) -> None:
-        """Optimises the code, or the requested field, and evaluates the shape before and after."""
+        """Optimises the code, and evaluates the shape before and after."""
         apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
         if apart > FAR_APART:
             note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             run.record.notes = [*run.record.notes, note]
-        solve = solve_task if run.inputs.field.of_prior else solve_by_growth
-        solve(self, run)
-
-    def observations(
-        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[Observations, Given]:
-        """The observations for a field without a prior; some photographs are held out.
-
-        Raises:
-            BadInput: for settings that need a prior, and for too few photographs.
-        """
-        if self.sought or self.starts > 1:
-            raise BadInput("task.scale, degrees, shift, similarity and starts need a prior: set field=prior")
-        scene_seed = scene.seed(seed)
-        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        given = GivenPhotographs(self, renderer, photographs, device)
-        nothing = np.zeros(scene.view.mask.shape, dtype=bool)
-        return PhotographObservations.of(given), Given(scene.view, nothing, given.colours.cpu().numpy())
+        solve_task(self, run)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

@@ -1,55 +1,34 @@
-"""Photographs with known cameras: the photometric loss, and held-out pairs for fields without a prior."""
+"""Photographs with known cameras, and the photometric loss that compares a field with them."""
 
-from copy import copy
-from dataclasses import dataclass, replace
-from math import nan
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.models.held_out import HeldOutError
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings
 from datasets.shot import Shot
-from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
 from renderers.camera import Rays
-from renderers.checks import BadInput
 from renderers.field import Field
 from renderers.rendering import Renderer, at_iteration
 
 SURE = 0.999  # least weight of neighbouring pixels on the shape for a depth to be interpolated between them
-HELD_OUT_EVERY = 6  # every sixth pair of photographs is held out, where a field has no prior
 
 
 @runtime_checkable
 class PhotometricSettings(Protocol):
     """The settings of a task that the loss reads; see `bench.tasks.multiview.Multiview`."""
 
-    @property
-    def views_per_step(self) -> int: ...
-
-    @property
-    def neighbour(self) -> int: ...
-
-    @property
-    def visible(self) -> float: ...
-
-    @property
-    def photometric_weight(self) -> float: ...
-
-    @property
-    def coarse_blur(self) -> float: ...
-
-    @property
-    def optimiser(self) -> OptimiserSettings: ...
-
-    @property
-    def turns(self) -> StartSettings: ...
+    views_per_step: int
+    neighbour: int
+    visible: float
+    photometric_weight: float
+    coarse_blur: float
+    optimiser: OptimiserSettings
+    turns: StartSettings
 
 
 class GivenPhotographs:
@@ -65,34 +44,19 @@ class GivenPhotographs:
         self.per_step = min(settings.views_per_step, len(photographs))
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
-        """The views that an iteration compares, each paired with its neighbour."""
-        return spaced(neighbours(len(self.cameras), self.settings.neighbour), self.per_step, iteration)
+        """The views that an iteration compares, evenly spaced, each paired with its neighbour; they shift by one."""
+        count = len(self.cameras)
+        views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
+        return [(view, (view + self.settings.neighbour) % count) for view in views]
 
-    def compare(self, field: Field, iteration: int, pairs: list[tuple[int, int]] | None = None) -> Terms:
+    def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
-
-        Args:
-            field: field of the shape.
-            iteration: current iteration.
-            pairs: pairs of views; None for those of the iteration.
 
         Raises:
             NotReached: where no pixel is seen by both views.
         """
-        renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration) if pairs is None else pairs
-        together = torch.cat(self.differences(field, renderer, pairs, self._blurred(iteration)))
-        if not len(together):
-            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
-        return {"photometric": self.settings.photometric_weight * together.mean()}
-
-    def differences(
-        self,
-        field: Field,
-        renderer: Renderer,
-        pairs: list[tuple[int, int]],
-        colours: Float[Tensor, "views height width 3"],
-    ) -> list[Float[Tensor, " _"]]:
-        """Absolute differences of colours for each pair, over the pixels that both views see."""
+        renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
+        colours = self.blurred(iteration)
         mine = rendered(renderer, field, self._together([pair[0] for pair in pairs]))
         with torch.no_grad():
             others = rendered(renderer, field, self._together([pair[1] for pair in pairs]))
@@ -104,7 +68,10 @@ class GivenPhotographs:
                 seen = mine.hit[k] & self._sees(there, others.hit[k], pixels, depth)
             warped, _ = sample(colours[other], pixels[seen])
             differences.append((warped - colours[view][seen]).abs().mean(-1))
-        return differences
+        together = torch.cat(differences)
+        if not len(together):
+            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
+        return {"photometric": self.settings.photometric_weight * together.mean()}
 
     def _sees(
         self,
@@ -124,118 +91,11 @@ class GivenPhotographs:
         origins = torch.stack([rays.origins for rays in chosen])
         return Rays(origins, torch.stack([rays.directions for rays in chosen]), image=True)
 
-    def _blurred(self, iteration: int) -> Float[Tensor, "views height width 3"]:
+    def blurred(self, iteration: int) -> Float[Tensor, "views height width 3"]:
         """The images at an iteration, blurred at first where `coarse_blur` is set."""
         iterations = self.settings.turns.iterations_of_last(self.settings.optimiser.iterations)
         sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * iteration / iterations)
         return self.colours if sigma <= 0 else blurred(self.colours, sigma)
-
-
-@dataclass(frozen=True)
-class PhotographObservations:
-    """Photographs of which some are held out; see `bench.models.observations.Observations`.
-
-    Errors are differences of colours, so no pixel footprint applies: `footprint` is 0.
-
-    Args:
-        given: all photographs.
-        fitted, held_out: pairs of neighbours; no photograph is in both lists.
-    """
-
-    given: GivenPhotographs
-    fitted: list[tuple[int, int]]
-    held_out: list[tuple[int, int]]
-
-    footprint: ClassVar[float] = 0.0
-
-    @staticmethod
-    def of(given: GivenPhotographs) -> "PhotographObservations":
-        """Holds out one of every `HELD_OUT_EVERY` pairs.
-
-        Raises:
-            BadInput: where there are too few photographs.
-        """
-        count = len(given.cameras)
-        fitted, held_out = split_pairs(count, neighbour=given.settings.neighbour)
-        if len(held_out) < 2 or not fitted:
-            least = 2 * HELD_OUT_EVERY
-            raise BadInput(
-                f"{count} photographs leave no pairs to hold out where no prior is used: task.images.views={least}, "
-                "with task.neighbour=1, or field=prior"
-            )
-        return PhotographObservations(given, fitted, held_out)
-
-    @property
-    def renderer(self) -> Renderer:
-        """The renderer with which photographs are compared."""
-        return self.given.renderer
-
-    @property
-    def rays(self) -> int:
-        """Rays per iteration, of both views of each pair."""
-        return (
-            2 * min(self.given.per_step, len(self.fitted)) * self.given.colours.shape[1] * self.given.colours.shape[2]
-        )
-
-    @property
-    def points(self) -> Float[Tensor, "n 3"]:
-        """Known points of the surface: none."""
-        return self.given.colours.new_zeros(0, 3)
-
-    @property
-    def free(self) -> Float[Tensor, "n 3"]:
-        """Known points in free space: none."""
-        return self.points
-
-    def through(self, renderer: Renderer) -> "PhotographObservations":
-        """The same observations, compared with another renderer."""
-        given = copy(self.given)
-        given.renderer = renderer
-        return replace(self, given=given)
-
-    def depth_error(self, terms: Terms) -> float:
-        """Not a number: differences of colours give no error of depth."""
-        return nan
-
-    def terms(self, field: Field, iteration: int, share: float) -> Terms:
-        """The photometric loss of an iteration's pairs.
-
-        Raises:
-            NotReached: where no point is seen by two views.
-        """
-        return self.given.compare(field, iteration, spaced(self.fitted, self.given.per_step, iteration))
-
-    @torch.no_grad()
-    def error(self, field: Field) -> HeldOutError:
-        """The error of the held-out pairs."""
-        return photographic_error(
-            self.given.differences(field, at_max_samples(self.renderer), self.held_out, self.given.colours)
-        )
-
-
-def photographic_error(differences: list[Float[Tensor, " _"]]) -> HeldOutError:
-    """The mean over pairs of the mean difference of colours; 1, the largest, where two photographs share no point."""
-    rows = [[float(found.mean()), 1, 0, 1] if len(found) else [0, 0, 1, 1] for found in differences]
-    return HeldOutError(np.array(rows, dtype=np.float64), 1.0)
-
-
-def neighbours(count: int, apart: int) -> list[tuple[int, int]]:
-    """Pairs of each of `count` views on a circle with the one that is `apart` views further."""
-    return [(view, (view + apart) % count) for view in range(count)]
-
-
-def spaced(pairs: list[tuple[int, int]], most: int, iteration: int) -> list[tuple[int, int]]:
-    """The pairs of an iteration, at most `most`, evenly spaced; they shift by one with each iteration."""
-    count = min(most, len(pairs))
-    return [pairs[(iteration + round(k * len(pairs) / count)) % len(pairs)] for k in range(count)]
-
-
-def split_pairs(count: int, *, neighbour: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Pairs of neighbouring views that a field is fitted to, and held-out pairs; no view is in both lists."""
-    pairs = neighbours(count, neighbour)
-    held_out = [pair for pair in pairs[::HELD_OUT_EVERY] if max(pair) < count - 1 or min(pair) > 0]
-    hidden = {view for pair in held_out for view in pair}
-    return [pair for pair in pairs if not hidden & set(pair)], held_out
 
 
 def blurred(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:

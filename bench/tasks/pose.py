@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
-from bench.models.field import fitted_shape
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
@@ -132,8 +131,6 @@ class Pose(PoseTask):
     normal_weight: float
     optimiser: OptimiserSettings
 
-    takes_field: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_choice("task.shape", self.shape, ("grid", "prior", "formula"))
@@ -145,7 +142,7 @@ class Pose(PoseTask):
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput where the shape is to be known by a network that was not fitted to it."""
-        if self.shape == "prior" and inputs.field.of_prior:
+        if self.shape == "prior":
             inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
@@ -158,7 +155,7 @@ class Pose(PoseTask):
         name = type(inputs.renderer).__name__
         if not inputs.renderer.capabilities.ray_gradient:
             raise Unsupported(f"{name} has no gradient towards rays, so none towards a camera")
-        known = known_shape(self, inputs) if inputs.field.of_prior else fitted_shape(run, self)
+        known = known_shape(self, inputs)
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
 
         def problem() -> PoseProblem:

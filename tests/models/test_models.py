@@ -7,22 +7,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from bench.config import load
 from bench.models import candidates as formulas
-from bench.models.candidates import PAPERS, REACH, candidate
+from bench.models.candidates import PAPERS, REACH, by_size, candidate
 from bench.models.fit import SCREENING, Fitter, _slope_error
 from bench.models.growth import _is_better, cost, grow
-from bench.models.held_out import MISSED, HeldOut, HeldOutError
+from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
 from bench.models.observations import FREE, Holdout, hold_out, together
 from bench.models.study import choose
 from bench.models.views import Views
+from bench.pictures.size_chart import AXES
 from bench.records.record import RunStatus
-from bench.setup.auto import AutoSettings, epsilon, rays_share
-from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
+from bench.setup.auto import rays_share
+from bench.setup.fields import SIZE_WORDS, FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import GivenView
+from bench.studies.parsimony import SIZES as SHOWN_SIZES
 from datasets.extract import extract
 from datasets.scene import see
 from datasets.truth import Truth
@@ -30,6 +31,7 @@ from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
 from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
 from renderers.silhouette import Own
+from tests.looped import each
 from tests.tiny import CPU
 
 DIST = load("renderer", "dist", n_gradient_samples=1)
@@ -86,7 +88,7 @@ def evidence_of(name: str, size: int | Size, error: HeldOutError | None) -> Evid
     return Evidence(name, size, 10, error, status, "" if error else "it rose")
 
 
-@pytest.mark.parametrize("name", SIZES)
+@each("name", SIZES)
 def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
     ball = Model("sphere", [torch.zeros(1, requires_grad=True)], lambda free: sphere(0.5), 0.1, metric=True)
     seen = Seen(points(500).float(), ball, 0, CPU)
@@ -105,23 +107,34 @@ def test_the_papers_network_has_1_8_million():
     assert PAPERS.flops == pytest.approx(2 * PAPERS.stored, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("unoin_3", "did you mean union_3"), ("union_1", "union_2 is the smallest"), ("network_4", "unknown field"),
-     ("network_4x2", "width must be at least 4"), ("grid_x", "unknown field"), ("grid_4", "between 8 and 256")],
-)  # fmt: skip
-def test_an_unknown_candidate_is_an_error(name, message):
+@each(
+    "changed, message",
+    [
+        ({"candidates": ("unoin_3",)}, "did you mean union_3"),
+        ({"candidates": ("union_1",)}, "union_2 is the smallest"),
+        ({"candidates": ("network_4",)}, "unknown field"),
+        ({"candidates": ("grid_4",)}, "between 8 and 256"),
+        ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
+        ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
+        ({"views": {"share": 1.0}}, "between 0 and 1"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
-        ModelSettings((name,), "stored", FIT, GROWTH, VIEWS)
+        parts = {"candidates": ("sphere",), "size": "stored", "fit": FIT, "growth": GROWTH, "views": VIEWS}
+        if "views" in changed:
+            changed = {"views": replace(VIEWS, **changed["views"])}
+        ModelSettings(**parts | changed)
 
 
 def test_a_rounded_box_can_be_a_box_and_a_capsule():
     logs = [*np.log([0.2, 0.5, 0.2]), 40.0]
     numbers = torch.tensor([0.0] * 6 + logs, dtype=torch.float64)
     as_capsule = capsule((0.0, -0.3, 0.0), (0.0, 0.3, 0.0), 0.2)
-    assert torch.allclose(formulas.rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
+    rounded = formulas.PARTS["rounded_box"].shape
+    assert torch.allclose(rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
     numbers[9] = -40.0
-    assert torch.allclose(formulas.rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
+    assert torch.allclose(rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
 
 
 def test_parts_are_turned_and_moved_and_united():
@@ -130,10 +143,10 @@ def test_parts_are_turned_and_moved_and_united():
     turned = box((0.4, 0.1, 0.2)).translate((0.3, 0.1, -0.2))  # by a right angle about z
     whole = turned | sphere(0.2, (-0.4, 0.0, 0.0))
     assert torch.allclose(formulas.union(torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
-    assert torch.allclose(formulas.box(first[:9])(points()), turned(points()), atol=1e-6)
+    assert torch.allclose(formulas.PARTS["box"].shape(first[:9])(points()), turned(points()), atol=1e-6)
 
 
-@pytest.mark.parametrize("powers", [(1.0, 1.0), (1.0, 4.0), (2.0, 2.0), (3.0, 1.5), (20.0, 20.0)])
+@each("powers", [(1.0, 1.0), (1.0, 4.0), (2.0, 2.0), (20.0, 20.0)])
 def test_a_superquadric_is_a_bound(powers):
     shape = superquadric((0.6, 0.3, 0.4), powers)
     where = points()[:1000].requires_grad_()
@@ -141,19 +154,6 @@ def test_a_superquadric_is_a_bound(powers):
     assert torch.linalg.vector_norm(slopes, dim=-1).max() <= 1 + 1e-6
     close = shape(where.detach() + 1e-9)
     assert bool(close.isfinite().all())
-
-
-def test_superquadrics_reach_from_octahedra_over_ellipsoids_to_boxes():
-    where = points()
-    octahedron = (where.abs() / torch.tensor([0.6, 0.3, 0.4])).sum(-1) < 1
-    assert torch.equal(superquadric((0.6, 0.3, 0.4), (1.0, 1.0))(where) < 0, octahedron)
-    ellipsoid = sphere(1.0).stretch((0.6, 0.3, 0.4))
-    assert torch.allclose(superquadric((0.6, 0.3, 0.4), (2.0, 2.0))(where), ellipsoid(where), atol=1e-9)
-    almost = superquadric((0.6, 0.3, 0.4), (60.0, 60.0))(where) < 0
-    assert (almost != (box((0.6, 0.3, 0.4))(where) < 0)).double().mean() < 0.01
-    exponents = torch.tensor([2.0, 3.0], dtype=torch.float64, requires_grad=True)
-    superquadric((0.6, 0.3, 0.4), exponents)(torch.zeros(1, 3, dtype=torch.float64)).sum().backward()
-    assert bool(exponents.grad.isfinite().all())
 
 
 def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
@@ -227,15 +227,6 @@ def test_held_out_rays_are_not_given():
     assert first == again != other
 
 
-def test_without_a_mask_only_known_depths_are_held_out():
-    view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
-    some = view.mask & (torch.arange(24) % 2 == 0)
-    given = GivenView.of(view, WEIGHTS, DIST, observed=some, mask=None, device=CPU)
-    found = hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.5, (), 0.02, 0), rays=64)
-    assert len(found.held_out.distance) == pytest.approx(0.5 * some.sum(), abs=1)
-    assert bool(found.held_out.mask.all())
-
-
 CASES = {
     "the smallest within one standard error": ([(4, 0.030), (9, 0.0105), (10, 0.010)], 0.001, 9, True, False),
     "not one that is just above": ([(4, 0.030), (9, 0.0125), (10, 0.010)], 0.001, 10, True, False),
@@ -244,7 +235,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_the_choice_is(case):
     candidates, footprint, chosen, within, enough = CASES[case]
     ladder = [evidence_of(str(size), size, an_error(mean, 0.0015)) for size, mean in candidates]  # s.e. about 0.00097
@@ -339,7 +330,7 @@ def test_a_candidate_that_would_cost_more_than_the_budget_is_not_tried():
     assert "larger ones would exceed models.growth.budget" in found.summary("auto")[0]
 
 
-@pytest.mark.parametrize(("spread", "better"), [(0.002, True), (-0.002, False)])
+@each("spread, better", [(0.002, True), (-0.002, False)])
 def test_a_candidate_is_better_beyond_the_noise_of_the_difference(spread, better):
     """Both differ by as much; in one case all groups agree on it, in the other they contradict each other."""
     old, new = (evidence_of("box", 9, one) for one in (an_error(0.01, 0.002), an_error(0.0095, spread)))
@@ -364,7 +355,6 @@ def test_rays_follow_the_error_that_is_left():
     assert rays_share(0.1, 0.01, 0.02) == pytest.approx(0.25)
     assert rays_share(0.1, 0.01, 0.5) == 0.1
     assert rays_share(0.1, 0.01, 0.001) == 1.0
-    assert rays_share(0.1, 0.0, 0.5) == 1.0  # no footprint: no pixel is too fine
     assert rays_share(0.1, 0.01, float("nan")) == 1.0
     coarse, whole = fitter_of("capsule", warm_iterations=1, fewest_rays=0.1), fitter_of("capsule", warm_iterations=1)
     spent = []
@@ -375,7 +365,7 @@ def test_rays_follow_the_error_that_is_left():
     assert spent[0] < 0.6 * spent[1]
 
 
-@pytest.mark.parametrize("name", ["dist", "idr", "dvr"])
+@each("name", ["dist", "dvr"])
 def test_the_error_that_is_left_is_that_of_the_depth_whatever_a_silhouette_costs(name):
     """A cross-entropy has no length: a shape that is right asks for all rays, one that is missed for the fewest."""
     observations = views_of("box", load("renderer", name)).observations(0)
@@ -385,31 +375,6 @@ def test_the_error_that_is_left_is_that_of_the_depth_whatever_a_silhouette_costs
     assert right < observations.footprint < small
     nothing = Shape(lambda p: 1 + 0 * p[..., 0], Kind.DISTANCE)
     assert observations.depth_error(observations.terms(nothing, 0, 1.0)) == np.inf
-
-
-def test_half_a_pixel_is_that_of_epsilon_auto():
-    loose = AutoSettings(10.0, spurious=1.0, area_over_perimeter=1.0)
-    assert views_of("ball").footprint == pytest.approx(epsilon(SAMPLER, OmegaConf.create({}), loose))
-    with pytest.raises(ValueError, match="outside of the unit sphere"):
-        _ = replace(views_of("ball"), sampler=replace(SAMPLER, distance=0.5)).footprint
-
-
-def test_further_views_are_others():
-    views = views_of("ball")
-    first, further = views.observations(0).held_out, views.further(4, 0)
-    assert isinstance(further, HeldOut)
-    assert not torch.isin(further.rays.origins.unique(dim=0), first.rays.origins).all(-1).any()
-    again = views.further(4, 1)
-    assert not torch.equal(further.rays.origins, again.rays.origins)
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [({"held_out": 1}, "at least 2"), ({"share": 1.0}, "between 0 and 1"), ({"elevation": 90.0}, "between 0 and 90")],
-)
-def test_invalid_view_settings_are_errors(changed, message):
-    with pytest.raises(ValueError, match=message):
-        replace(VIEWS, **changed)
 
 
 def test_a_renderers_random_draws_are_the_same_for_every_fit():
@@ -431,13 +396,6 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
         hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.2, (), 0.02, 0), rays=64)
 
 
-def test_a_field_that_hits_no_known_depth_has_the_largest_error():
-    nothing = HeldOutError(np.array([[0.0, 0, 2, 40]] * 3), 0.1)
-    assert nothing.mean == pytest.approx(0.1)
-    flat = Model("sphere", [torch.zeros(1)], lambda free: Shape(lambda p: 1e-6 + 0 * p[..., 0]), 0.1, metric=True)
-    assert views_of("ball").observations(0).error(flat.frozen()).mean > views_of("ball").footprint
-
-
 def test_a_warm_start_counts_evaluations_of_the_previous_field():
     fitter = fitter_of("ball", warm_iterations=10)
     ball = fitter.begin(candidate("sphere"), None)
@@ -449,18 +407,47 @@ def test_a_warm_start_counts_evaluations_of_the_previous_field():
     assert network.evidence.flops > 10 * 128 * (10 + candidate("network_1x16").flops)
 
 
-def test_unions_without_points_have_distinct_parts():
-    nothing = torch.zeros(0, 3)
-    (model,) = candidate("union_3").starts(Seen(nothing, None, 0, CPU))
-    assert len(model.parameters[0].unique(dim=0)) == 3
-    (larger,) = candidate("union_5").starts(Seen(nothing, model, 0, CPU))
-    assert torch.equal(larger.parameters[0][:3], model.parameters[0])
+def test_a_union_has_a_part_about_each_cluster_however_small():
     two = torch.cat([torch.randn(30, 3) * 0.02 + 0.6, torch.tensor([[-0.7] * 3, [-0.72] * 3])])
     for start in candidate("union_2").starts(Seen(two, None, 0, CPU)):
         middles = start.parameters[0][:, :3].mean(1).sort().values
         assert middles.tolist() == pytest.approx([-0.71, 0.6], abs=0.05)
 
 
-def test_a_repeated_candidate_is_an_error():
-    with pytest.raises(ValueError, match="name each candidate once"):
-        ModelSettings(("sphere", "box", "sphere"), "stored", FIT, GROWTH, VIEWS)
+# On fandisk, both are under half a pixel: the grid has fewer free numbers, the network fewer stored ones.
+GRID, NETWORK = Size(free=4_427, stored=32_768, sparse_bytes=40_000), Size(free=12_801, stored=12_801)
+
+
+@pytest.mark.parametrize(
+    ("measure", "chosen"), [("free", "grid_32"), ("stored", "network_4x64"), ("bytes", "network_4x64")]
+)
+@pytest.mark.parametrize("turned", [False, True])
+def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chosen, turned):
+    fits = [evidence_of("grid_32", GRID, an_error(0.008)), evidence_of("network_4x64", NETWORK, an_error(0.009))]
+    choice = choose(fits[::-1] if turned else fits, 0.01, measure)
+    assert (choice.chosen.candidate, choice.measure, choice.best.candidate) == (chosen, measure, "grid_32")
+
+
+def test_sizes_in_words():
+    assert str(GRID) == "32,768 numbers, 4,427 of them free"
+    assert str(NETWORK) == "12,801 numbers"
+    assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204)
+
+
+def test_candidates_are_tried_in_the_order_of_the_measure(compose_config):
+    names = ("sphere", "ellipsoid", "box", "network_2x64", "grid_32", "network_4x64", "network_4x128")
+    by_stored = (*names[:4], "network_4x64", "grid_32", "network_4x128")
+    assert [one.name for one in by_size(names, "free")] == list(names)
+    for measure in ("stored", "bytes"):
+        assert [one.name for one in by_size(names, measure)] == list(by_stored)
+    for scale in ("smoke", "desk", "paper"):
+        shipped = tuple(compose_config(f"scale={scale}").models.candidates)
+        sizes = [one.stored for one in by_size(shipped, "stored")]
+        assert sizes == sorted(sizes)
+        free = [candidate(name).stored for name in shipped if not name.startswith("grid_")]
+        assert free == sorted(free)  # all numbers of the others are free
+
+
+def test_pages_have_the_same_measures_under_the_same_words():
+    assert set(SHOWN_SIZES) == set(SIZE_WORDS)
+    assert {measure: AXES[measure] for measure in SHOWN_SIZES} == SIZE_WORDS

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from bench.evaluate.evaluate import Evaluation
 from bench.models.candidates import PAPERS, candidate
-from bench.models.field import verdict
+from bench.models.field import failure_of
 from bench.models.growth import grow
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
@@ -22,7 +21,6 @@ from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.solve.problem import Unsupported
 from bench.tasks.capacity import Capacity, saved
-from bench.tasks.photographs import photographic_error, split_pairs
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
 from tests.tiny import Blind, ball_prior, camera_of, plain, run_of, silent
@@ -96,28 +94,13 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert "half a pixel is" in " ".join(shown.split())
 
 
-@pytest.mark.slow  # tests/models/test_sizes.py has the same choice by given errors
-@pytest.mark.parametrize(("measure", "needs"), [("free", "grid_12"), ("stored", "network_1x320")])
-def test_a_real_fit_whose_choice_depends_on_the_measure(compose_config, tmp_path, measure, needs):
-    """Both candidates are under half a pixel, which is wide here: a grid of 1,728 samples, of which few are fitted."""
-    ladder, few = "models.candidates=[grid_12,network_1x320]", ("task.checks.views=3", "task.checks.drawn=2")
-    fits = ("models.fit.iterations=8", "models.fit.warm_iterations=150", "view.resolution=8")
-    record = run(
-        *(tmp_path, compose_config, "task=capacity", "dataset=sphere", ladder, f"models.size={measure}", *few, *fits)
-    )
-    metrics = record.metrics
-    assert (record.status, metrics["recommended_field"], metrics["recommended_by"]) == ("ok", needs, measure)
-    assert metrics["grid_12.stored"] == 1728 == metrics["grid_12.bytes"] / 4 > metrics["network_1x320.stored"]
-    assert metrics["grid_12.free"] < metrics["network_1x320.free"] == metrics["network_1x320.stored"]
-
-
 def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
     growth = grow(fitter_of("box", iterations=10, seed=1), [candidate("sphere")], GROWTH)
     assert growth.fitted.evidence.mean > growth.footprint  # a ball is no box
-    assert verdict(growth, Evaluation({})) == (RunStatus.OK, "")
-    assert verdict(growth, Evaluation({}, failure=(RunStatus.EMPTY, "nothing")))[0] == RunStatus.EMPTY
+    assert failure_of(growth, Evaluation({})) is None
+    assert failure_of(growth, Evaluation({}, failure=(RunStatus.EMPTY, "nothing")))[0] == RunStatus.EMPTY
     better = replace(growth.initial_error, sums=growth.initial_error.sums * [0.5, 1, 0.5, 1])
-    status, reason = verdict(replace(growth, initial_error=better), Evaluation({}))
+    status, reason = failure_of(replace(growth, initial_error=better), Evaluation({}))
     assert status == RunStatus.NOT_REACHED
     assert reason.startswith("the held-out error rose by more than its noise: 0.0")
 
@@ -127,15 +110,6 @@ def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
     record = run(tmp_path, compose_config, "task=capacity", "dataset=sphere", "models.candidates=[sphere]", *own)
     assert (record.status, record.metrics["recommended_field"]) == ("ok", "sphere")
     assert not [note for note in record.notes if note.startswith("pixel precision: renderer.")]
-
-
-def test_the_final_number_of_samples_is_noted_for_the_recommended_candidate(compose_config, tmp_path):
-    dvr = ("renderer=dvr", "renderer.n_ray_samples=auto", "dataset=sphere", "models.candidates=[sphere,box]")
-    record = run(tmp_path, compose_config, "task=capacity", *dvr)
-    assert (record.status, record.metrics["recommended_field"]) == ("ok", "sphere")
-    came = [note for note in record.notes if note.startswith("renderer.n_ray_samples=auto ends with")]
-    assert came == [note for note in came if note.startswith("renderer.n_ray_samples=auto ends with 16, for a part 1.")]
-    assert len(came) == 1
 
 
 def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
@@ -190,64 +164,15 @@ def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     assert (tmp_path / "mesh.ply").is_file()
 
 
-def test_a_pose_is_found_with_a_grown_shape(compose_config, tmp_path):
-    overrides = (
-        "task=pose",
-        "dataset=box",
-        "field=auto",
-        "models.candidates=[sphere,box]",
-        "task.optimiser.iterations=3",
-    )
-    record = run(tmp_path, compose_config, *overrides, "task.optimiser.iterations=3", "models.fit.warm_iterations=80")
-    assert record.status in ("ok", "not_reached"), record.reason
-    assert any(note.startswith("field=auto: sphere -> box, 9 numbers") for note in record.notes)
-    assert record.metrics["mask_iou"] > 0.5
-
-
-def test_photographs_evaluate_a_field_on_held_out_pairs(compose_config, tmp_path):
-    overrides = (
-        "task=multiview",
-        "dataset=sphere",
-        "field=auto",
-        "models.candidates=[sphere,box]",
-        "task.optimiser.iterations=6",
-    )
-    record = run(tmp_path, compose_config, *overrides, "task.images.views=12")
-    assert record.status in ("ok", "not_reached"), record.reason
-    assert record.metrics["field"] in ("sphere", "box")
-    assert record.metrics["field_footprint"] == 0
-    fitted, held_out = split_pairs(12, neighbour=1)
-    assert not {view for pair in fitted for view in pair} & {view for pair in held_out for view in pair}
-    assert (len(fitted), len(held_out)) == (6, 2)
-
-
 @pytest.mark.parametrize(
     ("overrides", "status", "message"),
     [
         (("task=gradients", "+experiment=fitted", "field=auto"), "refused", "does not take field=auto: remove it"),
         (("task=completion", "field=spere"), "refused", "unknown field 'spere': did you mean sphere"),
         (("task=capacity", "task.frugal_rays=0"), "refused", "frugal_rays must be above 0"),
-        (  # found by the run, when it pairs its photographs
-            ("task=multiview", "field=auto", "task.images.views=6"),
-            "refused",
-            "6 photographs leave no pairs to hold out",
-        ),
     ],
 )  # fmt: skip
 def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path, overrides, status, message):
     record = run(tmp_path, compose_config, *overrides)
     assert record.status == status
     assert message in record.reason
-
-
-def test_the_shipped_ladders_begin_with_a_sphere_and_reach_the_papers_network(compose_config):
-    for scale, last in (("smoke", "network_4x64"), ("desk", PAPERS.name), ("paper", PAPERS.name)):
-        names = list(compose_config(f"scale={scale}").models.candidates)
-        assert names[0] == "sphere"
-        assert names[-1] == last
-
-
-def test_photographs_without_a_common_point_count_as_wholly_wrong():
-    """A field that two photographs of a pair do not both see costs as much as the largest difference of colours."""
-    error = photographic_error([torch.full((50,), 0.1), torch.zeros(0)])
-    assert error.mean == pytest.approx((0.1 + 1) / 2)

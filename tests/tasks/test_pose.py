@@ -18,10 +18,10 @@ from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
-from renderers.boundary import BrokenContract
 from renderers.fields.analytic import box
 from renderers.silhouette import Own
-from tests.tiny import CPU, Blind, ball_prior, camera_of, phases_of, run_of
+from tests.looped import each
+from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
@@ -57,19 +57,6 @@ def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
     return PoseProblem(settings, renderer, box(SIZES), scene.view, settings.cameras(CAMERA, 0), CPU)
 
 
-def test_a_renderer_that_claims_a_gradient_towards_rays_and_lacks_it_is_told(scene, tmp_path):
-    class Detached(type(DIST)):
-        """Its distances are constants."""
-
-        def render(self, field, rays):
-            found = super().render(field, rays)
-            return replace(found, distance=found.distance.detach())
-
-    run = run_of(tmp_path, Detached(**vars(DIST)), ball_prior(), CAMERA, make_scene=lambda: scene)
-    with pytest.raises(BrokenContract, match=r"Detached\.capabilities\.ray_gradient is True, .* towards the rays"):
-        SETTINGS.execute(run)
-
-
 def test_the_distances_of_the_view_are_told_to_a_loss_that_takes_them(scene):
     asked = []
 
@@ -87,7 +74,7 @@ def test_the_distances_of_the_view_are_told_to_a_loss_that_takes_them(scene):
     assert box(SIZES)(points).abs().max() < 1e-4  # on the true surface
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
+@each("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
 def test_the_error_of_a_turn_is_its_angle(angle):
     axis = torch.tensor([0.6, 0.0, 0.8])
     turned = CAMERA.with_object_moved(torch.cat([torch.zeros(3), radians(angle) * axis]))
@@ -170,27 +157,21 @@ def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
     return history.curve[-1]["total"]
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_restarts_find_what_one_start_misses(scene, seed):
+def test_restarts_find_what_one_start_misses(scene):
     """Judged by the loss: a box looks the same from four sides."""
-    assert final_loss(scene, seed, starts=8, trial=6, iterations=140) < 0.1 < final_loss(scene, seed)
+    assert final_loss(scene, 2, starts=8, trial=6, iterations=140) < 0.1 < final_loss(scene, 2)
 
 
-@pytest.mark.parametrize(("shape", "tolerance"), [("grid", 0.02), ("formula", 1e-6)])
-def test_a_known_shape_is_the_scenes(run, shape, tolerance):
-    known = known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)
+def test_a_known_shape_is_the_scenes(run):
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
-    assert (known(points) - box(SIZES)(points)).abs().max() < tolerance
-
-
-def test_a_known_shape_may_be_a_network(run):
-    known = known_shape(replace(SETTINGS, shape="prior"), run.inputs)
-    expected = run.inputs.prior.decoder.at(run.inputs.prior.codes[0])
-    points = torch.rand(10, 3)
-    assert torch.equal(known(points), expected(points))
-
-
-def test_a_shape_without_a_formula_is_told(run):
+    grid, formula, network = (
+        known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)(points)
+        for shape in ("grid", "formula", "prior")
+    )
+    assert (grid - box(SIZES)(points)).abs().max() < 0.02
+    assert (formula - box(SIZES)(points)).abs().max() < 1e-6
+    prior = run.inputs.prior
+    assert torch.equal(network, prior.decoder.at(prior.codes[0])(points))
     inputs = replace(run.inputs, make_scene=lambda: replace(run.inputs.scene, formula=None))
     with pytest.raises(ValueError, match=r"box has no formula: set task\.shape=grid"):
         known_shape(SETTINGS, inputs)
@@ -202,12 +183,6 @@ def test_a_renderer_without_a_gradient_towards_rays_is_unsupported(run):
         SETTINGS.execute(blind)
 
 
-def test_a_start_that_sees_nothing_is_not_ok_without_having_found_it(run):
-    replace(SETTINGS, shift=6.0, optimiser=OptimiserSettings(5, 0.02, "cosine")).execute(run)
-    assert run.record.metrics["success"] == 0.0
-    assert all(np.isfinite(run.record.metrics[name]) for name in ("rotation_error_deg", "translation_error"))
-
-
 @pytest.mark.parametrize("method", ["point_to_point", "point_to_plane"])
 def test_closest_points_find_a_near_pose(run, method):
     replace(ICP, method=method).execute(run)
@@ -216,15 +191,6 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.metrics["rotation_error_deg"] < 4.0
     assert run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
-
-
-def test_closest_points_say_what_they_do(run):
-    assert phases_of(run, ICP) == ["registering points"]
-
-
-def test_closest_points_start_where_the_renderers_do():
-    mine, theirs = (settings.cameras(CAMERA, 7)[0].world_to_camera for settings in (ICP, SETTINGS))
-    assert torch.equal(mine, theirs)
 
 
 def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
@@ -239,19 +205,12 @@ def test_points_that_never_come_near_are_told(run):
     assert run.record.metrics["success"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("settings", "changed", "message"),
+@each(
+    "settings, changed, message",
     [
         (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
-        (SETTINGS, {"shift": -1.0}, r"task\.shift must be at least 0"),
-        (SETTINGS, {"starts": 0}, r"task\.starts must be at least 1"),
         (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
-        (SETTINGS, {"shape": "voxels"}, r"task\.shape must be one of grid, prior, formula"),
-        (SETTINGS, {"success_degrees": 0.0}, r"task\.success_degrees must be positive"),
-        (ICP, {"method": "fpfh"}, r"task\.method must be one of point_to_point, point_to_plane"),
-        (ICP, {"reach": (0.1, 0.0)}, r"task\.reach must be positive"),
         (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
-        (ICP, {"spread": -1.0}, r"task\.spread must lie between 0 and 180"),
     ],
 )
 def test_what_cannot_be_is_told(settings, changed, message):
