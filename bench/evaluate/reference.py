@@ -1,19 +1,18 @@
 """Float64 renderings of a network in a view, made once and cached by a hash of weights and camera."""
 
 import hashlib
-import os
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from bench.records.files import digest, file_lock
+from bench.progress import notice
+from bench.records.files import digest
 from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior.store import kept
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals, steepest
 from renderers.reference import trace
@@ -38,28 +37,15 @@ def in_float64(prior: Prior) -> Prior:
 
 
 def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
-    """The reference of a prior's first shape in a view, from `folder`, or made and stored there.
+    """The reference of a prior's first shape in a view, from `folder`, or made and stored there."""
 
-    Raises:
-        ValueError: where the stored one cannot be read.
-    """
-    key = _key(prior, camera)
-    path = folder / f"reference-{key}.safetensors"
-    if not path.is_file():
-        with file_lock(folder, key):
-            if not path.is_file():  # else another run has made it meanwhile
-                _store(prior, camera, path)
-    try:
-        return Reference(**load_file(path))
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"the reference {path} cannot be read ({error}): delete it, and it is made again") from error
+    def make() -> dict[str, Tensor]:
+        size = f"{camera.height} x {camera.width}"
+        notice(f"rendering the {size} pixels of the reference in float64, once; it is stored in {folder}")
+        exact = in_float64(prior)
+        return vars(make_reference(exact.decoder.at(exact.codes[0]), camera))
 
-
-def _store(prior: Prior, camera: Camera, path: Path) -> None:
-    exact = in_float64(prior)
-    scratch = path.with_suffix(f".{os.getpid()}.partial")
-    save_file(vars(make_reference(exact.decoder.at(exact.codes[0]), camera)), scratch)
-    scratch.replace(path)
+    return Reference(**kept(folder, f"reference-{_key(prior, camera)}", make))
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:

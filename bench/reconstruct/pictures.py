@@ -1,6 +1,7 @@
 """Pictures of a reconstruction: held-out photographs beside the shape with its colours. Not part of any timing."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from bench.evaluate.colours import coloured_image
 from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
-from bench.reconstruct.judge import judged_pixels
+from bench.reconstruct.judge import judge_mesh, judged_pixels
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter
-from bench.setup.inputs import RunInputs
+from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.optimise import History
+from bench.solve.solve import failure_of, note_result
 from datasets.mesh import Mesh
 from datasets.photographs import turned
 from datasets.scene import View, see
@@ -49,9 +52,23 @@ def draw_reconstruction(
     _save(folder, seen, inputs, subject, title)
 
 
-def draw_surface(folder: Path, inputs: RunInputs, mesh: Mesh, subject: Subject, title: str) -> None:
-    """Writes summary.png, input.png and images.npz of a mesh with colours."""
-    _save(folder, painter(mesh), inputs, subject, title)
+def note_surface(
+    run: RunContext, mesh: Mesh | None, subject: Subject, scores: dict[str, float], history: History | None = None
+) -> None:
+    """Judges a mesh with colours, notes the result, and writes summary.png, input.png and images.npz.
+
+    Args:
+        run: its record and folder are filled.
+        mesh: None where no surface was found.
+        subject: that it is judged by.
+        scores: further metrics.
+        history: of the loop that found it, where there was one.
+    """
+    after = judge_mesh(mesh, subject, run.inputs)
+    failure = after.failure if history is None else failure_of(history, after)
+    note_result(run, replace(after, metrics=after.metrics | scores, failure=failure))
+    if run.inputs.evaluation.picture is not None and mesh is not None:
+        _save(run.folder, painter(mesh), run.inputs, subject, run.record.outcome)
 
 
 def draw_picture(

@@ -87,14 +87,6 @@ class DistanceSamples:
     points: Float[Tensor, "shapes samples 3"]
     distances: Float[Tensor, "shapes samples"]
 
-    def first(self, count: int) -> "DistanceSamples":
-        """The samples of the first shapes."""
-        return DistanceSamples(self.points[:count], self.distances[:count])
-
-    def to(self, device: torch.device) -> "DistanceSamples":
-        """The same samples on a device."""
-        return DistanceSamples(self.points.to(device), self.distances.to(device))
-
 
 def distance_samples(
     dataset: Dataset, split: Split, settings: PriorSettings, shapes: int, progress: Report
@@ -131,7 +123,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     decoder = Decoder(**asdict(settings.network))
     initialise_to_sphere(decoder, radius=0.5)
     codes = settings.code_sigma * torch.randn(len(samples.points), settings.network.code_length)
-    decoder, codes, samples = decoder.to(device), nn.Parameter(codes.to(device)), samples.to(device)
+    decoder, codes = decoder.to(device), nn.Parameter(codes.to(device))
+    samples = DistanceSamples(samples.points.to(device), samples.distances.to(device))
     optimiser = torch.optim.Adam(
         [*decoder.parameters(), codes], lr=settings.learning_rate, betas=(0.9, settings.beta2), fused=True
     )

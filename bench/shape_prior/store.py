@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +16,15 @@ from torch import Tensor
 from bench.machine.environment import describe
 from bench.progress import Report, notice
 from bench.records.files import digest, file_lock, to_json, write_text
-from bench.shape_prior.autodecoder import Prior, PriorSettings, distance_samples, fit_error, surface_error, train
+from bench.shape_prior.autodecoder import (
+    DistanceSamples,
+    Prior,
+    PriorSettings,
+    distance_samples,
+    fit_error,
+    surface_error,
+    train,
+)
 from datasets.dataset import Dataset, Split
 from renderers.fields.mlp import Decoder
 
@@ -92,6 +101,17 @@ def load_whole(path: Path) -> dict[str, Tensor] | None:
         return None
 
 
+def kept(folder: Path, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The tensors of NAME.safetensors in a folder; made and stored there by one process where there are none."""
+    path = folder / f"{name}.safetensors"
+    with file_lock(folder, name):
+        tensors = load_whole(path)
+        if tensors is None:
+            tensors = make()
+            save_whole(tensors, path)
+    return tensors
+
+
 def probe(dataset: Dataset) -> list[float]:
     """Area and volume of the first two training shapes: a test compares them, to detect a change of the sampler."""
     meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]
@@ -109,7 +129,7 @@ def _surface_errors(
         return {"training": surface_error(prior.decoder, prior.codes, samples)}
     unseen = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress)
     return {
-        "training": fit_error(prior.decoder, samples.first(HELD_OUT)),
+        "training": fit_error(prior.decoder, DistanceSamples(samples.points[:HELD_OUT], samples.distances[:HELD_OUT])),
         "validation": fit_error(prior.decoder, unseen),
         "mean_shape": fit_error(prior.decoder, unseen, steps=0),
     }

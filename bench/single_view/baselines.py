@@ -12,9 +12,9 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import Surface, surface_metrics
 from bench.progress import Report
-from bench.records.files import digest, file_lock
+from bench.records.files import digest
 from bench.setup.inputs import RunInputs
-from bench.shape_prior.store import load_whole, save_whole
+from bench.shape_prior.store import kept
 from bench.single_view.images import ImagesOf
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH, GivenView
@@ -37,17 +37,15 @@ def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> M
     """The zero set of the mean signed distance of the first `count` training shapes, kept in `cache`."""
     settings = {"dataset": dataset.identity(), "count": count, "samples": SAMPLES, "reach": REACH, "version": VERSION}
     name = f"mean-{dataset.name}-{digest(settings)}"
-    path = cache / f"{name}.safetensors"
-    with file_lock(cache, name):
-        tensors = load_whole(path)
-        if tensors is None:
-            total = np.zeros((SAMPLES,) * 3)
-            for index in range(count):
-                progress("averaging shapes", index, count)
-                total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(SAMPLES, REACH)
-            tensors = {"values": torch.from_numpy(total / count).float()}
-            save_whole(tensors, path)
-    return extract(Grid(tensors["values"], REACH), grid=2 * SAMPLES, reach=REACH)
+
+    def make() -> dict[str, Tensor]:
+        total = np.zeros((SAMPLES,) * 3)
+        for index in range(count):
+            progress("averaging shapes", index, count)
+            total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(SAMPLES, REACH)
+        return {"values": torch.from_numpy(total / count).float()}
+
+    return extract(Grid(kept(cache, name, make)["values"], REACH), grid=2 * SAMPLES, reach=REACH)
 
 
 def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf]) -> int:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
-from bench.records.files import digest, file_lock
-from bench.shape_prior.store import load_whole, save_whole
+from bench.records.files import digest
+from bench.shape_prior.store import kept
 from datasets.captures.hull import carve
 from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
@@ -125,18 +125,16 @@ class Imaging:
         """The images of the first `count` shapes of a split, from `cache` where they were made before."""
         settings = {"dataset": dataset.identity(), "split": split, "count": count, "version": VERSION}
         key = digest({**settings, "photography": asdict(self.photography), "sampler": asdict(self.sampler)})
-        path = cache / f"images-{dataset.name}-{split}-{key}.safetensors"
-        with file_lock(cache, path.stem):
-            tensors = load_whole(path)
-            if tensors is None:
-                made = []
-                for index in range(count):
-                    progress("rendering images", index, count)
-                    made.append(self.of_shape(dataset, split, index))
-                progress("rendering images", count, count)
-                tensors = _packed(made)
-                save_whole(tensors, path)
-        return _unpacked(tensors)
+
+        def make() -> dict[str, Tensor]:
+            made = []
+            for index in range(count):
+                progress("rendering images", index, count)
+                made.append(self.of_shape(dataset, split, index))
+            progress("rendering images", count, count)
+            return _packed(made)
+
+        return _unpacked(kept(cache, f"images-{dataset.name}-{split}-{key}", make))
 
     def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:
         """The images of one shape, from cameras and with a texture of its own."""

@@ -33,7 +33,6 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
     Raises:
         BadInput: where a file cannot be read, there is no mask, or it fits neither the picture nor an object.
     """
-    check_files(path, mask)
     colours, opaque = read_image(path, mask, LONGEST)
     if opaque is None:
         raise BadInput(f"{path} has no mask: give task.mask_path=FILE, white on the object, or an alpha channel")
@@ -50,13 +49,6 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
     channels = torch.from_numpy(np.concatenate([colours, opaque], axis=-1)).permute(2, 0, 1)
     cut = _framed(channels, inside, pixels, filled)
     return as_input(cut[:3].permute(1, 2, 0), cut[3] > 0.5), notes
-
-
-def check_files(path: Path | str | None, mask: Path | str | None) -> None:
-    """Raises BadInput where one of them is given and is no file."""
-    for file, key in ((path, "image_path"), (mask, "mask_path")):
-        if file is not None and not Path(file).is_file():
-            raise BadInput(f"task.{key}={file} is no file: give the path of one")
 
 
 def filled_share(masks: Bool[Tensor, "images height width"]) -> float:

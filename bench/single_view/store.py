@@ -22,7 +22,7 @@ from bench.single_view.images import VERSION as IMAGES
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import filled_share
-from bench.single_view.training import Course, Failed, Supervision, TrainingSettings, train
+from bench.single_view.training import Course, Failed, Lessons, Supervision, TrainingSettings
 from datasets.dataset import Dataset, Split
 from renderers.checks import BadInput
 from renderers.rendering import Renderer
@@ -115,9 +115,8 @@ class Recipe:
             made = time.perf_counter() - started
             state = path.with_suffix(".state")
             try:
-                model, course = train(
-                    images, self.network, self.supervision, self.renderer, self.training, state, device, progress
-                )
+                lessons = Lessons(images, self.supervision, self.renderer, self.training, device)
+                model, course = lessons.train(self.network, state, progress)
             except Failed as error:
                 self._write(path, {"status": "nan", "reason": str(error)}, device)
                 raise

@@ -105,65 +105,59 @@ class Failed(ValueError):
         super().__init__(f"the training failed: not a number at step {step}{state}: lower task.training.learning_rate")
 
 
-def train(
-    images: Sequence[ImagesOf],
-    network: SingleViewNetwork,
-    supervision: Supervision,
-    renderer: Renderer,
-    settings: TrainingSettings,
-    state: Path,
-    device: torch.device,
-    progress: Report,
-) -> tuple[SingleView, Course]:
-    """Trains a network; a training that was stopped goes on from `state`, and ends with the same weights.
+@dataclass(frozen=True)
+class Lessons:
+    """A training: the images of the training shapes, what it may know of them, and how they are compared.
 
     Args:
         images: of the training shapes.
-        network: its sizes.
         supervision: what it may know.
         renderer: through which shapes are compared with images.
         settings: of the training.
-        state: file of the state of the training, also of one that has ended, until the caller has stored the network.
         device: of the training.
-        progress: of its steps.
-
-    Raises:
-        Failed: where the loss or its gradient is not finite; `state` stays.
     """
-    torch.manual_seed(settings.seed)
-    with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
-        model = SingleView(network).to(device)
-    optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
-    begun = _restored(state, model, optimiser, course)
-    lessons = Lessons(images, supervision, renderer, settings, device)
-    if 0 < begun < settings.steps:
-        notice(f"the training goes on after step {begun} of {settings.steps}")
-    for step in range(begun, settings.steps):
-        started = time.perf_counter()
-        for group in optimiser.param_groups:
-            group["lr"] = settings.rate(step)
-        loss = lessons.give(model, step, course.counts)
-        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
-        if not isfinite(loss) or not bool(norm.isfinite()):
-            raise Failed(step, step - step % settings.keep_every, state)
-        optimiser.step()
-        course.losses.append(loss)
-        course.seconds += time.perf_counter() - started
-        progress("training", step + 1, settings.steps, loss)
-        if (step + 1) % settings.keep_every == 0 or step + 1 == settings.steps:
-            _keep(state, model, optimiser, course)
-    return model.eval().requires_grad_(False), course
-
-
-@dataclass(frozen=True)
-class Lessons:
-    """What the steps of a training are made of; see `train`."""
 
     images: Sequence[ImagesOf]
     supervision: Supervision
     renderer: Renderer
     settings: TrainingSettings
     device: torch.device
+
+    def train(self, network: SingleViewNetwork, state: Path, progress: Report) -> tuple[SingleView, Course]:
+        """Trains a network; a training that was stopped goes on from `state`, and ends with the same weights.
+
+        Args:
+            network: its sizes.
+            state: file of the state of the training, also of one that has ended, until the caller has stored the
+                network.
+            progress: of its steps.
+
+        Raises:
+            Failed: where the loss or its gradient is not finite; `state` stays.
+        """
+        settings = self.settings
+        torch.manual_seed(settings.seed)
+        with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
+            model = SingleView(network).to(self.device)
+        optimiser, course = torch.optim.Adam(model.parameters(), lr=settings.learning_rate), Course()
+        begun = _restored(state, model, optimiser, course)
+        if 0 < begun < settings.steps:
+            notice(f"the training goes on after step {begun} of {settings.steps}")
+        for step in range(begun, settings.steps):
+            started = time.perf_counter()
+            for group in optimiser.param_groups:
+                group["lr"] = settings.rate(step)
+            loss = self.give(model, step, course.counts)
+            norm = torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
+            if not isfinite(loss) or not bool(norm.isfinite()):
+                raise Failed(step, step - step % settings.keep_every, state)
+            optimiser.step()
+            course.losses.append(loss)
+            course.seconds += time.perf_counter() - started
+            progress("training", step + 1, settings.steps, loss)
+            if (step + 1) % settings.keep_every == 0 or step + 1 == settings.steps:
+                _keep(state, model, optimiser, course)
+        return model.eval().requires_grad_(False), course
 
     def give(self, model: SingleView, step: int, counts: Counts) -> float:
         """The mean loss over a step's shapes, whose gradients are left in the weights; one shape's graph at a time."""

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
@@ -60,22 +58,11 @@ class DeepSDF:
         distance = view.depth[observed] / view.camera.depth(torch.ones(view.depth.shape))[observed]
         shift = self.offset * view.normals[observed]
         surface = rays.at(distance)
-        samples = Samples(
-            settings=self,
-            points=torch.cat([surface + shift, surface - shift]).to(device),
-            distances=self.offset * torch.tensor([1.0, -1.0]).repeat_interleave(len(distance)).to(device),
-        )
-        return CodeProblem(prior, self.code, samples.compare, observed, len(samples.points), device)
+        points = torch.cat([surface + shift, surface - shift]).to(device)
+        distances = self.offset * torch.tensor([1.0, -1.0]).repeat_interleave(len(distance)).to(device)
 
+        def compare(field: Field, iteration: int) -> Terms:
+            """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp)."""
+            return {"distance": self.distance_weight * (field(points) - distances).abs().mean()}
 
-@dataclass(frozen=True)
-class Samples:
-    """Points of known distance; `compare` evaluates a field at all of them."""
-
-    settings: DeepSDF
-    points: Float[Tensor, "n 3"]
-    distances: Float[Tensor, " n"]
-
-    def compare(self, field: Field, iteration: int) -> Terms:
-        """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp)."""
-        return {"distance": self.settings.distance_weight * (field(self.points) - self.distances).abs().mean()}
+        return CodeProblem(prior, self.code, compare, observed, len(points), device)

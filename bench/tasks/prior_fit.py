@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from bench.evaluate.evaluate import picture_view, surface_metrics, true_surface
 from bench.pictures.run_figures import save_images
@@ -85,24 +83,14 @@ class PriorFit:
         """The problem of a scene; it starts from code zero, the mean shape."""
         points, distances = sample_distances(scene.mesh, self.distances, seed)
         generator = torch.Generator(device=device).manual_seed(seed)
-        given = TrueDistances(self, points.to(device), distances.to(device), generator)
+        points, distances = points.to(device), distances.to(device)
+        count = min(self.batch, len(points))
+
+        def compare(field: Field, iteration: int) -> Terms:
+            """The mean absolute error at a random batch, weighted towards the surface as in the prior's training."""
+            picked = torch.randint(len(points), (count,), generator=generator, device=device)
+            error = (field(points[picked]) - distances[picked]).abs()
+            return {"distance": near_surface_first(error, distances[picked], self.surface_width).mean()}
+
         nothing = torch.zeros_like(scene.view.mask)
-        return CodeProblem(prior, self.code, given.compare, nothing, self.batch, device)
-
-
-@dataclass(frozen=True)
-class TrueDistances:
-    """True signed distances; `compare` evaluates a field at a random batch of the points."""
-
-    settings: PriorFit
-    points: Float[Tensor, "n 3"]
-    distances: Float[Tensor, " n"]
-    generator: torch.Generator
-
-    def compare(self, field: Field, iteration: int) -> Terms:
-        """The mean absolute error, weighted towards the surface as in the prior's training."""
-        count = min(self.settings.batch, len(self.points))
-        picked = torch.randint(len(self.points), (count,), generator=self.generator, device=self.points.device)
-        distances = self.distances[picked]
-        error = (field(self.points[picked]) - distances).abs()
-        return {"distance": near_surface_first(error, distances, self.settings.surface_width).mean()}
+        return CodeProblem(prior, self.code, compare, nothing, self.batch, device)

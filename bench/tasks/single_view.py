@@ -12,8 +12,8 @@ from torch import Tensor
 
 from bench.evaluate.colours import vertex_colours
 from bench.evaluate.evaluate import OWN, Evaluation, surface_of
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
-from bench.reconstruct.pictures import draw_picture, draw_reconstruction, draw_surface
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
+from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import with_colours
 from bench.records.record import RunStatus
@@ -22,11 +22,11 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
-from bench.single_view.own_image import best_view, check_files, read_picture
+from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.problem import check_field_gradient, check_kind
-from bench.solve.solve import COSTS, descend, failure_of, note_result
+from bench.solve.solve import COSTS, descend, note_result
 from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
@@ -112,7 +112,9 @@ class OneImage:
             raise ValueError(f"task.image_path needs task.method=network, not {self.method}: a picture has no truth")
         if self.mask_path is not None and self.image_path is None:
             raise ValueError("task.mask_path is the mask of a picture: give task.image_path as well")
-        check_files(self.image_path, self.mask_path)
+        for key, file in (("image_path", self.image_path), ("mask_path", self.mask_path)):
+            if file is not None and not Path(file).is_file():
+                raise BadInput(f"task.{key}={file} is no file: give the path of one")
 
     @property
     def knows_colours(self) -> bool:
@@ -241,11 +243,8 @@ class OneImage:
         with run.off_clock():
             mesh = surface_of(problem.field(), inputs)
             mesh = None if mesh is None else with_colours(mesh, subject.given)
-            after = judge_mesh(mesh, subject, inputs)
-            after.metrics["iou"] = overlap(problem.field(), images, inputs.device)
-            note_result(run, replace(after, failure=failure_of(history, after)))
-            if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, run.record.outcome)
+            scores = {"iou": overlap(problem.field(), images, inputs.device)}
+            note_surface(run, mesh, subject, scores, history)
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
@@ -264,23 +263,13 @@ class OneImage:
             mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), others[place].shots()
             record.notes.append(f"training shape {place}")
         with run.off_clock():
-            mesh = None if mesh is None else with_colours(mesh, seen)
-            after = judge_mesh(mesh, subject, inputs)
-            after.metrics["iou"] = 0.0 if mesh is None else overlap(Inside(Truth(mesh)), images, torch.device("cpu"))
-            note_result(run, after)
-            if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, run.record.outcome)
-
-
-@dataclass(frozen=True)
-class Inside:
-    """The signed distance of a closed mesh, as a function of points."""
-
-    truth: Truth
-
-    def __call__(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Negative inside."""
-        return torch.from_numpy(self.truth.signed_distance(points.numpy()))
+            scores = {"iou": 0.0}
+            if mesh is not None:
+                truth, mesh = Truth(mesh), with_colours(mesh, seen)
+                scores["iou"] = overlap(
+                    lambda points: torch.from_numpy(truth.signed_distance(points.numpy())), images, torch.device("cpu")
+                )
+            note_surface(run, mesh, subject, scores)
 
 
 @torch.no_grad()

@@ -1,16 +1,17 @@
 """The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
 
 import time
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
-from bench.reconstruct.pictures import draw_surface
+from bench.reconstruct.judge import COLOURED_DEFINITIONS
+from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, Depths, Subject, find_subject
 from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
-from bench.solve.solve import COSTS, note_result
+from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
@@ -18,7 +19,7 @@ from renderers.checks import BadInput, check_at_least
 
 
 @dataclass(frozen=True)
-class _Photographs:
+class _Photographs(ABC):
     """What the photographs are; see `bench.tasks.reconstruction.Reconstruction`."""
 
     images: Photography
@@ -31,7 +32,11 @@ class _Photographs:
         check_at_least("task.longest", self.longest, 8, "96 shows what there is")
         check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
 
-    def make(self, run: RunContext, surface: Callable[[Subject], Mesh | None]) -> None:
+    @abstractmethod
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The surface of the given photographs."""
+
+    def execute(self, run: RunContext) -> None:
         """Makes a surface of the given photographs, gives it their colours, and judges it by the others."""
         inputs, record = run.inputs, run.record
         record.definitions = COLOURED_DEFINITIONS | COSTS
@@ -40,14 +45,12 @@ class _Photographs:
         )
         record.notes = [*record.notes, subject.found, "no renderer took part"]
         clock = time.perf_counter()
-        mesh = cut_off(surface(subject))
+        mesh = cut_off(self.surface(subject))
         mesh = None if mesh is None else with_colours(mesh, subject.given)
         record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
-            note_result(run, judge_mesh(mesh, subject, inputs))
-            if inputs.evaluation.picture is not None and mesh is not None:
-                draw_surface(run.folder, inputs, mesh, subject, record.outcome)
+            note_surface(run, mesh, subject, {})
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,8 @@ class Hull(_Photographs):
         check_at_least("task.samples", self.samples, 8, "96 are as fine as a pixel at 96 x 96")
         super().__post_init__()
 
-    def execute(self, run: RunContext) -> None:
-        """Carves the hull."""
-        self.make(run, self._surface)
-
-    def _surface(self, subject: Subject) -> Mesh | None:
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The hull, carved."""
         if any(shot.mask is None for shot in subject.given):
             raise BadInput(f"{NO_HULL}, or set task=stereo")
         return hull_mesh(subject.given, self.samples)
@@ -100,11 +100,8 @@ class Poisson(_Photographs):
 
     fusing: Fusing
 
-    def execute(self, run: RunContext) -> None:
-        """Fuses the points of the given depths."""
-        self.make(run, self._surface)
-
-    def _surface(self, subject: Subject) -> Mesh | None:
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The fused points of the given depths."""
         if all(shot.depth is None for shot in subject.given):
             raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task=stereo")
         return self.fusing.surface(given_clouds(subject.given))
@@ -122,6 +119,6 @@ class Stereo(_Photographs):
     matching: Matching
     fusing: Fusing
 
-    def execute(self, run: RunContext) -> None:
-        """Matches the photographs, and fuses what is found."""
-        self.make(run, lambda subject: self.fusing.surface(stereo_clouds(subject.given, self.matching)))
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The fused points that the photographs agree on."""
+        return self.fusing.surface(stereo_clouds(subject.given, self.matching))

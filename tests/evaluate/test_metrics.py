@@ -56,31 +56,6 @@ def test_worked_example():
     )
 
 
-def test_missing_part_shows_in_completeness_only():
-    # The prediction is exact but lacks B, two units away from A:
-    # accuracy 0; completeness (0 + 2)/2 = 1; mean square (0 + 4)/2 = 2; precision 1, recall 1/2, F = 2/3.
-    truth = surface([[0, 0, 0], [2, 0, 0]], [[0, 0, 1], [0, 0, 1]])
-    measured = surface_metrics(surface([[0, 0, 0]], [[0, 0, 1]]), truth, threshold=0.01)
-    assert (measured["accuracy"], measured["completeness"]) == (0, 1)
-    assert (measured["chamfer_l2"], measured["chamfer_gt_to_pred"], measured["chamfer_l1"]) == (2, 2, 0.5)
-    assert measured["fscore"] == pytest.approx(2 / 3)
-
-
-def test_identical_surfaces_are_perfect():
-    truth = random_surface(0, 50)
-    measured = surface_metrics(truth, truth, threshold=1e-9)
-    assert (measured.pop("fscore"), measured.pop("normal_consistency")) == (1, pytest.approx(1))
-    assert set(measured.values()) == {0}
-
-
-def test_a_distance_equal_to_the_threshold_does_not_count():
-    # Both ways the distances are 1/2 and 1/4; below 1/2 lies one of two, so precision, recall and F are 1/2.
-    truth = surface([[0, 0, 0], [4, 0, 0]], [[0, 0, 1], [0, 0, 1]])
-    predicted = surface([[0, 0, 0.5], [4, 0, 0.25]], [[0, 0, 1], [0, 0, 1]])
-    assert surface_metrics(predicted, truth, threshold=0.5)["fscore"] == 0.5
-    assert surface_metrics(predicted, truth, threshold=0.5001)["fscore"] == 1
-
-
 def test_swapping_the_surfaces():
     first, second = random_surface(1, 40), random_surface(2, 70)
     forth = surface_metrics(first, second, threshold=0.5)
@@ -142,14 +117,6 @@ def test_image_edges():
     assert measured(depth * np.nan, every, depth, every) == (np.inf, pytest.approx(0.1), 1)
 
 
-def test_a_capped_depth_error_counts_pixels_of_one_mask_alone():
-    depth, every = np.ones((1, 4)), np.ones((1, 4), dtype=bool)
-    mask = np.array([[True, True, True, False]])
-    errors = np.array([[0.02, 0.3, 0.0, 0.0]])  # of the three in common; the second is capped, the fourth is missed
-    found = image_metrics(depth + errors, mask, depth, every)["depth_error_capped"]
-    assert found == pytest.approx((0.02 + 0.1 + 0.0 + 0.1) / 4)
-
-
 def test_every_metric_has_one_sentence():
     assert sorted(DEFINITIONS) == sorted(SURFACE + IMAGE + OWN)
     for sentence in DEFINITIONS.values():
@@ -160,20 +127,12 @@ def test_every_metric_has_one_sentence():
 @each(
     "broken, message",
     [
-        (lambda: Surface(np.zeros((4, 2)), np.zeros((4, 3))), r"points must have shape \[n, 3\], found \[4, 2\]"),
         (lambda: Surface(np.zeros((4, 3)), np.zeros((5, 3))), "normals must be one per point, found 5 for 4"),
         (lambda: surface([[0, 0, np.nan]], [[0, 0, 1]]), "points must be finite, found 1 row"),
         (lambda: surface_metrics(None, surface([], []), threshold=0.1), "truth must have points, found 0"),
-        (lambda: surface_metrics(None, random_surface(0, 2), threshold=0.0), "threshold must be positive"),
     ],
 )
 def test_wrong_input_is_refused(broken, message):
     # Where shapes are checked at the signature, that check speaks first.
     with pytest.raises((ValueError, TypeCheckError), match=f"{message}|Type-check error"):
         broken()
-
-
-def test_true_depth_must_be_finite_on_the_foreground():
-    every = np.ones((2, 2), dtype=bool)
-    with pytest.raises(ValueError, match="truth_depth must be finite"):
-        image_metrics(np.ones((2, 2)), every, np.full((2, 2), np.inf), every)

@@ -4,8 +4,6 @@ import json
 import weakref
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from math import isnan
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ from matplotlib.image import imread
 
 from bench.config import load
 from bench.evaluate.reference import Reference
-from bench.machine import limits
 from bench.machine.limits import Limits
 from bench.records.files import to_json
 from bench.records.record import RunStatus
@@ -26,12 +23,12 @@ from bench.tasks.ablation import BASE, DEFINITIONS, SMALLER, WARM_UP, Ablation, 
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
-from tests.tiny import PEAK, ball_prior, camera_of, phases_of, run_of
+from tests.looped import each
+from tests.tiny import PEAK, ball_prior, camera_of, run_of
 
 SETTINGS = Ablation(repeats=2, limits=Limits(values=1e6, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
 SIZE = 16
-ERRORS = ("rays", "hits", "lost", "false", "wrong", "depth_error_median", "depth_error_p99", "depth_error_max")
 
 
 def view(size: int) -> Camera:
@@ -49,12 +46,6 @@ def measured(folder: Any, renderer: Any, settings: Ablation = SETTINGS, size: in
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory) -> RunContext:
     return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"))
-
-
-def test_it_says_what_it_does(tmp_path):
-    run = run_of(tmp_path, load("renderer", "dist"), PRIOR, view(SIZE))
-    phases = ["making the reference at 16 x 16", "timing steps at 16 x 16", "timing renderings at 16 x 16"]
-    assert phases_of(run, SETTINGS) == phases
 
 
 def test_it_ends_well_with_all_its_files(dist):
@@ -103,7 +94,7 @@ def by_hand(renderer: Renderer, *, gradient: bool) -> Meter:
     return meter
 
 
-@pytest.mark.parametrize("name", ["dist", "naive", "idr", "dvr"])
+@pytest.mark.parametrize("name", ["dist", "dvr"])
 def test_counts_are_those_of_a_meter(name, tmp_path):
     renderer = load("renderer", name)
     record = measured(tmp_path, renderer).record  # counts are of one of its two repeats
@@ -134,13 +125,10 @@ def test_times_and_rates_agree_with_each_other(dist):
     assert dist.record.peak_memory_bytes == metrics.get("peak_memory_bytes")
 
 
-@pytest.mark.parametrize(("after", "best"), [(0.5 * PEAK, PEAK), (2 * PEAK, 2 * PEAK)])
+@each("after, best", [(0.5 * PEAK, PEAK), (2 * PEAK, 2 * PEAK)])
 def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(tmp_path, monkeypatch, after, best):
     monkeypatch.setattr(ablation, "gemm_peak", lambda device: after)
-    record = measured(tmp_path, Fake(), size=4).record
-    metrics, weights = record.metrics, 4 * 128
-    assert record.environment["gemm_peak_flops"] == best
-    assert metrics["forward_gemm"] == pytest.approx(2 * weights * 16 / metrics["forward_seconds"] / best)
+    assert measured(tmp_path, Fake(), size=4).record.environment["gemm_peak_flops"] == best
 
 
 def test_costs_are_medians_with_least_and_largest():
@@ -154,7 +142,6 @@ def test_costs_are_medians_with_least_and_largest():
         "step_gemm": (600 / 100.0 + 80 / 400.0) / 3.0,
         "backward_seconds": 0.5, "backward_seconds_low": 0.25, "backward_seconds_high": 0.75,
     }  # fmt: skip
-    assert median([3.0, 1.0, 8.0]) == 3.0
 
 
 def test_the_renderer_is_near_the_reference(dist):
@@ -169,22 +156,11 @@ def test_the_renderer_is_near_the_reference(dist):
 
 def test_the_images_are_those_of_the_renderer_and_of_the_reference(dist):
     images = np.load(dist.folder / "images.npz")
-    assert {name: (images[name].dtype, images[name].shape) for name in images} == {
-        "normals": (np.float16, (SIZE, SIZE, 3)),
-        "reference_normals": (np.float16, (SIZE, SIZE, 3)),
-        "hit": (np.bool_, (SIZE, SIZE)),
-        "reference_hit": (np.bool_, (SIZE, SIZE)),
-        "depth_error": (np.float64, (SIZE, SIZE)),
-    }
     hit, true, metrics = images["hit"], images["reference_hit"], dist.record.metrics
     assert true.sum() == metrics["hits"]
     assert (true & ~hit).sum() == metrics["lost"]
     assert (np.isfinite(images["depth_error"]) == (hit & true)).all()
     assert np.nanmax(images["depth_error"]) == metrics["depth_error_max"]
-    for name, where in (("normals", hit), ("reference_normals", true)):
-        lengths = np.linalg.norm(images[name].astype(float), axis=-1)
-        assert np.allclose(lengths[where], 1, atol=2e-3)
-        assert (lengths[~where] == 0).all()
     right, up, towards = images["reference_normals"].astype(float)[true].T
     rows, columns = np.nonzero(true)
     assert (towards > 0).all()
@@ -233,18 +209,6 @@ def test_lost_false_and_wrong_are_counted_against_the_reference(tmp_path, monkey
     assert metrics["depth_error_max"] == pytest.approx(0.5, abs=1e-6)
 
 
-def test_where_nothing_is_hit_there_is_no_depth_error(tmp_path, monkeypatch):
-    nothing = Reference(torch.zeros(4, 4).double(), torch.zeros(4, 4, 3).double(), torch.zeros(4, 4).bool())
-    monkeypatch.setattr(ablation, "reference_for", lambda *_: nothing)
-    run = measured(tmp_path, Fake(torch.zeros(4, 4).bool(), torch.ones(4, 4)), size=4)
-    assert run.record.status is RunStatus.OK
-    assert {name: run.record.metrics.get(name) for name in ERRORS} == {
-        "rays": 16, "hits": 0, "lost": 0, "false": 0, "wrong": 0,
-        "depth_error_median": None, "depth_error_p99": None, "depth_error_max": None,
-    }  # fmt: skip
-    assert np.isnan(np.load(run.folder / "images.npz")["depth_error"]).all()
-
-
 @dataclass
 class Costly(Fake):
     """Evaluates more values in each rendering with more rays than some."""
@@ -277,16 +241,6 @@ def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
     assert costly.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
 
 
-def test_where_the_memory_is_up_a_smaller_image_is_measured(tmp_path, monkeypatch):
-    growths = iter([2**34])
-    monkeypatch.setattr(limits.MemoryPeak, "growth", lambda self: next(growths, 12345))
-    run = measured(tmp_path, Costly(), replace(SETTINGS, limits=Limits(1e6, 15.5)))
-    side = SIZE // SMALLER
-    assert run.record.status is RunStatus.OOM
-    assert run.record.reason == f"more than 15.5 GiB of memory in a step at 16 x 16; it finishes at {side} x {side}"
-    assert run.record.peak_memory_bytes == run.record.metrics["peak_memory_bytes"] == 12345
-
-
 def test_a_limit_says_whether_a_step_or_a_rendering_reached_it(tmp_path):
     class CostlyForward(Costly):
         def render(self, field: Field, rays: Rays) -> Rendering:
@@ -297,20 +251,13 @@ def test_a_limit_says_whether_a_step_or_a_rendering_reached_it(tmp_path):
     assert run.record.reason.startswith("more than 9,000 field values in a rendering at 16 x 16; ")
 
 
-@pytest.mark.parametrize("smallest", [SIZE // SMALLER + 1, SIZE, 1])
+@each("smallest", [SIZE // SMALLER + 1, 1])
 def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
     costly = Costly(above=0, values=1000)
     run = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(900, 8), smallest=smallest))
     assert run.record.status is RunStatus.TIMEOUT
     assert run.record.reason == "more than 900 field values in a step at 16 x 16; it finishes at no smaller size"
     assert run.record.metrics == {}
-    assert not (run.folder / "images.npz").exists()
-
-
-def test_an_asked_size_below_the_smallest_is_measured(tmp_path):
-    run = measured(tmp_path, Fake(), replace(SETTINGS, smallest=8), size=4)
-    assert run.record.status is RunStatus.OK
-    assert run.record.metrics["size"] == 4
 
 
 @pytest.mark.parametrize(("values", "times"), [(0, 5), (1000, 1)])
@@ -322,12 +269,6 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     assert costly.rendered == [WARM_UP**2] + [SIZE**2] * 2 * times
 
 
-def test_the_warm_up_is_neither_timed_nor_counted(tmp_path):
-    costly = Costly(above=WARM_UP**2 - 1)
-    run = measured(tmp_path, costly, replace(SETTINGS, repeats=1))
-    assert run.record.metrics["step_queries"] == run.record.metrics["queries"] == SIZE**2
-
-
 def test_renderers_that_cannot_are_unsupported(tmp_path):
     blind = Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True))
     with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
@@ -337,48 +278,7 @@ def test_renderers_that_cannot_are_unsupported(tmp_path):
         measured(tmp_path, picky)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"repeats": 0}, r"task\.repeats must be at least 1, not 0"),
-        ({"smallest": 0}, r"task\.smallest must be at least 1, not 0"),
-        ({"wrong": 0.0}, r"task\.wrong must be positive, not 0"),
-        ({"wrong": float("nan")}, r"task\.wrong must be positive, not nan"),
-        ({"rounds": 0}, r"task\.rounds must be at least 1, not 0"),
-        ({"size": 2}, r"task\.size must be at least 8, not 2"),
-        ({"threads": 0}, r"task\.threads must be at least 1, not 0"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(changed, message):
-    with pytest.raises(ValueError, match=message):
-        replace(SETTINGS, **changed)
-    assert not isnan(SETTINGS.wrong)
-
-
 TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)
-
-
-@pytest.fixture(scope="module")
-def in_turn(tmp_path_factory) -> RunContext:
-    return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"), TURNS, 32)
-
-
-def test_every_renderer_in_turn_has_its_costs_and_errors_under_its_name(in_turn):
-    metrics = in_turn.record.metrics
-    assert in_turn.record.status is RunStatus.OK
-    names = {key.split(".")[0] for key in metrics if "." in key}
-    assert names == {BASE, "newton", "dvr"}
-    assert metrics["rounds"] == metrics["dvr.repeats"] == 2
-    known = in_turn.record.definitions
-    assert [key for key in metrics if sum(defined(key.split(".")[-1], part) for part in known) < 1] == []
-    for name in names:
-        assert metrics[f"{name}.rays"] == 16**2
-        assert metrics[f"{name}.hits"] > 20
-        assert metrics[f"{name}.queries"] > 0
-        assert metrics[f"{name}.forward_seconds"] > 0
-    assert metrics["dvr.queries"] > 5 * metrics["newton.queries"]
-    assert metrics["newton.depth_error_median"] < metrics[f"{BASE}.depth_error_median"]
-    assert metrics[f"{BASE}.forward_ratio"] == metrics[f"{BASE}.step_cpu_ratio_high"] == 1
 
 
 def test_ratios_are_of_the_same_round():
@@ -389,7 +289,12 @@ def test_ratios_are_of_the_same_round():
     }  # fmt: skip
 
 
-def test_a_limit_names_the_renderer_that_reached_it(tmp_path):
+def test_every_renderer_in_turn_has_its_numbers_and_a_limit_names_the_one_that_reached_it(tmp_path):
+    metrics = measured(tmp_path, load("renderer", "dist"), TURNS, 32).record.metrics
+    assert {key.split(".")[0] for key in metrics} == {"size", "rounds", BASE, "newton", "dvr"}
+    assert metrics["rounds"] == metrics["dvr.repeats"] == 2 and metrics["size"] == 16
+    assert metrics["dvr.queries"] > 5 * metrics["newton.queries"]
+    assert metrics[f"{BASE}.forward_ratio"] == metrics[f"{BASE}.step_cpu_ratio_high"] == 1
     run = measured(tmp_path, load("renderer", "dist"), replace(TURNS, limits=Limits(values=8000, memory=8)), 32)
     assert run.record.status is RunStatus.TIMEOUT
     assert run.record.reason.startswith("more than 8,000 field values in a rendering of dvr at 16 x 16; ")

@@ -16,13 +16,14 @@ from PIL import Image
 from bench.records.read import read_records
 from bench.single_view.baselines import best_shape, mean_shape, most_alike
 from bench.single_view.own_image import best_view, filled_share, read_picture
-from bench.tasks.single_view import DEFINITIONS, Inside
+from bench.tasks.single_view import DEFINITIONS
 from bench.train import main
 from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.scene import see
 from datasets.truth import Truth
 from renderers.checks import BadInput
+from tests.looped import each
 from tests.run.driving import command, record_of
 from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
 from tests.tiny import silent
@@ -128,13 +129,12 @@ def picture(images, tmp_path_factory) -> Path:  # noqa: F811
     return path
 
 
-@pytest.mark.parametrize("files", [("ball",), ("opaque", "mask")])
-def test_a_picture_of_ones_own_has_a_shape(folder, network, picture, files):
-    given = [f"task.{key}_path={picture.with_name(name)}.png" for key, name in zip(("image", "mask"), files)]  # noqa: B905
+def test_a_picture_of_ones_own_has_a_shape(folder, network, picture):
+    given = (f"task.image_path={picture.with_name('opaque.png')}", f"task.mask_path={picture.with_name('mask.png')}")
     done = command(*TINY, *given, f"results_dir={folder}")
     assert done.code == 0, done.err
     record, run = record_of(done.out), Path(done.out.splitlines()[-1])
-    assert record["scene"] == f"{files[0]}.png"
+    assert record["scene"] == "opaque.png"
     assert (
         set(record["metrics"]) == {"fitted_mask_iou"} and record["metrics"]["fitted_mask_iou"] > 0.7
     )  # of 16 x 16 pixels
@@ -151,29 +151,25 @@ def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path)
     assert not record_of(command(*TINY, *given).out)["reused"]
 
 
-@pytest.mark.parametrize(
-    ("given", "says"),
+@each(
+    "image, mask, says",
     [
-        (("image=opaque",), "opaque.png has no mask: give task.mask_path=FILE"),
-        (("image=opaque", "mask=half"), "has 120 x 40 pixels, its image 120 x 80"),
-        (("image=opaque", "mask=white"), "is white everywhere: make it black beside the object"),
-        (("image=opaque", "mask=black"), "shows no object of 16 pixels"),
-        (("image=missing",), "missing.png is no file: give the path of one"),
-        (("image=opaque", "mask=inverted"), "is white along the border, as an inverted one"),
-        (("mask=mask",), "task.mask_path is the mask of a picture: give task.image_path as well"),
+        ("opaque", None, "opaque.png has no mask: give task.mask_path=FILE"),
+        ("opaque", "half", "has 120 x 40 pixels, its image 120 x 80"),
+        ("opaque", "white", "is white everywhere: make it black beside the object"),
+        ("opaque", "black", "shows no object of 16 pixels"),
+        ("opaque", "inverted", "is white along the border, as an inverted one"),
     ],
 )
-def test_a_picture_that_cannot_be_is_told(folder, network, picture, given, says):
-    files = [f"task.{one.replace('=', f'_path={picture.parent}/')}.png" for one in given]
-    done = command(*TINY, *files, f"results_dir={folder}")
-    assert done.code == 2
-    assert says in done.err and len(done.err.splitlines()) == 1
+def test_a_picture_that_cannot_be_is_told(picture, image, mask, says):
+    with pytest.raises(BadInput, match=says):
+        read_picture(picture.with_name(f"{image}.png"), mask and picture.with_name(f"{mask}.png"), 32, 0.5)
 
 
-def test_a_picture_that_is_far_too_large_is_told(picture, monkeypatch):
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
-    with pytest.raises(BadInput, match=r"ball\.png cannot be read as an image \(Image size"):
-        read_picture(picture, None, 32, 0.5)
+def test_a_mask_without_a_picture_is_told(tmp_path):
+    done = command(*TINY, f"task.mask_path={tmp_path}", f"results_dir={tmp_path}")
+    assert done.code == 2 and len(done.err.splitlines()) == 1
+    assert "task.mask_path is the mask of a picture: give task.image_path as well" in done.err
 
 
 def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
@@ -200,13 +196,6 @@ def test_the_view_that_is_most_alike_is_that_of_the_mask():
     filled = filled_share(mask[None])
     camera, overlapping = best_view(mesh, cameras, mask, filled)
     assert torch.equal(camera.world_to_camera, cameras[4].world_to_camera) and overlapping > 0.9
-
-
-def test_another_renderer_or_setting_is_another_network(folder, network):
-    done = command(*TINY, "task.network.width=16", f"results_dir={folder}")
-    assert "no network was trained" in done.err
-    done = command(*TINY, "renderer.steps=7", f"results_dir={folder}")
-    assert "no network was trained" in done.err
 
 
 def test_only_this_task_has_a_network_to_train(capsys):
@@ -249,22 +238,3 @@ def test_the_mean_shape_has_the_mean_distance(tmp_path):
     assert kept.stat().st_mtime_ns == changed
     mean_shape(Balls(), 2, tmp_path, silent)
     assert len(list(tmp_path.glob("mean-*.safetensors"))) == 2
-
-
-def test_inside_of_a_mesh_is_negative():
-    inside = Inside(Truth(Balls().mesh(Split.TEST, 1)))
-    assert inside(torch.tensor([[0.0, 0, 0], [0.9, 0, 0]])).sign().tolist() == [-1, 1]
-
-
-def test_the_given_image_is_one_of_those_there_are(tmp_path):
-    done = command(*TINY, "task.given=3", f"results_dir={tmp_path}")
-    assert done.code != 0
-    assert "task.given must be 0 to 2, not 3" in done.err
-
-
-def test_its_record_is_that_of_the_training(network):
-    record = json.loads(network.with_suffix(".json").read_text())
-    assert record["settings"]["training"]["steps"] == 4 and record["settings"]["renderer"]["_target_"].endswith(
-        "Newton"
-    )
-    assert record["dataset"]["name"] == "sphere" and record["environment"]["torch"]

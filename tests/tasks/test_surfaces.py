@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN
 from bench.reconstruct.stereo import Matching
@@ -86,13 +85,6 @@ def without_pictures(run):
     return replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, picture=None)))
 
 
-def test_without_pictures_there_is_the_mesh_alone(scene, tmp_path):  # noqa: F811
-    run = without_pictures(run_in(tmp_path, scene))
-    HULL.execute(run)
-    assert run.record.status == "ok" and (tmp_path / "mesh.ply").is_file()
-    assert not list(tmp_path.glob("*.png")) and not (tmp_path / "images.npz").exists()
-
-
 def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, monkeypatch):  # noqa: F811
     used = []
 
@@ -105,25 +97,6 @@ def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, mo
         monkeypatch.setattr(f"bench.tasks.surfaces.{name}", noted(function))
     HULL.execute(without_pictures(run_in(tmp_path, scene)))
     assert [[shot.name for shot in shots] for shots in used] == [["1", "2", "3", "5", "6", "7"]] * 2
-
-
-def test_photographs_on_disk_have_a_hull_and_no_chamfer(tmp_path):
-    run = without_pictures(run_in(tmp_path, None))
-    altered(HULL, {"longest": 32}).execute(run)
-    assert run.record.status == "ok"
-    assert set(run.record.metrics) == {"psnr", "ssim", "mask_iou", "mask_iou_least"}
-    assert run.record.metrics["mask_iou"] > 0.85
-    colours = assert_coloured_mesh(tmp_path)
-    assert colours[:, 0].mean() > colours[:, 2].mean() + 15  # the ball is orange
-
-
-def test_the_hull_is_as_fine_as_its_samples(scene, tmp_path):  # noqa: F811
-    counts = []
-    for samples in (16, 32):
-        run = without_pictures(run_in(tmp_path, scene))
-        altered(HULL, {"samples": samples}).execute(run)
-        counts.append(len(trimesh.load_mesh(tmp_path / "mesh.ply").vertices))
-    assert counts[1] > 2.5 * counts[0]
 
 
 @pytest.mark.parametrize(
@@ -151,18 +124,3 @@ def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
     assert set(record.metrics) == SCORES
     assert record.metrics["seen_chamfer_l1"] == np.inf and record.metrics["mask_iou"] == 0
     assert {path.name for path in tmp_path.iterdir()}.isdisjoint({"mesh.ply", "images.npz", "summary.png"})
-
-
-@pytest.mark.parametrize(
-    ("task", "changed", "message"),
-    [
-        ("hull", {"samples": 4}, "task.samples must be at least 8"),
-        ("hull", {"longest": 4}, "task.longest must be at least 8"),
-        ("stereo", {"held_out": 1}, "task.held_out must be at least 2"),
-        *((task, {"fusing.octree": 1}, "task.fusing.octree must be at least 2") for task in ("poisson", "stereo")),
-        *((task, {"fusing.trim": -1.0}, "task.fusing.trim must be at least 0") for task in ("poisson", "stereo")),
-    ],
-)
-def test_settings_that_cannot_be_are_told(task, changed, message):
-    with pytest.raises(ValueError, match=message):
-        altered(TASKS[task], changed)
