@@ -10,14 +10,12 @@ import torch
 from bench.models.growth import _is_better
 from bench.models.model import Evidence, Size
 from bench.models.observations import TILES
-from bench.reconstruct.choice import ASIDE, AutoField, Choice, tiled
-from bench.reconstruct.pixels import Stack
+from bench.reconstruct.choice import AutoField, Choice, tiled
 from bench.reconstruct.subject import Subject
 from bench.solve.problem import OptimiserSettings
 from datasets.shot import Shot
 from renderers import IDR
 from renderers.field import Counts
-from tests.looped import each
 from tests.tiny import ball_prior, camera_of, run_of
 
 SETTINGS = OptimiserSettings(40, 0.1, "constant")
@@ -120,24 +118,3 @@ def test_the_noise_is_that_of_tiles_not_of_pixels():
         gain = share * apart.std(ddof=1) / 4 - apart.mean()
         assert _is_better(of_tiles(tiles - apart - gain), one) is better
     assert _is_better(of_tiles(tiles - apart - 0.1), one)
-
-
-def test_tiles_cover_photographs_of_any_size(tmp_path):
-    known = {"a": Known(1, 0.3)}
-    assert ended_on(known, tmp_path)[0].kept.error.sums.shape == (2 * TILES**2, 4)
-    assert len(Stack.of([shot("0")], None, torch.device("cpu")).pixels.at_one) == 256
-    assert ASIDE == 8
-
-
-@each(
-    "changed, says",
-    [
-        ({"candidates": ()}, "task.auto.candidates"),
-        ({"candidates": ("network_1x8", "network_1x8")}, "must name each once"),
-        ({"trial": 0.0}, "task.auto.trial"),
-        ({"patience": 0}, "patience"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(changed, says):
-    with pytest.raises(ValueError, match=says):
-        AutoField(**({"candidates": ("network_1x16",), "trial": 0.1, "patience": 1} | changed))

@@ -126,11 +126,6 @@ class Wider:
         return torch.minimum(self.first(points), self.second(points))
 
 
-def test_photographs_without_a_truth_have_metrics_of_images_alone(subject, inputs):
-    metrics = judge(painted(), replace(subject, truth=None), inputs).metrics
-    assert set(metrics) == {prefix + name for prefix in ("", OWN) for name in IMAGES}
-
-
 def test_no_surface_is_empty_and_scores_worst(subject, inputs):
     found = judge(painted(radius=-0.5), subject, inputs)
     assert found.mesh is None and found.failure is not None and found.failure[0] is RunStatus.EMPTY
@@ -160,22 +155,6 @@ def test_images_are_compared_black_outside_of_their_masks():
     meets = sphere_span(camera.rays())[2]
     wrong = ((larger[2] - 0.8) ** 2)[meets].mean().item()  # what the shape does not cover is black, and wrong as well
     assert meets.any() and not meets.all() and blind["psnr"] == pytest.approx(-10 * log10(wrong), abs=1e-4)
-
-
-def test_without_masks_no_surface_is_not_a_perfect_one():
-    camera = camera_of(16)
-    blank = View(camera, torch.zeros(16, 16), torch.zeros(16, 16, 3), torch.zeros(16, 16).bool())
-    shot = Shot("0", camera, torch.full((16, 16, 3), 0.8), None)
-    scores = image_scores([blank], [torch.zeros(16, 16, 3)], [shot])
-    assert scores["psnr"] == pytest.approx(-20 * log10(0.8)) and scores["ssim"] < 0.5
-
-
-def test_the_same_image_has_the_best_scores():
-    shot = shot_of(painted(), camera_of(12))
-    assert shot.mask is not None and not shot.mask.all()
-    scores = image_scores([_view(shot)], [shot.colours * shot.mask[..., None]], [shot])
-    assert scores["psnr"] == inf and scores["ssim"] == pytest.approx(1.0)
-    assert scores["mask_iou"] == scores["mask_iou_least"] == 1.0
 
 
 def _view(shot) -> View:
