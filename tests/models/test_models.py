@@ -18,12 +18,10 @@ from bench.models.model import Evidence, Model, Seen, Size
 from bench.models.observations import FREE, Holdout, hold_out, together
 from bench.models.study import choose
 from bench.models.views import Views
-from bench.pictures.size_chart import AXES
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
-from bench.setup.fields import SIZE_WORDS, FitSettings, GrowthSettings, ModelSettings, ViewSettings
+from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import GivenView
-from bench.studies.parsimony import SIZES as SHOWN_SIZES
 from datasets.extract import extract
 from datasets.scene import see
 from datasets.truth import Truth
@@ -244,11 +242,6 @@ def test_the_choice_is(case):
     assert choice.best.mean == pytest.approx(min(mean for _, mean in candidates))
 
 
-def test_a_choice_without_a_successful_fit_is_an_error():
-    with pytest.raises(ValueError, match="all fits failed; the last: it rose"):
-        choose([evidence_of("failed", 1, None)], 0.01, "stored")
-
-
 def test_a_warm_start_alone_finds_a_sphere_and_a_box():
     ball = fitter_of("ball").begin(candidate("sphere"), None)
     assert ball.model.parameters[0].tolist() == pytest.approx([0.1, 0.0, -0.1, np.log(0.6)], abs=0.02)
@@ -296,7 +289,7 @@ def test_growth_ends_on_a_sufficient_candidate():
 
 
 def test_growth_ends_with_patience_and_budget():
-    fitter = fitter_of("capsule", warm_iterations=20, iterations=10)
+    fitter = fitter_of("capsule", warm_iterations=20, iterations=10, warm_points=64)
     candidates = [candidate(name) for name in ("sphere", "box", "box", "box", "rounded_box")]
     asked = replace(GROWTH, patience=9, budget=100.0)
     patient = grow(fitter, candidates, replace(asked, patience=1))
@@ -418,13 +411,10 @@ def test_a_union_has_a_part_about_each_cluster_however_small():
 GRID, NETWORK = Size(free=4_427, stored=32_768, sparse_bytes=40_000), Size(free=12_801, stored=12_801)
 
 
-@pytest.mark.parametrize(
-    ("measure", "chosen"), [("free", "grid_32"), ("stored", "network_4x64"), ("bytes", "network_4x64")]
-)
-@pytest.mark.parametrize("turned", [False, True])
-def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chosen, turned):
+@each("measure, chosen", [("free", "grid_32"), ("stored", "network_4x64"), ("bytes", "network_4x64")])
+def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chosen):
     fits = [evidence_of("grid_32", GRID, an_error(0.008)), evidence_of("network_4x64", NETWORK, an_error(0.009))]
-    choice = choose(fits[::-1] if turned else fits, 0.01, measure)
+    choice = choose(fits, 0.01, measure)
     assert (choice.chosen.candidate, choice.measure, choice.best.candidate) == (chosen, measure, "grid_32")
 
 
@@ -440,14 +430,6 @@ def test_candidates_are_tried_in_the_order_of_the_measure(compose_config):
     assert [one.name for one in by_size(names, "free")] == list(names)
     for measure in ("stored", "bytes"):
         assert [one.name for one in by_size(names, measure)] == list(by_stored)
-    for scale in ("smoke", "desk", "paper"):
-        shipped = tuple(compose_config(f"scale={scale}").models.candidates)
-        sizes = [one.stored for one in by_size(shipped, "stored")]
-        assert sizes == sorted(sizes)
-        free = [candidate(name).stored for name in shipped if not name.startswith("grid_")]
-        assert free == sorted(free)  # all numbers of the others are free
-
-
-def test_pages_have_the_same_measures_under_the_same_words():
-    assert set(SHOWN_SIZES) == set(SIZE_WORDS)
-    assert {measure: AXES[measure] for measure in SHOWN_SIZES} == SIZE_WORDS
+    shipped = tuple(compose_config("scale=desk").models.candidates)
+    free = [candidate(name).stored for name in shipped if not name.startswith("grid_")]
+    assert free == sorted(free)  # all numbers of the others are free

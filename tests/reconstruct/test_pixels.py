@@ -58,14 +58,6 @@ def test_patches_are_neighbours_in_one_photograph():
         assert (there[..., 1] < height).all() and (there[..., 2] < width).all()
 
 
-def test_the_same_seed_draws_the_same_pixels_and_another_seed_others():
-    stack = Stack.of(SHOTS, None, CPU)
-    for patches in (False, True):
-        first, again, other = (places(stack.drawn(64, patches=patches, seed=seed)) for seed in (5, 5, 6))
-        assert torch.equal(first, again) and not torch.equal(first, other)
-        assert first.shape == (64, 3)
-
-
 def test_only_rays_that_meet_the_unit_sphere_are_drawn_and_all_of_them():
     wide = [numbered(camera_of(16, field_of_view=100.0), 0), numbered(camera_of(9, field_of_view=90.0), 1)]
     stack = Stack.of(wide, None, CPU)

@@ -18,12 +18,10 @@ from bench.reconstruct.subject import (
     hull_distances,
 )
 from datasets.mesh import Mesh
-from datasets.own_photographs import OwnPhotographs
 from datasets.photographs import around
 from datasets.scene import Scene, see
 from datasets.truth import Truth, sample_surface
 from renderers.checks import BadInput
-from tests.datasets.test_captures import nerf
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.reconstruct.test_losses import RENDERERS, ball, shot_of
@@ -71,16 +69,6 @@ def test_too_few_photographs_are_told(inputs):
     with pytest.raises(BadInput, match="4 photographs with every 2th held out leave 2: give more"):
         find_subject(few, NO_DEPTHS, inputs, longest=16, every=2, masks=True)
     assert len(find_subject(few, NO_DEPTHS, inputs, longest=16, every=4, masks=True).given) == 3
-
-
-def test_photographs_of_ones_own_have_no_truth_and_no_depths(inputs, tmp_path):
-    nerf(tmp_path)
-    inputs = replace(inputs, photographed=OwnPhotographs(str(tmp_path), True, "stated"))
-    subject = found(inputs, every=5, longest=24)
-    assert subject.truth is None and (len(subject.given), len(subject.held_out)) == (8, 2)
-    assert subject.given[0].colours.shape == (20, 24, 3) and subject.given[0].mask is not None
-    with pytest.raises(BadInput, match=r"have no depths: take task=stereo, or set task\.depths\.points=none"):
-        found(inputs, Depths("dense", 0.0))
 
 
 @each("points, count", [("dense", None), ("25%", None), ("30", 30)])

@@ -157,21 +157,6 @@ def test_the_course_is_there_when_the_loop_is_cut_short():
     assert history.seconds["forward"] > 0
 
 
-class Hungry(Toy):
-    """A toy whose loss takes 256 MiB for a while."""
-
-    def loss(self, iteration):
-        torch.ones(2**26)
-        return super().loss(iteration)
-
-
-def test_memory_that_the_loss_takes_is_measured():
-    peak = go(Hungry(), 2).peak_memory_bytes
-    if peak is None:
-        pytest.skip("the memory of a process cannot be measured here")
-    assert 2**27 < peak < 2**30
-
-
 def test_a_cosine_falls_from_the_rate_to_nearly_zero():
     rates = [OptimiserSettings(10, 0.2, "cosine").rate(iteration) for iteration in range(10)]
     assert rates[0] == 0.2

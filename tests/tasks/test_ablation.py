@@ -241,16 +241,6 @@ def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
     assert costly.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
 
 
-def test_a_limit_says_whether_a_step_or_a_rendering_reached_it(tmp_path):
-    class CostlyForward(Costly):
-        def render(self, field: Field, rays: Rays) -> Rendering:
-            self.values = 0 if torch.is_grad_enabled() else 10_000
-            return super().render(field, rays)
-
-    run = measured(tmp_path, CostlyForward(above=16 * 16 - 1), replace(SETTINGS, limits=Limits(9000, 8)))
-    assert run.record.reason.startswith("more than 9,000 field values in a rendering at 16 x 16; ")
-
-
 @each("smallest", [SIZE // SMALLER + 1, 1])
 def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
     costly = Costly(above=0, values=1000)

@@ -136,12 +136,6 @@ def test_the_code_is_held_short(problem_of, average, expected):
     assert terms["total"] == pytest.approx(terms["depth"] + terms["silhouette"] + expected)
 
 
-def test_the_mask_is_given_to_the_renderers_own_loss(problem_of):
-    renderer = Fake()
-    values(problem_of(renderer, points="2"))
-    assert renderer.asked.tolist() == MASK
-
-
 @dataclass
 class Told(Fake):
     """A fake whose loss takes the given distances as well."""

@@ -200,15 +200,6 @@ def test_hits_that_are_off_on_the_same_surface_count(tmp_path):
     assert min(off[f"{band}.pixels"] for band in HITS) >= SETTINGS.pixels - 3
 
 
-def test_where_no_pixel_of_a_band_counts_it_has_no_other_numbers(tmp_path):
-    nowhere = load("renderer", "idr", steps=1)
-    metrics = judged(tmp_path, nowhere).record.metrics
-    assert metrics["oblique.pixels"] == 0
-    assert metrics["oblique.excluded"] == SETTINGS.pixels
-    assert "oblique.code_cosine" not in metrics
-    assert metrics["silhouette.image_scale"] == 0
-
-
 def test_renderers_that_cannot_are_unsupported(tmp_path):
     inner = EXACT["idr"]
     with pytest.raises(Unsupported, match="Changed has no gradient towards the field"):

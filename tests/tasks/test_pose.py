@@ -57,23 +57,6 @@ def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
     return PoseProblem(settings, renderer, box(SIZES), scene.view, settings.cameras(CAMERA, 0), CPU)
 
 
-def test_the_distances_of_the_view_are_told_to_a_loss_that_takes_them(scene):
-    asked = []
-
-    class Told(type(DIST)):
-        """Keeps what it is asked about."""
-
-        def observed_loss(self, field, rays, rendering, observed):
-            asked.append((rays, observed))
-            return self.silhouette_loss(field, rays, rendering, observed.mask)
-
-    problem_of(scene, Told(**vars(DIST)), degrees=0.0, shift=0.0).loss(0)
-    ((rays, observed),) = asked
-    assert torch.equal(observed.distance.isfinite(), scene.view.mask)
-    points = rays.at(observed.distance.nan_to_num())[scene.view.mask]
-    assert box(SIZES)(points).abs().max() < 1e-4  # on the true surface
-
-
 @each("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
 def test_the_error_of_a_turn_is_its_angle(angle):
     axis = torch.tensor([0.6, 0.0, 0.8])
@@ -159,7 +142,7 @@ def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
 
 def test_restarts_find_what_one_start_misses(scene):
     """Judged by the loss: a box looks the same from four sides."""
-    assert final_loss(scene, 2, starts=8, trial=6, iterations=140) < 0.1 < final_loss(scene, 2)
+    assert final_loss(scene, 2, starts=6, trial=6, iterations=100) < 0.1 < final_loss(scene, 2)
 
 
 def test_a_known_shape_is_the_scenes(run):

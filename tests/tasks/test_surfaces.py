@@ -99,21 +99,11 @@ def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, mo
     assert [[shot.name for shot in shots] for shots in used] == [["1", "2", "3", "5", "6", "7"]] * 2
 
 
-@pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        (altered(HULL, {"masks": False}), "the visual hull needs a mask of each"),
-        (
-            altered(POISSON, {"depths": Depths("none", 0.0)}),
-            "screened Poisson needs depths: set task.depths.points=dense, or task=stereo",
-        ),
-    ],
-    ids=["masks", "depths"],
-)
-def test_what_a_surface_needs_is_told(scene, tmp_path, task, message):  # noqa: F811
-    with pytest.raises(BadInput, match=message):
-        task.execute(run_in(tmp_path, scene))
-    assert not (tmp_path / "mesh.ply").exists()
+def test_what_a_surface_needs_is_told(scene, tmp_path):  # noqa: F811
+    with pytest.raises(BadInput, match="the visual hull needs a mask of each"):
+        altered(HULL, {"masks": False}).execute(run_in(tmp_path, scene))
+    with pytest.raises(BadInput, match=r"screened Poisson needs depths: set task\.depths\.points=dense"):
+        altered(POISSON, {"depths": Depths("none", 0.0)}).execute(run_in(tmp_path, scene))
 
 
 def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
