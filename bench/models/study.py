@@ -9,7 +9,7 @@ import torch
 from bench.models.fit import Fitted, Fitter
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence
-from bench.models.views import Views
+from bench.models.observations import Views
 from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
 from renderers.camera import Rays

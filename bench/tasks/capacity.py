@@ -9,9 +9,8 @@ from bench.models.field import SIZES
 from bench.models.fit import Fitter
 from bench.models.growth import Growth, grow
 from bench.models.model import Evidence, Size
-from bench.models.observations import RayObservations
+from bench.models.observations import RayObservations, Views
 from bench.models.study import CheckSettings, Choice, Study
-from bench.models.views import Views
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates
 from bench.records.files import curve_file

@@ -106,7 +106,8 @@ class Gradients:
             inputs.scene.view.camera.double(),
             Counts(),
         )
-        subject.check()
+        check_kind(inputs.renderer, twin.decoder.at(twin.codes[0]))
+        check_field_gradient(inputs.renderer)
         generator = torch.Generator().manual_seed(inputs.seed)
         axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
         directions = torch.linalg.qr(axes).Q
@@ -191,11 +192,6 @@ class Subject:
     code: Float[Tensor, " code_length"]
     camera: Camera
     counts: Counts
-
-    def check(self) -> None:
-        """Raises Unsupported where the renderer cannot do this."""
-        check_kind(self.renderer, self.decoder.at(self.code))
-        check_field_gradient(self.renderer)
 
     def same_surface(
         self, pixels: Int[Tensor, " m"], found: Float[Tensor, " m"], distance: Float[Tensor, " m"]

@@ -1,7 +1,7 @@
 """Camera pose without a renderer: Open3D's iterative closest points on the same depth image."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
+from bench.solve.solve import note_result
 from bench.tasks.pose import SEEN_DEFINITIONS, PoseTask
 from datasets.scene import View
 from datasets.truth import sample_surface
@@ -72,11 +73,8 @@ class PoseICP(PoseTask):
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         with run.off_clock():
             after = self.evaluate(found, inputs.scene)
-        record.metrics, record.notes = after.metrics, [*record.notes, *after.notes]
-        record.status, record.reason = RunStatus.OK, ""
-        if not np.isfinite(distance):
-            reason = "no point of the depth image came within task.reach of the mesh"
-            record.status, record.reason = RunStatus.NOT_REACHED, reason
+        failure = (RunStatus.NOT_REACHED, "no point of the depth image came within task.reach of the mesh")
+        note_result(run, replace(after, failure=None if np.isfinite(distance) else failure))
 
     def _register(
         self, camera: Camera, view: View, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from bench.tasks.photographs import sample
+from bench.tasks.multiview import sample
 from datasets.mesh import Mesh
 from datasets.photographs import HIGHEST, Photography, around, turned
 from datasets.shot import Shot

@@ -15,9 +15,8 @@ from bench.models.fit import SCREENING, Fitter, _slope_error
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
-from bench.models.observations import FREE, Holdout, hold_out, together
+from bench.models.observations import FREE, Holdout, Views, hold_out, together
 from bench.models.study import choose
-from bench.models.views import Views
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings

@@ -47,7 +47,7 @@ def record_of(out: str) -> dict:
     return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
 
 
-def command(*arguments: str) -> Outcome:
+def command(*arguments: str, main: Callable[[], int] = main) -> Outcome:
     """A command line in this process; its runs have processes of their own, unless it says isolation=off."""
     GlobalHydra.instance().clear()
     out, err = io.StringIO(), io.StringIO()

@@ -11,8 +11,7 @@ from bench.config import load
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, optimise
 from bench.solve.problem import NotReached, OptimiserSettings
-from bench.tasks.multiview import Multiview
-from bench.tasks.photographs import GivenPhotographs, blurred, sample
+from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
 from datasets.mesh import Mesh
 from datasets.scene import Scene, see
 from datasets.truth import Truth
@@ -22,7 +21,7 @@ from tests.looped import each
 from tests.tiny import CPU, ball_prior, camera_of
 
 RENDERER = load("renderer", "dist")
-CAMERA = camera_of(32, angles=(0.0, 20.0))
+CAMERA = camera_of(24, angles=(0.0, 20.0))
 PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
     images=PLAINLY, focal=1.0, views_per_step=4, neighbour=1, visible=1e-3, photometric_weight=5.0,
