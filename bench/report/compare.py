@@ -21,7 +21,7 @@ from bench.report.data.statistics import Interval, geometric, geometric_mean, ge
 from bench.report.write import chart
 from bench.report.write.chart import panel_data, series
 from bench.report.write.result import Result
-from bench.report.write.table import Column, estimate, text, to_data, to_table
+from bench.report.write.table import Column, estimate, text
 
 EVERY = "all families"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
@@ -70,10 +70,14 @@ class Compared:
         runs: at least one.
         reference: gives the name or the preset of the row that the row of a preset is divided by. Of several rows of
             that preset it is the first one of the plan of the sweep.
+        metric: the error.
+        label: its name on axes.
     """
 
     runs: Runs
     reference: Callable[[str], str] | None = None
+    metric: str = METRIC
+    label: str = LABEL
 
     @cached_property
     def cells(self) -> pd.DataFrame:
@@ -86,7 +90,7 @@ class Compared:
         found = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
             at=self.runs.setting(CONDITION),
             ok=(frame.status == "ok").to_numpy(bool),
-            error=self.runs.error(METRIC),
+            error=self.runs.error(self.metric),
             evaluations=frame["values"],
             seconds=frame.loop,
         )
@@ -215,6 +219,27 @@ class Compared:
         """The lines over all families."""
         return [line for line in self.lines if line["family"] == self.lines[0]["family"]]
 
+    def beside(self, above: dict[str, dict[str, Any]], published: dict[str, dict[str, Line]]) -> list[Line]:
+        """The lines, with others beside those of each family.
+
+        Args:
+            above: the medians of further lines, by their names and the families that they have.
+            published: of each family the published rows, with their numbers at the conditions.
+        """
+        found = []
+        for name in dict.fromkeys(line["family"] for line in self.lines):
+            empty = {"family": name, "error": "", "ratio": None, "failed": ""}
+            found += [
+                empty | {"row": row} | dict.fromkeys(self.conditions, medians[name])
+                for row, medians in above.items()
+                if name in medians
+            ]
+            found += [line for line in self.lines if line["family"] == name]
+            found += [
+                empty | {"row": f"published: {row}"} | numbers for row, numbers in published.get(name, {}).items()
+            ]
+        return found
+
     def columns(self, ratio: str = "") -> list[Column]:
         """The columns of the lines; the ratio has that heading, and without one the CSV alone has it."""
         return [
@@ -234,21 +259,21 @@ class Compared:
         Args:
             title: as a sentence.
             question: that its verdict answers.
-            changed: what replaces parts of the result: `verdict`, `remarks`, `data`, `figure`, ...; and `ratio`, the
+            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
                 heading of the ratios.
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
-        columns = self.columns(ratio)
         whole = [(line["row"], line["ratio"]) for line in self.pooled if not line["lacking"]]
         sure = excluding_one(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
-            "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost.",
+            "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost "
+            "of runs that ended ok.",
             "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
             "remarks": (ERROR, f"{RATIO} {FAILURE}"),
-            "data": to_data(columns, self.lines),
-            "table": to_table(columns, self.lines),
+            "columns": self.columns(ratio),
+            "lines": self.lines,
         } | changed
         if "figure" not in parts:
             parts["figure"] = self.draw_front()
@@ -290,7 +315,7 @@ class Compared:
             chart.front(axis, rows, [line[cost] for line in known], errors, on)
             style.log_axis(axis, "x", [line[cost] for line in known])
             axis.set_xlabel(label)
-        axes[0].set_ylabel(LABEL)
+        axes[0].set_ylabel(self.label)
         style.log_axis(axes[0], "y", [v for line in self.pooled for v in (line["error"].low, line["error"].value)])
         style.legend_below(figure, axes[0], columns=3)
         return figure
@@ -313,7 +338,7 @@ class Compared:
         for axis in axes.flat[len(self.families) :]:
             axis.axis("off")
         for axis in axes[:, 0]:
-            axis.set_ylabel(LABEL)
+            axis.set_ylabel(self.label)
         style.log_axis(axes[0, 0], "y", self.cells.error)
         style.legend_below(figure, *axes.flat)
         return figure
@@ -339,7 +364,7 @@ class Compared:
                 for line in known
                 if line[cost] is not None
             ]
-            panels.append(panel_data("error over cost", label, LABEL.partition(" (")[0], points))
+            panels.append(panel_data("error over cost", label, self.label.partition(" (")[0], points))
         return {"panels": panels}
 
 

@@ -44,12 +44,12 @@ def run_columns(conditions: Sequence[Condition], *others: str) -> tuple[Column, 
     return (FAMILY, *keys, *(configured(key, "task", key) for key in others), *metrics(ONE_WAY, "chamfer_l2"))
 
 
-def middle(records: Sequence[Record]) -> Interval:
-    """The median error from truth to prediction x 1000, over shapes and seeds; a run that failed is infinite."""
-    return bootstrap(by_shape({run_key(run): SCALE * error(run, ONE_WAY) for run in records}), median, seed=0)
+def middle(records: Sequence[Record], metric: str = ONE_WAY) -> Interval:
+    """The median of a metric x 1000 over shapes and seeds, in which a run that failed is infinite."""
+    return bootstrap(by_shape({run_key(run): SCALE * error(run, metric) for run in records}), median, seed=0)
 
 
-def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric: str = ONE_WAY) -> list[dict[str, Any]]:
     """A line per family, row, condition and its value, with all other conditions at their neutral values.
 
     Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
@@ -60,12 +60,18 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list
         alone = [r for r in records if all(other.of(r) == other.neutral for other in conditions if other != one)]
         for (name, row, at), own in grouped(alone, lambda r, one=one: (family(r), row_of(r), one.of(r))).items():
             told = {"family": name, "method": row.name, "preset": row.preset, "condition": f"{one.label}: {at:g}"}
-            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own)})
+            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own, metric)})
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
 
 
 @style.styled
-def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, success: float | None = None) -> Figure:
+def draw(
+    lines: Sequence[dict[str, Any]],
+    conditions: Sequence[Condition],
+    *,
+    label: str = "truth to prediction × 1000\n(scene units²)",
+    success: float | None = None,
+) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
 
     `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
@@ -85,6 +91,6 @@ def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, su
                 axis.axhline(success, color="#777777", lw=0.9, label="success: below")
             axis.set(xlabel=one.label, title=name)
         style.log_axis(panels[0], "y", known)
-        panels[0].set_ylabel("truth to prediction × 1000\n(scene units²)")
+        panels[0].set_ylabel(label)
     style.legend_below(figure, *axes.flat, columns=3)
     return figure

@@ -86,15 +86,12 @@ def best(
 
 
 @style.styled
-def draw_runs(
-    runs: Runs, panels: Mapping[str, pd.Series], starts: pd.Series | None = None, *, log: bool = True
-) -> Figure:
+def draw_runs(runs: Runs, panels: Mapping[str, pd.Series], *, log: bool = True) -> Figure:
     """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
         runs: of the rows.
         panels: of each measure its values by the label of its axis; nan is not drawn, infinite is a cross at the edge.
-        starts: values before the optimisation, grey.
         log: whether an axis whose values differ by more than a factor of five is logarithmic.
     """
     rows = list(runs.rows())
@@ -102,12 +99,9 @@ def draw_runs(
     for axis, (label, values) in zip(axes, panels.items(), strict=True):
         for place, row in enumerate(rows):
             mine = ((runs.frame.row == row.name) & (runs.frame.preset == row.preset)).to_numpy() & values.notna()
-            if starts is not None:
-                axis.plot(starts[mine], _spread(place, mine.sum()), ".", color="#b0b0b0", ms=3, label="start")
             _points(axis, place, row.preset, values[mine].to_numpy(float))
-        shown = values if starts is None else pd.concat([values, starts[values.notna()]])
-        if log and style.needs_log(shown, 5.0):
-            style.log_axis(axis, "x", shown)
+        if log and style.needs_log(values, 5.0):
+            style.log_axis(axis, "x", values)
         axis.set_xlabel(label)
         axis.grid(axis="y", visible=False)
     axes[0].set_yticks(range(len(rows)), [row.name for row in rows])

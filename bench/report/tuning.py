@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS, NOT_RUN
@@ -31,8 +32,6 @@ VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
 OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
 UNFINISHED = (NOT_RUN, "killed")  # statuses of runs that say nothing of their draw
-Place = tuple[str, int, RunKey]  # split, draw, shape and seed
-Table = dict[Place, Record]
 
 
 @dataclass(frozen=True)
@@ -108,15 +107,18 @@ def tunings(runs: Runs) -> list[Tuning]:
     """
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
-    tables = [{(_split(r), _draw(r), run_key(r)): r for r in records} for records in by_method.values()]
-    common = {*tables[0]}.intersection(*tables[1:]) if tables else set()
-    runs = {split: sorted({run for of, _, run in common if of == split}) for split in (VALIDATION, TEST)}
-    draws = sorted({draw for _, draw, _ in common})
-    draws = [draw for draw in draws if all((s, draw, run) in common for s in runs for run in runs[s])]
-    if not draws or not runs[VALIDATION]:
+    keys = sorted({run_key(record) for record in ended})
+    cells = pd.DataFrame([_cell(record, keys) for record in ended])
+    if cells.empty:
         return []
-    worst = {split: _worst(tables, split, draws, runs[split]) for split in runs}
-    return [_tuning(method, table, draws, worst) for method, table in zip(by_method, tables, strict=True)]
+    cells = cells[cells.groupby(["split", "draw", "run"]).method.transform("nunique") == len(by_method)]
+    places = cells.groupby(["split", "run"]).ngroups  # that a draw needs, of each method
+    cells = cells[cells.groupby("draw").draw.transform("size") == places * len(by_method)]
+    if VALIDATION not in {*cells.split}:
+        return []
+    worst = cells.error.where(np.isfinite(cells.error)).groupby([cells.split, cells.run]).transform("max").fillna(1.0)
+    cells = cells.assign(error=np.log(np.minimum(cells.error, worst)))
+    return [_tuning(cells[cells.method == method], records, keys) for method, records in by_method.items()]
 
 
 def pooled(methods: list[Tuning]) -> Tuning:
@@ -147,52 +149,39 @@ def pooled(methods: list[Tuning]) -> Tuning:
 def left_out(runs: Runs, methods: list[Tuning]) -> list[str]:
     """A note of the draws that some runs have, and that no method is read on; none where there are none."""
     used = {draw for method in methods for draw in method.draws}
-    draws = sorted({_draw(record) for record in runs.records} - used)
+    draws = sorted({record["config"]["draw"] for record in runs.records} - used)
     return [f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, draws))}."] if draws else []
 
 
-def _tuning(method: str, table: Table, draws: list[int], worst: dict[str, dict[RunKey, float]]) -> Tuning:
-    used = {split: [[table[split, draw, run] for run in of] for draw in draws] for split, of in worst.items()}
-    logs = {
-        split: np.log(
-            [[min(_error(r), most) for r, most in zip(line, worst[split].values(), strict=True)] for line in of]
-        )
-        for split, of in used.items()
+def _cell(record: Record, keys: list[RunKey]) -> dict[str, Any]:
+    """A line of the table of runs, with the place of its shape and seed among all."""
+    config, ok = record["config"], record["status"] == "ok"
+    return {
+        **{"method": record["method"], "split": config["split"], "draw": config["draw"]},
+        **{"run": keys.index(run_key(record)), "failed": not ok, "record": record},
+        **{"error": SCALE * error(record, "chamfer_l2"), "values": value_evaluations(record) if ok else None},
     }
-    failed = {split: np.array([sum(r["status"] != "ok" for r in line) for line in of]) for split, of in used.items()}
-    spent = [used[VALIDATION][i] + used[TEST][i] for i in range(len(draws))]
-    first = spent[0][0]["config"]
+
+
+def _tuning(own: pd.DataFrame, records: list[Record], keys: list[RunKey]) -> Tuning:
+    """The draws of one method, of which `records` are all runs that ended."""
+    first = own[own.split == VALIDATION].groupby("draw").record.first()
+    method, config = own.method.iloc[0].removeprefix(SPACE), first.iloc[0]["config"]
+    logs = {split: part.pivot(index="draw", columns="run", values="error") for split, part in own.groupby("split")}
+    test = logs.get(TEST, pd.DataFrame(index=first.index))
     return Tuning(
-        method=method.removeprefix(SPACE),
-        label=str(first.get("label") or method.removeprefix(SPACE)),
-        draws=draws,
-        settings=_settings([line[0] for line in used[VALIDATION]], [*table.values()]),
-        validation=logs[VALIDATION],
-        test=logs[TEST],
-        failures=failed[VALIDATION],
-        failed=int(failed[VALIDATION].sum() + failed[TEST].sum()),
-        runs=sum(map(len, spent)),
-        test_runs=list(worst[TEST]),
-        evaluations=[median_of_known(value_evaluations(r) for r in line if r["status"] == "ok") for line in spent],
+        method=method,
+        label=str(config.get("label") or method),
+        draws=first.index.tolist(),
+        settings=_settings(first.tolist(), records),
+        validation=logs[VALIDATION].to_numpy(),
+        test=test.to_numpy(float),
+        failures=own[own.split == VALIDATION].groupby("draw").failed.sum().to_numpy(),
+        failed=int(own.failed.sum()),
+        runs=len(own),
+        test_runs=[keys[place] for place in test],
+        evaluations=[median_of_known(part.dropna()) for _, part in own.groupby("draw")["values"]],
     )
-
-
-def _split(record: Record) -> str:
-    return record["config"]["split"]
-
-
-def _draw(record: Record) -> int:
-    return record["config"]["draw"]
-
-
-def _error(record: Record) -> float:
-    return SCALE * error(record, "chamfer_l2")
-
-
-def _worst(tables: list[Table], split: str, draws: list[int], runs: list[RunKey]) -> dict[RunKey, float]:
-    """The largest finite error on each shape and seed; 1 where there is none."""
-    found = {run: [_error(table[split, draw, run]) for table in tables for draw in draws] for run in runs}
-    return {run: max((value for value in of if math.isfinite(value)), default=1.0) for run, of in found.items()}
 
 
 def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]]:

@@ -2,15 +2,9 @@
 
 import math
 
-from bench.records import format
-from bench.report import gallery
+from bench.report import single_view
 from bench.report.data.records import Record, Row, error, grouped, row_of
-from bench.report.data.runs import Runs, Selection
-from bench.report.gallery import Block, Cell, Scene
-from bench.report.medians import scene_of
-from bench.report.single_view import BASELINES, INTERVALS, OVER, RUNS, columns, draw, lines_of
-from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, Column, metrics, text, thousandfold, to_data, to_table
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
 
 PLACE = 41
 READS = (Selection("dvr_table1", setup=("machine",)),)
@@ -28,42 +22,45 @@ NOTES = (
     "hull” does nothing else.",
     "Without a training: the code of the prior that DIST finds by the mask, knowing the camera; the mean shape; the "
     "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat.",
-    f"{OVER} “Trained in” is once for the family, “Inference” the network with its mesh, or the search without one.",
+    f"{single_view.OVER} “Trained in” is once for the family, “Inference” the network with its mesh, or the search "
+    "without one.",
     "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box, which cannot be "
     "compared directly with the measured rows.",
 )
 COLUMNS = (
-    *columns("Training"),
-    *(Column("normal_consistency", "Normals"), Column("mask_iou", "Mask IoU"), Column("psnr", "PSNR")),
-    *(Column("training", "Trained in", show=format.seconds), Column("seconds", "Inference", show=format.seconds)),
-    *(text("failed", "Failed"), text("published", "Published")),
+    *single_view.columns("Training"),
+    table.Column("normal_consistency", "Normals"),
+    *(table.Column("mask_iou", "Mask IoU"), table.Column("psnr", "PSNR")),
+    table.Column("training", "Trained in", show=format.seconds),
+    table.Column("seconds", "Inference", show=format.seconds),
+    *(table.text("failed", "Failed"), table.text("published", "Published")),
 )
 IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz
-PICTURED = (FAMILY, *IDENTITY, *metrics("chamfer_l1", "iou"))
+PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("chamfer_l1", "iou"))
 
 
 def make(runs: Runs) -> Result:
     """A line per family and row, and the published ones."""
-    of_family = {name: lines_of(runs, name, BASELINES) for name in runs.families()}
+    of_family = {name: single_view.lines_of(runs, name, single_view.BASELINES) for name in runs.families()}
     lines = []
     for name, own in of_family.items():
         published = PUBLISHED.get(name.partition("/")[0], {}).items()
-        lines += [
-            *own,
-            *({"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published),
-        ]
+        lines += own
+        lines += [{"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published]
     return Result(
         runs,
         "Shape from one image.",
-        "Medians over shapes, by what the training of the network may know; Chamfer-L1 in scene units, times 1000.",
+        "Medians over shapes, of costs over those that ended ok, by what the training of the network may know; "
+        "Chamfer-L1 in scene units, times 1000.",
         question="How much must a training know, so that one image gives a shape?",
         verdict=_verdict(of_family),
-        interval=INTERVALS,
+        interval=single_view.INTERVALS,
         estimates=[line["interval"] for line in lines if "interval" in line],
         remarks=NOTES,
-        data=to_data(RUNS, runs.records),
-        table=to_table(COLUMNS, lines),
-        figure=draw(runs),
+        columns=COLUMNS,
+        lines=lines,
+        run_columns=single_view.RUNS,
+        figure=single_view.draw(runs),
     )
 
 
@@ -76,16 +73,16 @@ def _verdict(of_family: dict[str, list[dict]]) -> str:
         known = {x["method"]: x["chamfer_l1"] for x in trained if x["runs"] == n and math.isfinite(x["chamfer_l1"])}
         if known:
             first = min(known, key=lambda row: known[row])
-            alone = thousandfold(known.get("RGB"))
-            said.append(f"{family}: {first} *{thousandfold(known[first])}*, RGB alone {alone} (n = {n})")
+            alone = table.thousandfold(known.get("RGB"))
+            said.append(f"{family}: {first} *{table.thousandfold(known[first])}*, RGB alone {alone} (n = {n})")
     return f"Least median Chamfer-L1 × 1000 of the trainings: {'; '.join(said)}." if said else ""
 
 
 def figures(runs: Runs) -> Result:
     """A line for a success and a failure of each family."""
-    rows, of_scene = list(runs.rows()), grouped(runs.records, scene_of)
+    rows, of_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {scene: end for of in runs.families().values() for scene, end in _ends(of, rows[0]).items()}
-    scenes = {name: Scene(runs, of_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
+    scenes = {name: gallery.Scene(runs, of_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
     lines = {f"{name}, {end}": _line(rows, of_scene[name], scenes[name]) for name, end in shown.items()}
     return Result(
         runs,
@@ -97,12 +94,12 @@ def figures(runs: Runs) -> Result:
             "are seen by the camera of another image, which no row was given.",
             *gallery.missing(scenes.values()),
         ),
-        data=to_data(PICTURED, runs.records),
-        figure=gallery.draw([Block("", [*IMAGES.values(), *(row.name for row in rows)], lines)]),
+        run_columns=PICTURED,
+        figure=gallery.draw([gallery.Block("", [*IMAGES.values(), *(row.name for row in rows)], lines)]),
     )
 
 
-def _line(rows: list[Row], records: list[Record], scene: Scene) -> list[Cell]:
+def _line(rows: list[Row], records: list[Record], scene: gallery.Scene) -> list[gallery.Cell]:
     at = {row_of(record): record for record in records}
     images = [scene.whole(records, name) for name in IMAGES]
     return [*images, *(scene.cell(at.get(row), gallery.normals()) for row in rows)]
@@ -111,7 +108,8 @@ def _line(rows: list[Row], records: list[Record], scene: Scene) -> list[Cell]:
 def _ends(records: list[Record], row: Row) -> dict[str, str]:
     """The scenes of a family's shapes with the least and the largest error of a row, and which it is."""
     ordered = sorted((r for r in records if row_of(r) == row), key=lambda record: error(record, "chamfer_l1"))
-    return {scene_of(ordered[0]): "best", scene_of(ordered[-1]): "worst"} if ordered else {}
+    ends = {0: "best", -1: "worst"} if ordered else {}
+    return {medians.scene_of(ordered[place]): end for place, end in ends.items()}
 
 
 PAGES = {"dvr_table1": make, "single_view_figures": figures}

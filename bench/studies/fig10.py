@@ -1,14 +1,7 @@
 """Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
 
-import numpy as np
-
-from bench.records import format
 from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, run_columns
-from bench.report.data.records import ONE_WAY
-from bench.report.data.runs import Runs, Selection
-from bench.report.medians import plural
-from bench.report.write.result import Result
-from bench.report.write.table import to_data, to_table
+from bench.report.study import Result, Runs, Selection, format, medians, records
 
 PLACE = 50
 CONDITIONS = (
@@ -36,8 +29,9 @@ def make(runs: Runs) -> Result:
         interval=INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        data=to_data(run_columns(CONDITIONS), runs.records),
-        table=to_table((*NAMED, *MEDIAN), lines),
+        columns=(*NAMED, *MEDIAN),
+        lines=lines,
+        run_columns=run_columns(CONDITIONS),
         figure=draw(lines, CONDITIONS),
     )
 
@@ -45,13 +39,13 @@ def make(runs: Runs) -> Result:
 def _verdict(runs: Runs) -> str:
     """The row and family between whose conditions the median error changes most."""
     keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{one.key}") for one in CONDITIONS)]
-    medians = runs.error(ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
-    spread = (medians.max() / medians.min()).dropna().sort_values()
+    of_rows = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
+    spread = (of_rows.max() / of_rows.min()).dropna().sort_values()
     if spread.empty:
         return ""
     row, family = spread.index[-1]
-    ratio = "∞" if np.isinf(spread.iloc[-1]) else format.number(spread.iloc[-1])
-    shapes = plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
+    ratio = format.number(spread.iloc[-1])
+    shapes = medians.plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
     return (
         f"Over all conditions the median error changes by a factor of up to *{ratio}* ({row}, {family}); n = {shapes}."
     )

@@ -1,8 +1,7 @@
 """Every renderer under one loss of the mask and at one tuned setting: errors, ratios to DIST, error over cost."""
 
 from bench.report.compare import ERROR, FAILURE, RATIO, Compared
-from bench.report.data.runs import Runs, Selection
-from bench.report.write.result import Result
+from bench.report.study import Result, Runs, Selection
 
 PLACE = 21
 READS = (Selection("one_loss", ("task.points",)),)

@@ -1,93 +1,90 @@
 """Completion from depths that a scanner measured, against exact ones at the same pixels."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.data.records import ONE_WAY, SCALE
-from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import geometric_mean
-from bench.report.write import chart
-from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, metrics, text, to_data, to_table
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
 
 PLACE = 48
 READS = (Selection("scans", ("task.depths",), setup=("scenes", "pixels", "machine")),)
-METRICS = {"depth_mae": "depth error", ONE_WAY: "truth to prediction", "chamfer_l2": "Chamfer"}
+METRICS = {"depth_mae": "depth error", records.ONE_WAY: "truth to prediction", "chamfer_l2": "Chamfer"}
 EXACT, MEASURED, RATIO = "exact", "measured", "ratio"  # values of task.depths, and what is between their errors
 COLUMNS = (
-    text("row", "Method"),
+    table.text("row", "Method"),
     *(
-        Column(f"{name}_{part}", f"{label.capitalize()}, {part}")
+        table.Column(f"{name}_{part}", f"{label.capitalize()}, {part}")
         for name, label in METRICS.items()
         for part in (EXACT, MEASURED, RATIO)
     ),
-    text("failed", "Failed"),
+    table.text("failed", "Failed"),
 )
-RUNS = (FAMILY, configured("depths", "task", "depths"), *IDENTITY, *metrics(*METRICS), *LOOP)
+RUNS = (
+    *(table.FAMILY, table.configured("depths", "task", "depths"), *table.IDENTITY),
+    *(*table.metrics(*METRICS), *table.LOOP),
+)
 NOTES = (
     "Scans of one object depend on each other, so there is no interval: a ratio is the geometric mean over scans of "
-    "the error with measured depths over that with exact ones.",
+    "the error with measured depths over that with exact ones, 1 where both failed.",
     "Exact depths are those of the mesh at the pixels that the scanner measured; the mask is that of the mesh in both.",
     "A run that did not end ok counts as infinite; one that was refused does not count.",
 )
+Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
     """A line per row."""
-    pairs = {metric: _pairs(runs, metric) for metric in METRICS}
-    lines = pd.DataFrame({"failed": _failed(runs)})
-    for metric, found in pairs.items():
-        medians = found.groupby("row", sort=False)[[EXACT, MEASURED]].median()
-        ratio = (found[MEASURED] / found[EXACT]).groupby("row", sort=False).apply(_ratio)
-        lines = lines.join(medians.assign(**{RATIO: ratio}).add_prefix(f"{metric}_"))
-    lines = lines.astype(object).where(lines.notna(), None).rename_axis("row").reset_index().to_dict("records")
+    counted = runs.where(runs.frame.status != "refused")
+    pairs = {metric: _pairs(counted, metric) for metric in METRICS}
+    lines = [_line(row.name, counted, pairs) for row in runs.rows()]
+    scans = len(pairs["depth_mae"].groupby(["family", "solid", "seed"]))
     return Result(
         runs,
         "Shape from depths that a scanner measured.",
         "Median errors over scans (times 1000; depths in scene units, distances between surfaces in their squares) "
         "with exact and with measured depths, and the ratio of both.",
         question="Do depths that a scanner measured complete a shape as exact ones do?",
-        verdict=_verdict(pairs["depth_mae"]),
+        verdict=_verdict(lines, scans),
         remarks=NOTES,
-        data=to_data(RUNS, runs.records),
-        table=to_table(COLUMNS, lines),
-        figure=draw(runs, pairs),
+        columns=COLUMNS,
+        lines=lines,
+        run_columns=RUNS,
+        figure=draw(pairs),
     )
 
 
 def _pairs(runs: Runs, metric: str) -> pd.DataFrame:
     """The error with exact and with measured depths of each row, scan and seed that has runs with both."""
-    frame = runs.frame.assign(error=runs.error(metric, SCALE), depths=runs.setting("task.depths"))
-    kept = frame[frame.status != "refused"]
-    both = kept.pivot(index=["row", "preset", "family", "solid", "view", "seed"], columns="depths", values="error")
+    frame = runs.frame.assign(error=runs.error(metric), depths=runs.setting("task.depths"))
+    both = frame.pivot(index=["row", "preset", "family", "solid", "view", "seed"], columns="depths", values="error")
     return both.reindex(columns=[EXACT, MEASURED]).dropna()
 
 
-def _failed(runs: Runs) -> pd.Series:
-    bad = runs.frame.groupby("row", sort=False).status.agg(lambda found: (found != "ok").sum())
-    return bad.astype(str) + " of " + runs.frame.groupby("row", sort=False).size().astype(str)
+def _line(row: str, runs: Runs, pairs: dict[str, pd.DataFrame]) -> Line:
+    status = runs.frame.status[runs.frame.row == row]
+    line: Line = {"row": row, "failed": f"{(status != 'ok').sum()} of {len(status)}"}
+    for metric, found in pairs.items():
+        mine = found[found.index.get_level_values("row") == row]
+        if len(mine):
+            line |= {f"{metric}_{depths}": float(mine[depths].median()) for depths in (EXACT, MEASURED)}
+            exact, measured = (mine[depths].to_numpy()[:, None] for depths in (EXACT, MEASURED))
+            line[f"{metric}_{RATIO}"] = statistics.geometric_ratio([*measured], [*exact]).value
+    return line
 
 
-def _ratio(ratios: pd.Series) -> float | None:
-    return float(geometric_mean(ratios.to_numpy())) if np.isfinite(ratios).all() and (ratios > 0).all() else None
-
-
-def _verdict(pairs: pd.DataFrame) -> str:
-    """The least and the largest ratio of the depth errors; where both failed neither is better."""
-    with np.errstate(invalid="ignore"):
-        logs = (np.log(pairs[MEASURED]) - np.log(pairs[EXACT])).fillna(0.0).groupby("row", sort=False).mean()
-    if logs.empty:
+def _verdict(lines: list[Line], scans: int) -> str:
+    """The least and the largest ratio of the depth errors."""
+    ratios = [(line[f"depth_mae_{RATIO}"], line["row"]) for line in lines if f"depth_mae_{RATIO}" in line]
+    if not ratios:
         return ""
-    ends = [f"*{format.number(np.exp(logs[row]))}* ({row})" for row in (logs.idxmin(), logs.idxmax())]
-    n = len(pairs.groupby(["family", "solid", "seed"]))
-    return f"The depth error with measured depths is {' to '.join(ends)} times that with exact ones; n = {n} scans."
+    ends = [f"*{format.number(ratio)}* ({row})" for ratio, row in (min(ratios), max(ratios))]
+    return f"The depth error with measured depths is {' to '.join(ends)} times that with exact ones; n = {scans} scans."
 
 
 @style.styled
-def draw(runs: Runs, pairs: dict[str, pd.DataFrame]) -> Figure:
+def draw(pairs: dict[str, pd.DataFrame]) -> Figure:
     """A panel per metric: the error with measured depths over that with exact ones, a point per scan and method."""
     figure, axes = chart.sheet(2.9, 1, len(METRICS))
     for axis, (metric, label) in zip(axes[0], METRICS.items(), strict=True):

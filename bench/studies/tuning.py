@@ -1,26 +1,12 @@
 """What tuning is worth: the expected test error of the best of some drawn settings."""
 
+from typing import Any
+
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
 from bench.report.compare import CHAMFER
-from bench.report.data import statistics
-from bench.report.data.runs import Runs
+from bench.report.study import Result, Runs, chart, format, statistics, style, table
 from bench.report.tuning import TUNING, Tuning, left_out, tunings, unfinished
-from bench.report.write import chart
-from bench.report.write.result import Result
-from bench.report.write.table import (
-    FAMILY,
-    IDENTITY,
-    LOOP,
-    Column,
-    configured,
-    metrics,
-    text,
-    to_data,
-    to_table,
-)
 
 PLACE = 36
 READS = (TUNING,)
@@ -34,52 +20,49 @@ NOTES = (
     "The interval is over test shapes, for these draws and this choice: other draws and shapes would add to it.",
 )
 RUNS = (
-    *(FAMILY, configured("split", "split"), configured("draw", "draw"), *IDENTITY),
-    *metrics("chamfer_l2", "chamfer_l1", "mask_iou"),
-    *LOOP,
+    *(table.FAMILY, table.configured("split", "split"), table.configured("draw", "draw"), *table.IDENTITY),
+    *(*table.metrics("chamfer_l2", "chamfer_l1", "mask_iou"), *table.LOOP),
 )
-Curve = dict[int, statistics.Interval]  # by the number of draws
+Line = dict[str, Any]  # of a method, with the expected error by the number of draws as `curve`
 
 
 def make(runs: Runs) -> Result:
     """A line per method: the expected test error at each number of draws."""
     methods = [method for method in tunings(runs) if method.test_runs]
-    curves = {method.label: {k: statistics.geometric(method.expected(k)) for k in method.budgets} for method in methods}
-    budgets = sorted({k for curve in curves.values() for k in curve})
-    columns = [
-        text("method", "Method"),
-        *(
-            Column(str(k), f"Best of {k}", words=lambda line, k=k: str(line["curve"].get(k, format.MISSING)))
-            for k in budgets
-        ),
-        *(text("worth", "Best over one draw"), Column("evaluations", "Evaluations of the best", show=format.count)),
-        text("failed", "Failed"),
-    ]
-    worth = {method.label: _worth(method) for method in methods}
-    lines = [
-        {"method": method.label, "curve": curves[method.label], "failed": f"{method.failed} of {method.runs}"}
-        | {"evaluations": method.evaluations[method.best], "worth": worth[method.label]}
-        for method in methods
-    ]
+    lines = [_line(method) for method in methods]
+    budgets = sorted({k for line in lines for k in line["curve"]})
     return Result(
         runs,
         "What tuning is worth.",
-        "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken.",
+        "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken; "
+        "evaluations are medians of runs that ended ok.",
         question="What is tuning worth?",
-        verdict=_verdict(methods, worth),
+        verdict=_verdict(methods, lines),
         interval="95 % intervals over test shapes (Student's, of logarithms)",
-        estimates=[found for curve in curves.values() for found in curve.values()],
+        estimates=[found for line in lines for found in line["curve"].values()],
         remarks=_notes(runs, methods),
-        data=to_data(RUNS, runs.records),
-        table=to_table(columns, lines),
-        figure=draw(methods, curves),
+        columns=[
+            table.text("method", "Method"),
+            *(table.text("", f"Best of {k}", lambda line, k=k: line["curve"].get(k)) for k in budgets),
+            table.text("worth", "Best over one draw"),
+            table.Column("evaluations", "Evaluations of the best", show=format.count),
+            table.text("failed", "Failed"),
+        ],
+        lines=lines,
+        run_columns=RUNS,
+        figure=draw(lines, budgets),
     )
 
 
-def _worth(method: Tuning) -> statistics.Interval | str:
-    """The error of the best of all draws over that of one draw; empty for one draw."""
+def _line(method: Tuning) -> Line:
+    """Its curve, and the error of the best of all draws over that of one draw as `worth`; None for one draw."""
     most = max(method.budgets)
-    return statistics.geometric_ratio(method.expected(most), method.expected(1)) if most > 1 else ""
+    worth = statistics.geometric_ratio(method.expected(most), method.expected(1)) if most > 1 else None
+    return {
+        **{"method": method.label, "preset": method.method, "failed": f"{method.failed} of {method.runs}"},
+        **{"evaluations": method.evaluations[method.best], "worth": worth},
+        "curve": {k: statistics.geometric(method.expected(k)) for k in method.budgets},
+    }
 
 
 def _notes(runs: Runs, methods: list[Tuning]) -> list[str]:
@@ -91,9 +74,9 @@ def _notes(runs: Runs, methods: list[Tuning]) -> list[str]:
     return [*(note.format(**sizes) for note in NOTES), *([told] if waiting else []), *left_out(runs, methods)]
 
 
-def _verdict(methods: list[Tuning], worth: dict[str, statistics.Interval | str]) -> str:
+def _verdict(methods: list[Tuning], lines: list[Line]) -> str:
     """What the best draw is worth, of the method that gains the most and of the one that gains the least."""
-    known = [(found.value, label) for label, found in worth.items() if isinstance(found, statistics.Interval)]
+    known = [(line["worth"].value, line["method"]) for line in lines if line["worth"] is not None]
     if not known:
         return ""
     ends = [f"*{format.number(value)}* ({label})" for value, label in (min(known), max(known))]
@@ -102,20 +85,18 @@ def _verdict(methods: list[Tuning], worth: dict[str, statistics.Interval | str])
 
 
 @style.styled
-def draw(methods: list[Tuning], curves: dict[str, Curve]) -> Figure:
+def draw(lines: list[Line], budgets: list[int]) -> Figure:
     """Draws a line per method, the expected test error over the number of draws, and its interval at the last one."""
-    figure, axes = chart.sheet(3.2, width=4.6)
-    axis = axes[0, 0]
-    for method in methods:
-        curve = curves[method.label]
-        chart.line(axis, method.method, list(curve), [one.value for one in curve.values()], label=method.label)
-        chart.estimates(axis, method.method, [max(curve)], [curve[max(curve)]], bars=True, label=None)
+    figure, ((axis,),) = chart.sheet(3.2, width=4.6)
+    for line in lines:
+        preset, curve = line["preset"], line["curve"]
+        chart.line(axis, preset, [*curve], [one.value for one in curve.values()], label=line["method"])
+        chart.estimates(axis, preset, [max(curve)], [curve[max(curve)]], bars=True, label=None)
     axis.set(xlabel="number of drawn settings, the best of which is taken", ylabel="Chamfer × 1000 (scene units²)")
-    found = [one for curve in curves.values() for one in curve.values()]
+    found = [one for line in lines for one in line["curve"].values()]
     style.log_axis(axis, "y", [end for one in found for end in (one.low, one.value, one.high, *one.points)])
-    ticks = sorted({k for curve in curves.values() for k in curve})
     axis.set_xscale("log", base=2)
-    axis.set_xticks(ticks, [str(k) for k in ticks])
+    axis.set_xticks(budgets, [str(k) for k in budgets])
     style.legend_below(figure, axis, columns=2)
     return figure
 

@@ -1,8 +1,7 @@
 """The charts of the page have the colours of the figures, by the preset of a row and not by its name."""
 
 from bench.pictures import style
-from bench.studies import crossing, speed_curves
-from tests.report import test_report_crossing as of_crossing
+from bench.studies import speed_curves
 from tests.report import test_report_speed as of_speed
 from tests.report import test_report_stability as of_stability
 
@@ -33,12 +32,6 @@ def test_of_the_atlas(tmp_path):
     (panel,) = cost.chart["panels"]
     assert panel["y"]["reversed"] and cost.figure.axes[0].yaxis_inverted()
     assert panel["series"][0]["size"] > panel["series"][1]["size"]  # at the same place: neither is hidden
-
-
-def test_of_the_crossing(tmp_path):
-    result = crossing.make_front(of_crossing.crossed(tmp_path, families=("sofa",), shapes=3))
-    shown = assert_alike(result)
-    assert shown == {"DIST": style.look("dist").colour, "IDR": style.look("idr").colour}
 
 
 def test_of_the_front_and_its_curves(tmp_path):

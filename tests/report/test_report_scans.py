@@ -48,15 +48,27 @@ def test_scans_of_two_objects_are_not_mixed(tmp_path):
     assert row(tmp_path)["Depth error, ratio"] == "4.00"  # of 2 and 8
 
 
-@pytest.mark.parametrize(("status", "measured", "ratio"), [("diverged", "∞", "–"), ("refused", "2.00", "2.00")])
-def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, measured, ratio):
+@pytest.mark.parametrize(
+    ("status", "measured", "ratio", "failed"), [("diverged", "∞", "∞", "1 of 4"), ("refused", "2.00", "2.00", "0 of 3")]
+)
+def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, measured, ratio, failed):
     made(tmp_path, "exact", 1.0)
     made(tmp_path, "measured", 2.0)
     made(tmp_path, "exact", 1.0, index=1)
     made(tmp_path, "measured", 2.0, index=1, status=status)
-    line = row(tmp_path)
+    line, result = row(tmp_path), page(tmp_path)
     assert (line["Depth error, measured"], line["Depth error, ratio"]) == (measured, ratio)
-    assert line["Failed"] == "1 of 4"
+    assert line["Failed"] == failed
+    assert f"is *{ratio}* (newton) to *{ratio}* (newton)" in result.verdict
+    assert status in result.data["status"].tolist()
+
+
+def test_where_both_failed_neither_is_better(tmp_path):
+    for index, status in enumerate(("ok", "diverged")):
+        made(tmp_path, "exact", 1.0, index=index, status=status)
+        made(tmp_path, "measured", 4.0, index=index, status=status)
+    assert row(tmp_path)["Depth error, ratio"] == "2.00"  # of 4 and 1
+    assert "is *2.00* (newton)" in page(tmp_path).verdict
 
 
 def test_its_figure_has_a_point_for_each_pair(tmp_path):

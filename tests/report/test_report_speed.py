@@ -4,7 +4,6 @@ import json
 import math
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from bench.records.read import read_records
@@ -83,12 +82,11 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
     assert page.verdict == f"On the front of completing a shape: 2 of 4 settings, {ends}; n = 3 shapes."
 
 
-def test_failed_and_dominated_points_are_drawn_and_the_front_is_numbered(three):
+def test_dominated_points_are_hollow_and_the_front_is_numbered(three):
     axis = made(three).figure.axes[0]
     drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in axis.lines
              if len(line.get_xdata()) == 1}  # fmt: skip
-    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0), (6.0, 12.0)}  # the last beyond all finite ones
-    assert drawn[6.0, 12.0].get_marker() == "x"
+    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0)}  # the infinite one is in the table alone
     assert drawn[4.0, 8.0].get_markerfacecolor() == "none"
     assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
     assert {text.get_text(): text.xy for text in axis.texts} == {"1": (1.0, 7.0), "2": pytest.approx((3.0, 0.6))}
@@ -124,15 +122,6 @@ def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path
     assert data.loc["dist", "on_front"] == 1.0 and data.loc["dist, 20 steps", "seconds"] == 0.9
 
 
-def test_bands_are_drawn_from_six_shapes_on(three, tmp_path):
-    axis = made(three, speed_curves).figure.axes[0]
-    assert not axis.collections and len([line for line in axis.lines if line.get_linewidth() == 0.5]) > 3
-    for index in range(3, 6):
-        completed(tmp_path, "fast", [9, 6 + index], index=index)
-    axis = made(three, speed_curves).figure.axes[0]
-    assert axis.collections and not [line for line in axis.lines if line.get_linewidth() == 0.5]
-
-
 def test_the_charts_of_the_page_have_the_numbers_and_lead_to_the_runs(three):
     page = made(three)
     shown = [x for series in page.chart["panels"][0]["series"] if series["name"] != "front" for x in series["x"]]
@@ -153,33 +142,40 @@ def test_a_look_costs_what_was_spent_before_it(three):
     assert good["loss"].tolist()[:3] == [5, 4, 3] and math.isnan(good["loss"].iloc[3])
 
 
-def test_the_time_to_the_target_censors_what_did_not_reach_it(three):
+def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert speed_curves.TARGET == 1e-3
     page = made(three, speed_curves)
     table = page.table.set_index("Setting")
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
-    assert table.loc["bad"].tolist() == ["3", "0", "–", "0.775"]  # the last is the rank correlation of loss and error
-    assert table.loc["broken"].tolist() == ["3", "1", "1.00 s", "–"]  # failed runs did not, whatever they scored
+    assert table.loc["bad"].tolist() == ["3", "0", "∞", "0.775"]  # the last is the rank correlation of loss and error
+    assert table.loc["broken"].tolist() == ["3", "1", "∞", "–"]  # failed runs did not, whatever they scored
     assert page.verdict.startswith("good reaches an error of 1 (Chamfer × 1000) first, in *3.00 s*")
     assert "3 of 4 settings do not reach it" in page.verdict
 
 
-def test_a_run_that_failed_does_not_leave_those_that_have_not_reached_it(tmp_path):
-    for index in range(5):
+def test_the_verdict_says_the_median_of_the_table(tmp_path):
+    for index, errors in enumerate(([9, 1], [9, 8, 8, 8, 1], [9, 8])):
+        completed(tmp_path, "some", errors, index=index)
+        completed(tmp_path, "slow", [9, 8, 8, 8, 8, 1], index=index)
+    page = made(tmp_path, speed_curves)
+    assert page.table.set_index("Setting").loc["some"].tolist()[:3] == ["3", "2", "4.00 s"]  # of 1, 4 and ∞
+    assert page.verdict == ("some reaches an error of 1 (Chamfer × 1000) first, in *4.00 s* (median of n = 3 runs).")
+
+
+def test_where_every_median_is_infinite_the_figure_is_drawn_and_there_is_no_verdict(tmp_path):
+    for index in range(3):
         completed(tmp_path, "dist", [9, 8], index=index, status="nan")
-    completed(tmp_path, "dist", [9, 8, 8, 0.5], index=5)
-    figure = made(tmp_path, speed_curves).figure
-    figure.draw_without_rendering()  # also where every median is infinite
-    (steps,) = [line for line in figure.axes[2].lines if len(line.get_xdata()) > 1]
-    assert steps.get_ydata()[-1] == pytest.approx(5 / 6)
+    page = made(tmp_path, speed_curves)
+    page.figure.draw_without_rendering()
+    assert page.verdict == ""
 
 
-def test_a_run_without_a_curve_that_ended_ok_is_censored_when_it_ended(tmp_path):
+def test_a_run_without_a_curve_has_not_reached_the_target(tmp_path):
     folder = completed(tmp_path, "dist", [9, 8, 2])
     (folder / "curve.jsonl").unlink()
     runs = choose(read_records(tmp_path)[0], speed_curves.READS[0], tmp_path)
     (record,) = runs.records
-    assert speed_curves.time_to(history_of(runs, record), record) == (2.0, False)
+    assert speed_curves.time_to(history_of(runs, record), record) == math.inf
 
 
 def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
@@ -209,21 +205,13 @@ def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
     assert "Not shown: 1 run" in told(result)
 
 
-def test_the_median_over_runs_holds_a_failed_run_as_infinite():
-    columns = ["seconds", "value_evaluations", "error"]
-    runs = [pd.DataFrame([[0, 0, 9.0], [1, 10, e], [2, 20, e]], columns=columns) for e in (1.0, 2.0)]
-    lost = pd.DataFrame([[0, 0, 9.0], [1, 10, 0.1]], columns=columns)
-    where, _, middle, _ = speed_curves.band([*runs, lost], [False, False, True], "seconds")
-    assert where[0] == 1 and where[-1] == 2
-    assert (middle[0], middle[-1]) == (1.0, 2.0)
-
-
 def test_renderings_of_another_size_are_not_compared(tmp_path):
     rendered(tmp_path, "dist", 1.0, 0.01)
     rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
     rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
+    rendered(tmp_path, "dist", 1.0, 0.01)
     result = made(tmp_path)
-    assert "Not shown: 1 renderings of another size." in told(result)
+    assert "Not shown: 2 runs of this experiment at another scale" in told(result)
     assert result.data["setting"].tolist() == ["dist", "dist, 20 steps"]
     assert result.data["dominated"].tolist() == [False, False]
     assert result.data["evaluations"].tolist() == [1000, 1000]
