@@ -78,11 +78,10 @@ def best(
     known.sort(key=lambda line: line[name], reverse=most == "largest")
     if len(known) < 2 or not np.isfinite(known[0][name]):
         return ""
-    first, second, *_, last = *known, known[-1]
-    said = [f"{format.number(line[name], scale=scale)} ({line['method']})" for line in (first, second, last)]
-    value, _, who = said[0].partition(" ")
-    end = f", and at the other end {said[2]}" if len(known) > 2 else ""
-    return f"The {most} median {what} is *{value}* {who}, then {said[1]}{end}; n = {n}."
+    values = [format.number(line[name], scale=scale) for line in known]
+    said = [f"{value} ({line['method']})" for value, line in zip(values, known, strict=True)]
+    end = f", and at the other end {said[-1]}" if len(known) > 2 else ""
+    return f"The {most} median {what} is *{values[0]}* ({known[0]['method']}), then {said[1]}{end}; n = {n}."
 
 
 @style.styled

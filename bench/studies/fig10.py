@@ -1,7 +1,7 @@
 """Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
 
 from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, run_columns
-from bench.report.study import Result, Runs, Selection, format, medians, records
+from bench.report.study import Result, Runs, Selection, format, records
 
 PLACE = 50
 CONDITIONS = (
@@ -45,7 +45,7 @@ def _verdict(runs: Runs) -> str:
         return ""
     row, family = spread.index[-1]
     ratio = format.number(spread.iloc[-1])
-    shapes = medians.plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
+    shapes = format.plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
     return (
         f"Over all conditions the median error changes by a factor of up to *{ratio}* ({row}, {family}); n = {shapes}."
     )

@@ -3,7 +3,7 @@
 import math
 
 from bench.report.oracle import PRIORS
-from bench.report.study import Result, Runs, format, gallery, medians, records, statistics, table
+from bench.report.study import Result, Runs, format, gallery, records, statistics, table
 
 PLACE = 70
 READS = (PRIORS,)
@@ -55,7 +55,7 @@ def make(runs: Runs) -> Result:
         "shapes. Pictures: normals of the truth and of the fit.",
         question="How well can a prior show an unseen shape?",
         verdict=f"The best fit has *{middle}* times the least error that can be measured (median), at most {most} "
-        f"times; n = {medians.plural(len(values), 'shape')}.",
+        f"times; n = {format.plural(len(values), 'shape')}.",
         remarks=(*NOTES, *records.definitions(runs.records, DEFINED)),
         columns=COLUMNS,
         lines=lines,

@@ -1,13 +1,13 @@
 """The front of error over time: completing a shape, and rendering an image, by every setting of each renderer."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -18,6 +18,7 @@ from bench.report.write.caption import undefined
 PLACE = 80
 READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("view",)))
 SEED = 0  # of the bootstrap
+QUANTITIES = ("seconds", "error", "evaluations")  # of a run
 NEAR = 7  # points of a front that are nearer to each other, in points of type, have their numbers together
 LEAST = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
@@ -31,41 +32,30 @@ NOTES = (
 )
 POINT = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
 Line = dict[str, Any]  # of a setting
-Value = Callable[[records.Record], float | None]
-Groups = tuple[statistics.Groups, statistics.Groups, statistics.Groups]  # of seconds, errors and field values
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A task of the chart: its error metric, and functions that read a run's seconds and field values."""
+    """A task of the chart: its error metric, and the columns of a run's seconds and of its field values."""
 
     title: str
     error: str
     heading: str
-    seconds: Value
-    values: Value
+    seconds: str
+    values: tuple[str, ...]
 
 
-def _queries(record: records.Record) -> float | None:
-    """The number of field values of one rendering, coarse ones included; None where the record does not have it."""
-    queries = records.measured(record, "queries")
-    return None if queries is None else queries + (records.measured(record, "coarse_queries") or 0)
-
-
-COMPLETION = Trial(
-    *("completing a shape", "chamfer_l2", "Chamfer × 1000 (scene units²)"),
-    *(records.loop_seconds, records.value_evaluations),
-)
+COMPLETION = Trial("completing a shape", "chamfer_l2", "Chamfer × 1000 (scene units²)", "loop", ("values",))
 RENDERING = Trial(
     *("rendering an image", "error_p95", "depth error, 95th percentile × 1000 (scene units)"),
-    *(lambda record: records.measured(record, "forward_seconds"), _queries),
+    *("forward_seconds", ("queries", "coarse_queries")),
 )
 
 
 def make(completion: Runs | None, rendering: Runs | None) -> Result:
     """A point per setting: its median error and seconds, and its probability on the front."""
     found = {COMPLETION: completion, RENDERING: rendering}
-    panels = {trial: points(runs.records, trial) for trial, runs in found.items() if runs is not None}
+    panels = {trial: points(runs, trial) for trial, runs in found.items() if runs is not None}
     lines = [line for panel in panels.values() for line in panel]
     own = dict.fromkeys(key for line in lines for key in line if key.startswith("renderer."))
     return Result(
@@ -84,60 +74,53 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
     )
 
 
-def points(own: list[records.Record], trial: Trial) -> list[Line]:
+def points(runs: Runs, trial: Trial) -> list[Line]:
     """A line per setting, in the order of their runs."""
-    rows = records.grouped(own, records.row_of)
-    keys = sorted({records.run_key(record) for record in own}, key=str)
-    groups = _groups(rows, keys, trial)
+    keys = sorted({records.run_key(record) for record in runs.records}, key=str)
+    cells = _cells(runs, trial, keys)
+    groups = {
+        row.name: [records.by_shape(dict(zip(keys, cells.loc[row.name, of], strict=True))) for of in QUANTITIES]
+        for row in runs.rows()
+    }
     medians = np.array([[float(statistics.median(statistics.flat(g))) for g in of_row] for of_row in groups.values()])
     beaten = statistics.dominated(*medians.T[:2])
     chances = statistics.front([of_row[:2] for of_row in groups.values()], seed=SEED)
     lines = []
-    for i, (row, (_, errors, _)) in enumerate(groups.items()):
-        first, config = rows[row][0], rows[row][0]["config"].get("renderer") or {}
+    for i, (row, own) in enumerate(runs.rows().items()):
+        config, errors = own[0]["config"], groups[row.name][1]
         lines.append(
-            {"trial": trial.title, "setting": row.name, "renderer": records.base_renderer(first)}
-            | dict(zip(("seconds", "error", "evaluations"), medians[i].tolist(), strict=True))
-            | {"middle": statistics.bootstrap(errors, statistics.interquartile_mean, seed=SEED)}
-            | {"failed": sum(record["status"] != "ok" for record in rows[row]), "runs": len(rows[row])}
-            | {"missing": len(keys) - len({*map(records.run_key, rows[row])}), "shapes": len(errors)}
+            {"trial": trial.title, "setting": row.name, "renderer": records.base_renderer(own[0])}
+            | dict(zip(QUANTITIES, medians[i].tolist(), strict=True))
+            | {"middle": statistics.bootstrap(errors, statistics.interquartile_mean, seed=SEED), "shapes": len(errors)}
+            | {"failed": sum(record["status"] != "ok" for record in own), "runs": len(own)}
+            | {"missing": len(keys) - len({*map(records.run_key, own)})}
             | {"on_front": chances[i], "dominated": bool(beaten[i])}
-            | {"resolution": records.setting(first["config"], "view", "resolution")}
-            | {f"renderer.{key}": value for key, value in config.items() if key[0] != "_"}
+            | {"resolution": records.setting(config, "view", "resolution")}
+            | {f"renderer.{key}": value for key, value in (config.get("renderer") or {}).items() if key[0] != "_"}
         )
     return lines
 
 
-def _groups(rows: dict[records.Row, list[records.Record]], keys: list[Any], trial: Trial) -> dict[records.Row, Groups]:
-    """The seconds, errors and field values of each row, per shape; infinite what did not end ok or is missing.
+def _cells(runs: Runs, trial: Trial, keys: list[records.RunKey]) -> pd.DataFrame:
+    """The quantities of each row by the place of a run's key; infinite what did not end ok or is missing.
 
     Rows of a renderer with equal errors after equal numbers of field values compute the same: they share their times,
     or else noise would rank them.
     """
-    values = (
-        trial.seconds,
-        lambda record: records.SCALE * max(records.error(record, trial.error), LEAST),
-        trial.values,
-    )
-    tables = {row: np.array([_aligned(own, keys, value) for value in values]) for row, own in rows.items()}
-    renderers = {row: records.base_renderer(own[0]) for row, own in rows.items()}
-    found = {}
-    for row, mine in tables.items():
-        same = [
-            other
-            for name, other in tables.items()
-            if renderers[name] == renderers[row] and np.array_equal(other[1:], mine[1:]) and np.isfinite(mine[1:]).any()
-        ]
-        pooled = np.median(same or [mine], axis=0)
-        found[row] = tuple(records.by_shape(dict(zip(keys, quantity, strict=True))) for quantity in pooled)
-    return found
-
-
-def _aligned(own: list[records.Record], keys: list[Any], value: Value) -> list[float]:
-    """A quantity of the runs in the order of the keys."""
-    numbers = {records.run_key(record): value(record) if record["status"] == "ok" else None for record in own}
-    known = {key: float(x) for key, x in numbers.items() if x is not None and not math.isnan(x)}
-    return [known.get(key, math.inf) for key in keys]
+    values, *further = map(runs.number, trial.values)
+    quantities = {
+        "seconds": runs.number(trial.seconds),
+        "error": runs.error(trial.error).clip(lower=records.SCALE * LEAST),
+        "evaluations": values + sum(one.fillna(0) for one in further),
+    }
+    ok = (runs.frame.status == "ok").to_numpy(bool)
+    cells = pd.DataFrame(quantities).where(ok[:, None])
+    cells = cells.assign(row=runs.frame.row, key=[keys.index(records.run_key(record)) for record in runs.records])
+    wide = cells.pivot(index="row", columns="key", values=[*QUANTITIES]).fillna(math.inf)
+    renderers = {row.name: records.base_renderer(own[0]) for row, own in runs.rows().items()}
+    alike = [(renderers[row], *wide.loc[row, ["error", "evaluations"]]) for row in wide.index]
+    wide["seconds"] = wide["seconds"].groupby(pd.factorize(pd.Series(alike))[0]).transform("median")
+    return wide
 
 
 def _finite(panel: list[Line]) -> list[Line]:

@@ -57,23 +57,12 @@ def make(runs: Runs) -> Result:
         "Which method completes a shape best from sparse depth?",
         plotted="Median error over {shapes and seeds} at each number of given depth points, and the geometric mean.",
         verdict=found.best("errors × 1000 over all numbers of points"),
-        remarks=(compare.ERROR, " ".join((found.shapes(), _given(runs), _iterations(runs))), *NOTES),
+        remarks=(compare.ERROR, " ".join((found.shapes(), _iterations(runs))), *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
         lines=found.beside({LABEL: oracle}, published),
         run_columns=RUNS,
         figure=found.draw_conditions([r for r in found.rows if not r[0].endswith(VARIANTS)], oracle, LABEL),
     )
-
-
-def _given(runs: Runs) -> str:
-    """The median numbers of points that shares of the depth image are, of each family."""
-    given = runs.frame.assign(given=runs.number("evaluations_observed"), at=runs.setting("task.points"))
-    shares = (
-        given[~given["at"].str.isdigit() & given.given.notna()].groupby(["family", "at"], sort=False).given.median()
-    )
-    of_family = {name: own.droplevel(0) for name, own in shares.groupby("family", sort=False)}
-    told = [f"{name} " + ", ".join(f"{at} {n:.0f}" for at, n in own.items()) for name, own in of_family.items()]
-    return f"Points given, medians: {'; '.join(told)}." if told else ""
 
 
 def _iterations(runs: Runs) -> str:

@@ -1,6 +1,5 @@
 """Table 2 and the priors' page, made from run folders whose numbers are known."""
 
-import json
 import math
 import sys
 
@@ -103,15 +102,6 @@ def test_a_row_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
     ratio = float(cell(result, OTHER, "Ratio to DIST with mask").split()[0])
     assert ratio == pytest.approx(2 ** (2 / 3), rel=1e-2)  # where it fails it has the largest error of any row
     assert cell(result, OTHER, "Failed") == "6 of 18"
-
-
-def test_the_number_of_points_given_is_told(tmp_path):
-    for points, given in (("10%", 20), ("50", 50), ("dense", 200)):
-        folder = completed(tmp_path, REFERENCE, float(given), points=points)
-        record = json.loads((folder / "record.json").read_text())
-        record["evaluations"] = {"observed": given}
-        (folder / "record.json").write_text(json.dumps(record))
-    assert "Points given, medians: sofa 10% 20, dense 200." in told(made(tmp_path))
 
 
 def test_families_and_both_tasks_share_a_table(tmp_path):

@@ -54,34 +54,40 @@ def read(results):
     return choose(read_records(results)[0], TUNING, results)
 
 
-def test_the_best_is_chosen_on_validation_shapes(tmp_path):
-    drawn(tmp_path)
-    (method,) = tunings(read(tmp_path))
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The runs of one method without a failure, written once."""
+    results = tmp_path_factory.mktemp("whole")
+    drawn(results)
+    return read(results)
+
+
+def test_the_best_is_chosen_on_validation_shapes(whole):
+    (method,) = tunings(whole)
     assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
     assert method.best == 1  # the last draw is better on the test shapes
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
+    assert method.validation == pytest.approx(np.log(np.outer(VALIDATION, OWN[:6])))
 
 
 def test_what_families_differ_in_is_no_setting(tmp_path):
     for family in ("sofa", "plane"):
-        drawn(tmp_path, family=family)
+        drawn(tmp_path, family=family, shapes=1)
     (method,) = tunings(read(tmp_path))
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_the_expected_error_is_the_mean_over_all_choices_of_draws(tmp_path, k):
-    drawn(tmp_path)
-    (method,) = tunings(read(tmp_path))
+def test_the_expected_error_is_the_mean_over_all_choices_of_draws(whole, k):
+    (method,) = tunings(whole)
     chosen = [min(some, key=lambda draw: VALIDATION[draw]) for some in combinations(range(4), k)]
     expected = math.exp(np.mean([math.log(TEST[draw]) for draw in chosen]))
     assert len(method.expected(k)) == 6
     assert np.concatenate(method.expected(k)) == pytest.approx(np.multiply(expected, OWN[:6]))
 
 
-def test_the_page_has_a_column_per_budget(tmp_path):
-    drawn(tmp_path)
-    result = tuning.make(read(tmp_path))
+def test_the_page_has_a_column_per_budget(whole):
+    result = tuning.make(whole)
     budgets = ["Best of 1", "Best of 2", "Best of 4"]
     assert list(result.table.columns) == [
         *("Method", *budgets, "Best over one draw", "Evaluations of the best", "Failed")
@@ -182,7 +188,7 @@ def test_under_one_loss_a_failed_run_counts_before_errors(tmp_path):
 
 
 def test_one_setting_is_refused_where_methods_drew_settings_of_their_own(tmp_path):
-    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}}
+    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}, "shapes": 1}
     drawn(tmp_path, **errors)
     drawn(tmp_path, method="idr_mask", **errors)
     for path in tmp_path.glob("runs/*/record.json"):
