@@ -18,7 +18,7 @@ from bench.pictures.run_figures import LIGHT, normals_image, picture_normals
 from bench.records.files import leads_out
 from bench.records.record import read_record
 from datasets.mesh import Mesh, normalise
-from datasets.meshes import SUFFIXES, find_meshes, read_mesh
+from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import View, see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
@@ -33,6 +33,14 @@ ENDINGS = (".webp", ".gif")
 QUALITY = 90  # of WebP, of 100: at the usual 80 edges leave traces on the white of later frames
 TURN_MILLISECONDS = 3600
 SLACK = 1e-6  # of the unit sphere, since files round
+UPRIGHT = {  # rotations that make an axis the vertical one, y
+    "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+}
 
 
 def turned(truth: Truth, frames: int, size: int) -> Iterator[View]:
@@ -90,24 +98,6 @@ def _written(image: Float[np.ndarray, "fine_height fine_width 3"]) -> UInt8[np.n
     return (255 * image.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3))).round().astype(np.uint8)
 
 
-def read_surface(path: Path) -> Mesh:
-    """All triangles of a file, open or closed and not repaired, with the colours of its vertices.
-
-    Raises:
-        ValueError: the file is missing, empty, truncated or broken, or holds no surface.
-    """
-    import trimesh
-
-    (path,) = find_meshes(path)
-    try:
-        mesh = read_mesh(path)
-    except ValueError as error:
-        raise ValueError(f"mesh file '{path}': {error}") from None
-    visual = trimesh.load_mesh(path, process=False).visual
-    coloured = visual.kind in ("vertex", "face")  # textures are not read
-    return replace(mesh, colours=np.asarray(visual.vertex_colors)[:, :3] / 255) if coloured else mesh
-
-
 def mesh_of_run(folder: Path) -> Path:
     """The mesh of a run folder.
 
@@ -127,10 +117,11 @@ def mesh_of_run(folder: Path) -> Path:
     raise ValueError(f"{folder} has no mesh.ply: the run has no mesh ({why}); name another run, or a mesh file")
 
 
-def fitted(mesh: Mesh) -> Mesh:
-    """A mesh moved and scaled into the unit sphere, unless it lies in it."""
-    reach = np.linalg.norm(mesh.vertices[np.unique(mesh.faces)], axis=1).max()
-    return mesh if reach <= 1 + SLACK else normalise(mesh, 1.0)
+def stand(mesh: Mesh, up: str) -> Mesh:
+    """A mesh turned until the axis `up` is y, and moved and scaled into the unit sphere where it does not lie in it."""
+    turned = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
+    reach = np.linalg.norm(turned.vertices[np.unique(turned.faces)], axis=1).max()
+    return turned if reach <= 1 + SLACK else normalise(turned, 1.0)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -141,6 +132,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--into", type=Path, metavar="FILE", help=into)
     parser.add_argument("--frames", type=int, default=36, help="of the turn (default: %(default)s)")
     parser.add_argument("--size", type=int, default=256, help="pixels of each part's side (default: %(default)s)")
+    up = "the mesh's axis up, such as --up=-y (default: %(default)s)"
+    parser.add_argument("--up", choices=tuple(UPRIGHT), default="y", help=up)
     given = parser.parse_args(arguments)
     try:
         run = given.shape.is_dir()
@@ -151,8 +144,8 @@ def main(arguments: list[str] | None = None) -> int:
         for file in (into, given.shape / "mesh.ply"):
             if run and file.parent == given.shape and leads_out(file, given.shape):
                 raise ValueError(f"{file} is a link out of the run folder: remove it")
-        mesh = read_surface(mesh_of_run(given.shape) if run else given.shape)
-        frames = [Image.fromarray(frame) for frame in turntable(fitted(mesh), given.frames, given.size)]
+        mesh = read_mesh(mesh_of_run(given.shape) if run else given.shape)
+        frames = [Image.fromarray(frame) for frame in turntable(stand(mesh, given.up), given.frames, given.size)]
         into.parent.mkdir(parents=True, exist_ok=True)
         lasting = round(TURN_MILLISECONDS / given.frames)
         frames[0].save(into, save_all=True, append_images=frames[1:], duration=lasting, loop=0, quality=QUALITY)

@@ -175,34 +175,6 @@ def _car(p: SimpleNamespace) -> Shape:
     return (body | wheels).translate((0, -0.35, 0))
 
 
-def _sphere(p: SimpleNamespace) -> Shape:
-    return sphere(p.radius)
-
-
-def _ellipsoid(p: SimpleNamespace) -> Shape:
-    return sphere(1.0).stretch((p.half_x, p.half_y, p.half_z))
-
-
-def _box(p: SimpleNamespace) -> Shape:
-    return box((p.half_x, p.half_y, p.half_z))
-
-
-def _rounded_box(p: SimpleNamespace) -> Shape:
-    return rounded_box((p.half_x, p.half_y, p.half_z), p.rounding)
-
-
-def _capsule(p: SimpleNamespace) -> Shape:
-    return capsule((0, -p.length / 2, 0), (0, p.length / 2, 0), p.radius)
-
-
-def _cylinder(p: SimpleNamespace) -> Shape:
-    return cylinder(p.radius, p.half_height)
-
-
-def _torus(p: SimpleNamespace) -> Shape:
-    return torus(p.major, p.minor)
-
-
 def _union(p: SimpleNamespace) -> Shape:
     left = box((p.half_x, p.half_y, p.half_z)).translate((-p.apart, 0, 0))
     right = sphere(p.radius).translate((p.apart, 0, 0))
@@ -212,13 +184,13 @@ def _union(p: SimpleNamespace) -> Shape:
 Builder = Callable[[SimpleNamespace], Shape]
 FAMILIES: dict[str, Builder] = {"sofa": _sofa, "plane": _plane, "table": _table, "car": _car}  # priors are shipped
 PRIMITIVES: dict[str, Builder] = {
-    "sphere": _sphere,
-    "ellipsoid": _ellipsoid,
-    "box": _box,
-    "rounded_box": _rounded_box,
-    "capsule": _capsule,
-    "cylinder": _cylinder,
-    "torus": _torus,
+    "sphere": lambda p: sphere(p.radius),
+    "ellipsoid": lambda p: sphere(1.0).stretch((p.half_x, p.half_y, p.half_z)),
+    "box": lambda p: box((p.half_x, p.half_y, p.half_z)),
+    "rounded_box": lambda p: rounded_box((p.half_x, p.half_y, p.half_z), p.rounding),
+    "capsule": lambda p: capsule((0, -p.length / 2, 0), (0, p.length / 2, 0), p.radius),
+    "cylinder": lambda p: cylinder(p.radius, p.half_height),
+    "torus": lambda p: torus(p.major, p.minor),
     "union": _union,
 }
 BUILDERS = FAMILIES | PRIMITIVES

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datasets.dataset import Split
 from datasets.mesh import Mesh, fit_in_sphere, normalise
-from datasets.meshes import READ_ERRORS, check_whole, load_mesh
+from datasets.meshes import READ_ERRORS, check_counts, load_mesh
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
 from datasets.truth import Truth, sample_surface
 from renderers.checks import BadInput, check_share
@@ -60,8 +60,9 @@ class Scan:
         import trimesh
 
         try:
-            check_whole(self.file)
-            points = np.asarray(getattr(trimesh.load(self.file, process=False), "vertices", ()))
+            read = trimesh.load(self.file, process=False)
+            points = np.asarray(getattr(read, "vertices", ()))
+            check_counts(self.file, len(points), len(getattr(read, "faces", ())))
         except READ_ERRORS as error:
             raise BadInput(f"scan '{self.file}': must be a whole .ply file ({error}); copy it again") from None
         if len(points) < 3 or not np.isfinite(points).all():

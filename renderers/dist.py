@@ -9,10 +9,10 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind, steepest
+from renderers.field import Field, steepest
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
-from renderers.rendering import Capabilities, Rendering
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
 from renderers.silhouette import Hinge
 
 
@@ -60,9 +60,7 @@ class DIST:
     silhouette_signed: bool
     silhouette_average: str
 
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
+    capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")

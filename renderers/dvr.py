@@ -10,9 +10,9 @@ from torch import Tensor
 from renderers.bracket import BLOCK, REFINEMENTS, first_crossing, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind
+from renderers.field import Field
 from renderers.gradients import fixed_samples, implicit
-from renderers.rendering import Capabilities, Observed, Rendering, Status, assemble
+from renderers.rendering import OF_LEVELS, Capabilities, Observed, Rendering, Status, assemble
 from renderers.silhouette import PLACES, Occupancy
 
 
@@ -55,7 +55,7 @@ class DVR:
     occupied_at: str
     sphere_radius: float
 
-    capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
+    capabilities: ClassVar[Capabilities] = OF_LEVELS
 
     def __post_init__(self) -> None:
         check_at_least("n_ray_samples", self.n_ray_samples, 2, "the paper uses 16 to 128")
@@ -73,10 +73,6 @@ class DVR:
         """The renderer of an iteration: n is halved for each doubling that is still to come (Sec. 3.5)."""
         to_come = sum(iteration < doubling for doubling in self.doublings)
         return replace(self, n_ray_samples=max(self.n_ray_samples // 2**to_come, 2))
-
-    def with_samples(self, samples: int) -> "DVR":
-        """The renderer with another n at every iteration, without doublings."""
-        return replace(self, n_ray_samples=samples, doublings=())
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Searches without a graph, then attaches the implicit gradient to the hits."""

@@ -13,8 +13,8 @@ from torch import Tensor
 from renderers.bracket import BLOCK
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least
-from renderers.field import Field, Kind, carries_gradient
-from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.field import Field, carries_gradient
+from renderers.rendering import OF_LEVELS, Capabilities, Rendering, Status, assemble
 from renderers.silhouette import SurfaceRenderer
 
 OUTSIDE = 1.0  # value that stands for one that is not finite, of a grid point
@@ -43,7 +43,7 @@ class MeshProxy(SurfaceRenderer):
     grid: int
     ray_samples: int
 
-    capabilities: ClassVar[Capabilities] = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
+    capabilities: ClassVar[Capabilities] = OF_LEVELS
 
     def __post_init__(self) -> None:
         super().__post_init__()

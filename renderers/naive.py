@@ -9,10 +9,10 @@ from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind
+from renderers.field import Field
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march
-from renderers.rendering import Capabilities, Rendering, Status, assemble
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, Status, assemble
 from renderers.silhouette import Hinge
 
 
@@ -49,9 +49,7 @@ class Naive:
     silhouette_signed: bool
     silhouette_average: str
 
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
+    capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_choice, check_positive
-from renderers.field import Field, Kind
-from renderers.rendering import Capabilities, Rendering
+from renderers.field import Field
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
 from renderers.silhouette import Hinge
 from renderers.tracer import Tracer
 from renderers.warm import Memory, warm_trace
@@ -63,9 +63,7 @@ class Newton:
     memory: Memory = field(default_factory=Memory, repr=False, compare=False)
     remembers: bool = False
 
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
+    capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
     def __post_init__(self) -> None:
         _ = self.tracer  # which checks its settings

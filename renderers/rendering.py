@@ -106,6 +106,10 @@ class Capabilities:
     ray_gradient: bool
 
 
+OF_LENGTHS = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True)
+OF_LEVELS = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
+
+
 @dataclass(frozen=True)
 class Observed:
     """What is observed of rays: a mask, and distances where they are given.
@@ -172,20 +176,6 @@ class Guided(Protocol):
 
     def observed_loss(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
         """The method's own loss between its rendering, and a mask and the distances that are given."""
-        ...
-
-
-@runtime_checkable
-class Spaced(Renderer, Protocol):
-    """A renderer that searches among equally spaced samples of the field, from where a ray enters a sphere to its exit.
-
-    What is thinner along a ray than their spacing, at most 2 R / (n - 1) for n of them and the radius R, may be missed.
-    """
-
-    sphere_radius: float
-
-    def with_samples(self, samples: int) -> "Spaced":
-        """The renderer with that many samples per ray, at every iteration."""
         ...
 
 

@@ -17,8 +17,8 @@ from torch.nn.functional import softplus
 from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, Kind, occupancy_logits
-from renderers.rendering import Capabilities, Observed, Renderer, Rendering, closest_values
+from renderers.field import Field, occupancy_logits
+from renderers.rendering import OF_LENGTHS, Capabilities, Observed, Renderer, Rendering, closest_values
 
 RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
 PLACES = (RANDOM, DEPTH)
@@ -165,9 +165,7 @@ class SurfaceRenderer(ABC):
     mask_weight: float
     sphere_radius: float
 
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
+    capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
     def __post_init__(self) -> None:
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")

@@ -9,8 +9,9 @@ from matplotlib import colormaps
 from PIL import Image
 
 from bench.records.record import Record
-from bench.turntable import fitted, main, read_surface, turntable
+from bench.turntable import UPRIGHT, main, stand, turntable
 from datasets.mesh import Mesh
+from datasets.meshes import read_mesh
 
 SIZE = 32
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -112,8 +113,8 @@ def test_a_run_folder_gets_its_turntable_and_a_mesh_file_one_in_the_current_fold
 
 def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
     inside, outside = ball(0.3, at=(0.5, 0, 0)), ball(0.3, at=(0.8, 0, 0))
-    assert np.array_equal(fitted(inside).vertices, inside.vertices)
-    moved = fitted(outside).vertices
+    assert np.array_equal(stand(inside, "y").vertices, inside.vertices)
+    moved = stand(outside, "y").vertices
     assert np.linalg.norm(moved, axis=1).max() == pytest.approx(1)
     assert moved.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
 
@@ -124,20 +125,26 @@ def test_every_kind_of_file_is_read_with_its_colours(tmp_path, suffix):
     rgba = (255 * np.hstack([mesh.colours, np.ones((len(mesh.vertices), 1))])).astype(np.uint8)
     path = tmp_path / f"ball.{suffix}"
     trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgba, process=False).export(path)
-    read = read_surface(path)
+    read = read_mesh(path)
     assert read.repairs == () and len(read.faces) == len(mesh.faces)
-    if suffix == "stl":  # of which trimesh reads none
+    if suffix in ("stl", "off"):  # of which trimesh reads none
         assert read.colours is None
     else:
         assert read.colours == pytest.approx(np.where(read.vertices[:, [0]] < 0, RED, BLUE))
 
 
-def test_parts_of_a_scene_are_joined(tmp_path):
+def test_colours_of_vertices_beside_a_texture_are_read(tmp_path):
+    corners = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 0 0 1\n"
+    (tmp_path / "a.obj").write_text(f"{corners}vt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
+    assert read_mesh(tmp_path / "a.obj").colours == pytest.approx(np.stack([RED, RED, BLUE]))
+
+
+def test_parts_of_a_scene_are_joined_and_those_without_colours_are_grey(tmp_path):
     mesh, plain = ball(), ball(0.1)
     painted = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=[255, 0, 0, 255], process=False)
     bare = trimesh.Trimesh(plain.vertices, plain.faces, process=False)
     trimesh.Scene({"a": painted, "b": bare}).export(tmp_path / "two.glb")
-    read = read_surface(tmp_path / "two.glb")
+    read = read_mesh(tmp_path / "two.glb")
     assert len(read.faces) == 2 * len(mesh.faces)
     outer = np.linalg.norm(read.vertices, axis=1) > 0.5
     assert read.colours is not None and outer.sum() == len(mesh.vertices)
@@ -153,9 +160,10 @@ ERRORS = (
     (["nothing.ply"], "found nothing at"),
     (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
     (["broken.ply"], "broken.ply': must be a whole .ply file, but reading failed"),
+    (["cut.ply"], "cut.ply': must be a whole .ply file"),
     (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
-    (["points.ply"], "points.ply': must have faces, found none"),
-    (["line.ply"], "line.ply': must have an area, found 0"),
+    (["points.ply"], "points.ply': must have faces, found none: "),
+    (["line.ply"], "line.ply': must have an area, found 0 in a box"),
     (["dust.ply"], "must be large enough to be seen, found 3.46e-06 across; scale it to 1"),
     (["ball.ply", "--into", "new/a.mp4"], "must end in .webp or .gif, found 'new/a.mp4'; type --into new/a.webp"),
     (["ball.ply", "--frames", "1"], "--frames must be 2 to 720, found 1; 36 is a good number"),

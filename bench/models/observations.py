@@ -17,7 +17,6 @@ from bench.solve.observed_view import GivenView, Weights
 from datasets.scene import see
 from datasets.truth import Truth
 from datasets.views import ViewSampler
-from renderers.adaptive_samples import at_max_samples
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import BadInput
 from renderers.field import Field
@@ -82,7 +81,7 @@ class RayObservations:
 
     def error(self, field: Field) -> HeldOutError:
         """The error of a field on the held-out rays."""
-        return self.held_out.error(field, at_max_samples(self.renderer))
+        return self.held_out.error(field, self.renderer)
 
     def depth_error(self, terms: Terms) -> float:
         """The mean depth error; a silhouette loss is a length for some renderers only, so it is left out."""

@@ -10,7 +10,6 @@ from bench.models.fit import Fitted, Fitter
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence
 from bench.models.observations import Views
-from renderers.adaptive_samples import at_max_samples
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.checks import check_at_least
@@ -85,8 +84,7 @@ class Study:
     def check(self, chosen: Fitted, views: Views, settings: CheckSettings) -> dict[str, float]:
         """The share of random draws of further views on which the choice holds; see `shares`."""
         observations, further = self.fitter.observations, views.further(settings.views, self.fitter.seed)
-        renderer = at_max_samples(observations.renderer)
-        errors = {fitted: further.error(fitted.model.frozen(), renderer) for fitted in self._succeeded}
+        errors = {fitted: further.error(fitted.model.frozen(), observations.renderer) for fitted in self._succeeded}
         footprint, seed = observations.footprint, self.fitter.seed
         return shares(errors[chosen], list(errors.values()), settings, footprint=footprint, seed=seed)
 
@@ -109,7 +107,7 @@ class Study:
         """Evaluations for rendering rays with either renderer, and the hits that only one of them has."""
         plain, shape, counts = self.fitter.observations.renderer, fitted.model.frozen(), (Counts(), Counts())
         hits = [
-            rendered(at_max_samples(renderer), Meter(shape, count), rays).hit
+            rendered(renderer, Meter(shape, count), rays).hit
             for renderer, count in zip((plain, self.pixel_precise), counts, strict=True)
         ]
         lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())

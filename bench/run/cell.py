@@ -11,7 +11,7 @@ import torch
 from bench.config import EvaluationSettings, build_once
 from bench.machine.environment import pick_device, using_threads
 from bench.progress import Report
-from bench.setup.auto import AUTO, Node, at_pixel_precision, resolved
+from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior, PriorSettings
@@ -21,7 +21,6 @@ from datasets.dataset import Dataset, Split
 from datasets.own_photographs import Photographed
 from datasets.scene import make_scene, scene_name
 from datasets.views import ViewSampler
-from renderers.adaptive_samples import follow
 from renderers.rendering import Renderer
 
 WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
@@ -119,13 +118,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None) -> Cell:
             raise ValueError(
                 f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
             )
-        if requested.get("n_ray_samples") != AUTO:
-            return made, notes
-        if config["stress"] is not None:
-            raise ValueError(
-                "renderer.n_ray_samples=auto follows one optimisation, and a stress has many trials: give a number"
-            )
-        return follow(made), notes
+        return made, notes
 
     noted = renderer(config["renderer"])
     task, dataset, evaluation, prior, models = build_once(

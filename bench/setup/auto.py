@@ -1,16 +1,14 @@
 """Settings of a renderer with the value `auto`: the precision of a pixel, and the number of steps that it takes.
 
-Each follows by an equation from the view and the renderer's other settings: `renderer.epsilon=auto`. The number of
-samples per ray follows from the shape and changes during an optimisation: see `renderers.adaptive_samples`.
+Each follows by an equation from the view and the renderer's other settings: `renderer.epsilon=auto`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import ceil, inf, isnan, log, radians, sin
+from math import ceil, isnan, log, radians, sin
 from typing import Any
 
 from datasets.views import ViewSampler
-from renderers.adaptive_samples import samples
 from renderers.checks import check_positive, check_share
 
 AUTO = "auto"
@@ -100,23 +98,12 @@ def rays_share(least: float, footprint: float, error: float) -> float:
     return min(max((footprint / max(error, footprint)) ** 2, least), 1.0)
 
 
-def first_samples(view: ViewSampler, renderer: Node, settings: AutoSettings) -> int:
-    """The number of samples per ray before any part of the shape has been seen."""
-    return samples(inf, RADIUS)
-
-
-FORMULAS: dict[str, Callable[[ViewSampler, Node, AutoSettings], Any]] = {
-    "epsilon": epsilon,
-    "steps": steps,
-    "n_ray_samples": first_samples,
-}
-PIXEL_PRECISION = ("epsilon", "steps")  # that follow from the camera alone
+FORMULAS: dict[str, Callable[[ViewSampler, Node, AutoSettings], Any]] = {"epsilon": epsilon, "steps": steps}
 LIMITED = {  # what a value holds for
     "epsilon": ", with at most {0.spurious:.0%} spurious hits around outlines (auto.spurious) of true distances whose "
     "area over perimeter is {0.area_over_perimeter:g} or more (auto.area_over_perimeter)",
     "steps": ", for surfaces met at {0.grazing:g} degrees or more (auto.grazing)",
 }
-CHANGING = {"n_ray_samples": ("begins with", "and follows the thinnest part that is seen")}  # during an optimisation
 
 
 def resolved(renderer: Node, view: ViewSampler, settings: AutoSettings) -> tuple[Node, list[str]]:
@@ -133,14 +120,12 @@ def resolved(renderer: Node, view: ViewSampler, settings: AutoSettings) -> tuple
     node, notes = dict(renderer), []
     for name in [name for name in FORMULAS if name in requested]:
         node[name] = FORMULAS[name](view, node, settings)
-        seen = f"for {view.resolution} pixels from {view.distance:g} away (view)"
-        seen += LIMITED[name].format(settings) if name in LIMITED else ""
-        verb, reason = CHANGING.get(name, ("is", seen))
-        notes.append(f"renderer.{name}=auto {verb} {node[name]:.4g}, {reason}")
+        seen = f"for {view.resolution} pixels from {view.distance:g} away (view){LIMITED[name].format(settings)}"
+        notes.append(f"renderer.{name}=auto is {node[name]:.4g}, {seen}")
     return node, notes
 
 
 def at_pixel_precision(renderer: Node) -> Node:
-    """The renderer's node with `auto` for its settings in `PIXEL_PRECISION`; unchanged where it has no epsilon."""
-    names = [name for name in PIXEL_PRECISION if name in renderer and "epsilon" in renderer]
+    """The renderer's node with `auto` for its settings in `FORMULAS`; unchanged where it has no epsilon."""
+    names = [name for name in FORMULAS if name in renderer and "epsilon" in renderer]
     return {**renderer, **dict.fromkeys(names, AUTO)}

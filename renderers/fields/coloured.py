@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Flops, Kind, occupancy_field
+from renderers.field import Field, Flops, Kind
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import CHUNK
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
@@ -20,7 +20,6 @@ SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second de
 AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
 DIRECTION_OCTAVES = 2  # of the encoding of view directions
 LOGIT_WIDTH = 0.1  # scene units over which a logit of occupancy changes by 1 at its start
-THRESHOLD = 0.5  # of occupancy: DVR's tau
 COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size of those of distances
 Vectors = Float[Tensor, "*batch 3"]
 
@@ -58,6 +57,9 @@ class ColouredDistance(nn.Module):
         directional: whether colours depend on the view direction.
     """
 
+    kind: ClassVar[Kind] = Kind.DISTANCE
+    lipschitz: ClassVar[None] = None
+
     def __init__(self, *, layers: int, width: int, octaves: int, radius: float, directional: bool) -> None:
         super().__init__()
         check_at_least("layers", layers, 1, "4 suit one shape")
@@ -84,12 +86,26 @@ class ColouredDistance(nn.Module):
         self.last.weight.normal_(sqrt(pi / self.last.in_features), 1e-4)
         self.last.bias.zero_()
         around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
-        self.last.bias.fill_(-self.field(around).mean())  # softplus is a little more than a ReLU
+        self.last.bias.fill_(-self(around).mean())  # softplus is a little more than a ReLU
 
     @property
-    def field(self) -> "DistanceOf":
-        """The distance at the current weights."""
-        return DistanceOf(self)
+    def field(self) -> "ColouredDistance":
+        """Itself; near enough to a distance where an eikonal term keeps it so."""
+        return self
+
+    @property
+    def flops(self) -> Flops:
+        """A multiplication and an addition per weight; as much again towards points, twice with weights."""
+        layers = nn.ModuleList([*self.hidden, self.last])
+        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
+        learnt = any(weight.requires_grad for weight in layers.parameters())
+        return Flops(value, 2 * value if learnt else value)
+
+    def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The distances."""
+        flat = points.reshape(-1, 3)
+        chunks = [flat] if torch.is_grad_enabled() else flat.split(CHUNK)
+        return torch.cat([self.last(self._hidden(chunk)) for chunk in chunks]).view(points.shape[:-1])
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`; directions are unused unless `directional`."""
@@ -105,33 +121,6 @@ class ColouredDistance(nn.Module):
         for layer in self.hidden:
             features = softplus(layer(features), beta=SHARPNESS)
         return features
-
-
-@dataclass(frozen=True)
-class DistanceOf:
-    """The distance of a `ColouredDistance`: a Field near enough to a distance where an eikonal term keeps it so."""
-
-    network: ColouredDistance
-    kind: Kind = Kind.DISTANCE
-    lipschitz: float | None = None
-
-    @property
-    def flops(self) -> Flops:
-        """A multiplication and an addition per weight; as much again towards points, twice with weights."""
-        layers = nn.ModuleList([*self.network.hidden, self.network.last])
-        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
-        learnt = any(weight.requires_grad for weight in layers.parameters())
-        return Flops(value, 2 * value if learnt else value)
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        flat = points.reshape(-1, 3)
-        chunks = [flat] if torch.is_grad_enabled() else flat.split(CHUNK)
-        values = [self.network.last(self.network._hidden(chunk)) for chunk in chunks]
-        return torch.cat(values).view(points.shape[:-1])
-
-    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        """See `Coloured`."""
-        return self.network.colours(points, normals, directions)
 
 
 class ColouredOccupancy(nn.Module):
@@ -181,7 +170,7 @@ def begin_as_sphere(network: OccupancyNetwork, radius: float) -> None:
 
 @dataclass(frozen=True)
 class OccupancyOf:
-    """The level set p = 1/2 of an occupancy network at one code (DVR, Sec. 3.1)."""
+    """The level set p = 1/2 of an occupancy network at one code (DVR, Sec. 3.1, with tau = 1/2)."""
 
     bound: BoundOccupancy
 
@@ -194,7 +183,7 @@ class OccupancyOf:
         return self.bound.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return occupancy_field(self.bound.logits, THRESHOLD)(points)
+        return -self.bound.logits(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
@@ -220,6 +209,10 @@ class ColouredGrid(nn.Module):
         reach: half the cube's side, in scene units.
     """
 
+    kind: ClassVar[Kind] = Kind.DISTANCE
+    lipschitz: ClassVar[None] = None
+    flops: ClassVar[Flops] = FLOPS
+
     def __init__(self, *, samples: int, radius: float, reach: float) -> None:
         super().__init__()
         check_at_least("samples", samples, 2, "48 suit one shape")
@@ -231,30 +224,18 @@ class ColouredGrid(nn.Module):
         self.reach = reach
 
     @property
-    def field(self) -> "GridOf":
-        """The distance at the current values."""
-        return GridOf(self)
+    def field(self) -> "ColouredGrid":
+        """Itself."""
+        return self
 
-
-@dataclass(frozen=True)
-class GridOf:
-    """The distance of a `ColouredGrid`."""
-
-    grid: ColouredGrid
-
-    kind: ClassVar[Kind] = Kind.DISTANCE
-    lipschitz: ClassVar[None] = None
-    flops: ClassVar[Flops] = FLOPS
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return Grid(self.grid.distances, self.grid.reach)(points)
+    def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The distances."""
+        return Grid(self.distances, self.reach)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""
-        places = (points.flip(-1) / self.grid.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
-        sampled = torch.nn.functional.grid_sample(
-            self.grid.logits[None], places, padding_mode="border", align_corners=True
-        )
+        places = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
+        sampled = torch.nn.functional.grid_sample(self.logits[None], places, padding_mode="border", align_corners=True)
         return torch.sigmoid(COLOUR_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
 
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from renderers.bracket import BLOCK
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Kind, carries_gradient
+from renderers.field import Field, carries_gradient
 from renderers.gradients import fixed_samples
-from renderers.rendering import Capabilities, Deferred, Rendering, Status, Volume, assemble
+from renderers.rendering import OF_LENGTHS, Capabilities, Deferred, Rendering, Status, Volume, assemble
 
 FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
 SEEN = 0.5  # opacity above which a ray has hit
@@ -151,9 +151,7 @@ class VolumeRenderer(ABC):
     mask_weight: float
     sphere_radius: float
 
-    capabilities: ClassVar[Capabilities] = Capabilities(
-        needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True
-    )
+    capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
     def __post_init__(self) -> None:
         check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")

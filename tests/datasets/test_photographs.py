@@ -11,7 +11,6 @@ import trimesh
 from bench.tasks.multiview import sample
 from datasets.mesh import Mesh
 from datasets.photographs import HIGHEST, Photography, around, turned
-from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
 from datasets.truth import Truth
 from tests.looped import each
@@ -47,16 +46,11 @@ def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
     assert colours.shape == (300, 3)
     assert colours.min() >= 0 and colours.max() <= 1
     assert np.array_equal(colours, make_texture(name, 0.5, seed=3)(points, normals))
+    other = make_texture(name, 0.5, seed=4)(points, normals)
+    assert (np.abs(other - colours).mean() > 0.1) == (name in ("noise", "painted"))
     nearby = texture(points + 1e-5, normals)
     assert np.abs(nearby - colours).max() < 0.02  # no jump
     assert (colours.std(axis=0).max() > 0.05) == (name not in ONE_COLOUR)
-
-
-@each("name", ["noise", "painted"])
-def test_each_seed_has_colours_of_its_own(name):
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    first, second = (make_texture(name, 0.3, seed)(points, points) for seed in (0, 1))
-    assert np.abs(first - second).mean() > 0.1
 
 
 def test_each_axis_sees_its_own_projection():
@@ -71,14 +65,15 @@ def test_cameras_stand_on_a_circle_and_look_at_the_origin():
     quarter = turned(CAMERA, pi / 2)
     assert quarter.center.norm().item() == pytest.approx(2.5, rel=1e-5)
     assert quarter.center[1].item() == pytest.approx(CAMERA.center[1].item(), abs=1e-5)
-    assert (quarter.center @ CAMERA.center - CAMERA.center[1] ** 2).item() == pytest.approx(0.0, abs=1e-4)
+    before = CAMERA.center
+    torch.testing.assert_close(quarter.center, torch.stack([-before[2], before[1], before[0]]), atol=1e-5, rtol=0)
     pixels, _ = quarter.project(torch.zeros(1, 3))
     assert pixels[0].tolist() == pytest.approx([16.0, 16.0], abs=1e-3)
     four = turned(turned(turned(quarter, pi / 2), pi / 2), pi / 2)
     assert torch.allclose(four.world_to_camera, CAMERA.world_to_camera, atol=1e-5)
 
 
-@each("count", [2, 7, 40])
+@each("count", [7, 40])
 def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
     cameras = around(CAMERA, count)
     centres = torch.stack([camera.center for camera in cameras])
@@ -95,7 +90,7 @@ def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
     apart = torch.cdist(centres, centres) + 9 * torch.eye(count)
     assert apart.min() > 2.5 * 1.5 / count**0.5  # evenly spaced, no two close to each other
     sides = {(bool(x > 0), bool(z > 0)) for x, _, z in centres.tolist()}
-    assert len(sides) == min(count, 4) or count < 7
+    assert len(sides) == 4
 
 
 def test_an_arc_is_of_one_side_with_the_first_camera_in_its_middle(ball):
@@ -106,16 +101,6 @@ def test_an_arc_is_of_one_side_with_the_first_camera_in_its_middle(ball):
     angles = torch.rad2deg(torch.arccos((flat @ flat[2]).clamp(-1, 1)))
     assert angles.tolist() == pytest.approx([45, 22.5, 0, 22.5, 45], abs=0.1)
     assert (flat[0] @ flat[4]).item() == pytest.approx(0, abs=1e-5)
-
-
-def test_places_choose_between_a_circle_and_all_around(ball):
-    circle, sphere = (replace(PLAINLY, places=places).take(ball, CAMERA, seed=0) for places in ("circle", "sphere"))
-    assert len(circle) == len(sphere) == 8
-    assert np.ptp([shot.camera.center[1].item() for shot in circle]) < 1e-4
-    assert np.ptp([shot.camera.center[1].item() for shot in sphere]) > 3.0
-    assert torch.equal(circle[0].camera.world_to_camera, CAMERA.world_to_camera)
-    with pytest.raises(ValueError, match="places must be one of circle, arc, sphere"):
-        replace(PLAINLY, places="cube")
 
 
 @each("texture", ["noise", "astronaut"])
@@ -162,12 +147,6 @@ def test_lambertian_light_is_fixed(ball):
     assert min(part.min() for part in inner) > 0.38 * max(part.max() for part in inner)  # which is not black
 
 
-def test_a_camera_turns_from_z_to_minus_x():
-    before, after = (camera.center.double() for camera in (CAMERA, turned(CAMERA, pi / 2)))
-    expected = torch.stack([-before[2], before[1], before[0]])
-    torch.testing.assert_close(after, expected, atol=1e-5, rtol=0)
-
-
 def test_a_surface_of_one_colour_is_refused(ball):
     with pytest.raises(ValueError, match=r"has nothing to compare: set shading=lambertian"):
         replace(PLAINLY, texture="plain")
@@ -185,20 +164,11 @@ def test_a_camera_that_sees_nothing_is_refused(ball):
     "changed, message",
     [
         ({"views": 1}, "views must be at least 2"),
-        ({"texture": "wood"}, "texture must be one of noise, painted, plain"),
+        ({"places": "cube"}, "places must be one of circle, arc, sphere"),
         ({"texture_size": 0.0}, "texture_size must be positive"),
-        ({"shading": "pbr"}, "shading must be one of"),
-        ({"background": "sky"}, "background must be one of"),
-        ({"noise": -0.1}, "noise must be at least 0"),
         ({"blur": float("nan")}, "blur must be at least 0"),
     ],
 )
 def test_invalid_settings_are_errors(changed, message):
     with pytest.raises(ValueError, match=message):
         replace(PLAINLY, **changed)
-
-
-def test_images_have_the_size_of_their_camera(ball):
-    first = PLAINLY.take(ball, CAMERA, seed=0)[0]
-    with pytest.raises(ValueError, match=r"colours must have the camera's size, \(32, 32\), not \(16, 32\)"):
-        Shot("0", first.camera, first.colours[:16], None)

@@ -43,19 +43,7 @@ def test_axes_are_x_right_y_down_z_forward_with_pixel_centres_at_a_half():
     assert rays.directions[19:21, 31:33].sum((0, 1))[:2].tolist() == pytest.approx([0, 0])
 
 
-def test_the_camera_centre_follows_from_its_motion():
-    # The camera is 3 behind the origin on z and turned by half a turn about y: it looks along -z, its right is -x.
-    turned = torch.diag(vector((-1, 1, -1, 1)))
-    turned[:3, 3] = vector((0, 0, 3))
-    view = camera(turned)
-    assert view.center.tolist() == [0, 0, 3]
-    ray = view.rays().directions[19, 63]  # to the right of the middle
-    assert ray[0] < 0
-    assert ray[2] < 0
-    torch.testing.assert_close(view.camera_to_world @ turned, torch.eye(4, dtype=torch.float64))
-
-
-@settings(max_examples=20)
+@settings(max_examples=5)
 @given(
     angle=st.floats(-pi, pi),
     translation=st.tuples(*[st.floats(-3, 3)] * 3),
@@ -74,13 +62,6 @@ def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_
     assert torch.equal(rays.origins, view.center.expand(40, 64, 3))
 
 
-@each("dtype", [torch.float32, torch.float64])
-def test_dtype_comes_from_the_matrices(dtype):
-    view = Camera(INTRINSICS.to(dtype), motion(0.3, (0, 0, 2)).to(dtype), 3, 5)
-    rays = view.rays()
-    assert rays.origins.dtype == rays.directions.dtype == view.depth(torch.ones(3, 5, dtype=dtype)).dtype == dtype
-
-
 def test_gradients_reach_intrinsics_and_extrinsics():
     def project(intrinsics: torch.Tensor, translation: torch.Tensor) -> tuple[torch.Tensor, ...]:
         # The motion is made from its translation and from its intrinsics, so that it stays rigid under gradcheck.
@@ -94,15 +75,8 @@ def test_gradients_reach_intrinsics_and_extrinsics():
     translation = vector((0.1, -0.2, 2)).requires_grad_(True)
     assert torch.autograd.gradcheck(project, (intrinsics, translation))
 
-    angle = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    turned = torch.eye(4, dtype=torch.float64)
-    turned[0, 0], turned[0, 2], turned[2, 0], turned[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
-    bearing = Camera(INTRINSICS, turned, 40, 64).rays().directions[20, 32]
-    heading = torch.atan2(bearing[0], bearing[2])  # turns with the camera, the other way round
-    assert torch.autograd.grad(heading, angle)[0].item() == pytest.approx(-1, abs=1e-3)
 
-
-@each("row, column, value", [(0, 0, 0.0), (1, 1, 0.0), (1, 1, -50.0), (0, 0, float("nan")), (0, 2, float("inf"))])
+@each("row, column, value", [(0, 0, 0.0), (1, 1, -50.0), (0, 2, float("inf"))])
 def test_intrinsics_that_are_none_are_refused(row, column, value):
     intrinsics = INTRINSICS.clone()
     intrinsics[row, column] = value
@@ -115,9 +89,7 @@ def test_intrinsics_that_are_none_are_refused(row, column, value):
     [
         2 * torch.eye(3),  # a scale
         torch.diag(torch.tensor([1.0, 1, -1])),  # a mirror
-        torch.zeros(3, 3),
         torch.eye(3) + 0.01 * torch.ones(3, 3),
-        torch.full((3, 3), float("nan")),
     ],
 )
 def test_a_motion_that_is_not_rigid_is_refused(rotation):
@@ -125,12 +97,8 @@ def test_a_motion_that_is_not_rigid_is_refused(rotation):
     matrix[:3, :3] = rotation
     with pytest.raises(ValueError, match="world_to_camera must"):
         camera(matrix)
-
-
-@each("value", [float("nan"), float("inf")])
-def test_a_camera_that_is_nowhere_is_refused(value):
-    with pytest.raises(ValueError, match="world_to_camera must"):
-        camera(motion(0.0, (0, value, 0)))
+    with pytest.raises(ValueError, match="world_to_camera must hold finite"):
+        camera(motion(0.0, (0, float("nan"), 0)))
 
 
 def test_a_camera_of_no_pixels_or_of_other_shapes_is_refused():
@@ -152,13 +120,9 @@ def test_rays_of_other_shapes_or_lengths_are_refused():
     for scale in (2.0, 0.5, 0.0, float("nan")):
         with pytest.raises(ValueError, match="directions must have unit length"):
             Rays(torch.zeros(2, 3), torch.stack([ahead, scale * ahead]))
-    Rays(torch.zeros(0, 3), torch.zeros(0, 3))  # no rays are fine
-
-
-@each("value", [float("nan"), float("inf")])
-def test_rays_from_nowhere_are_refused(value):
     with pytest.raises(ValueError, match="origins"):
-        Rays(vector((0, value, 0)), vector((0, 0, 1)))
+        Rays(vector((0, float("inf"), 0)), ahead)
+    Rays(torch.zeros(0, 3), torch.zeros(0, 3))  # no rays are fine
 
 
 def test_parts_of_rays():
@@ -196,23 +160,6 @@ def test_blocks_over_the_edge_repeat_the_edge():
     assert parallel(1, 1).coarser(4).origins[..., :2].tolist() == [[[0.5, 0.5]]]
 
 
-@each("shape", [(), (2,), (2, 3), (0,)])
-def test_leading_dimensions_of_images_are_kept(shape):
-    sheet = parallel(6, 5)
-    many = Rays(*(part.expand(*shape, 6, 5, 3) for part in (sheet.origins, sheet.directions)), image=True)
-    coarse = many.coarser(2)
-    assert coarse.shape == (*shape, 3, 3)
-    assert torch.equal(coarse.origins, sheet.coarser(2).origins.expand(*shape, 3, 3, 3))
-
-
-def test_coarser_rays_of_a_pinhole_keep_its_centre_and_meet_the_middle_of_the_block():
-    view = Camera(INTRINSICS, motion(0.3, (0, 0, 2)), 8, 8)
-    coarse = view.rays().coarser(4)
-    torch.testing.assert_close(coarse.origins, view.center.expand(2, 2, 3), rtol=0, atol=1e-14)
-    half = Camera(torch.diag(vector((0.25, 0.25, 1))) @ INTRINSICS, motion(0.3, (0, 0, 2)), 2, 2).rays()
-    torch.testing.assert_close(coarse.directions, half.directions, rtol=0, atol=3e-4)  # a pixel is 1e-2 wide
-
-
 def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     return Rays(vector(origin), torch.nn.functional.normalize(vector(direction), dim=0))
 
@@ -240,7 +187,7 @@ def test_spans_of_the_sphere_by_closed_form(origin, direction, radius, entry, le
     assert found_entry >= 0
 
 
-@settings(max_examples=20)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 2**32), radius=st.floats(0.1, 2))
 def test_a_span_ends_on_the_sphere_or_begins_at_the_origin(seed, radius):
     generator = torch.Generator().manual_seed(seed)
@@ -262,12 +209,6 @@ def test_a_span_ends_on_the_sphere_or_begins_at_the_origin(seed, radius):
     assert (least >= sampled - 4e-3).all()  # the samples' spacing
 
 
-def test_the_distance_to_the_origin_is_that_of_a_half_line():
-    assert distance_to_origin(ray((0.5, 0, -3), (0, 0, 1))).item() == pytest.approx(0.5)
-    assert distance_to_origin(ray((3, 0, 4), (0, 0, 1))).item() == pytest.approx(5)  # the origin lies behind
-    assert distance_to_origin(ray((0, 0, -3), (0, 0, 1))).item() == 0
-
-
 def test_gradients_of_spans_and_distances_are_exact_and_finite():
     origins = torch.stack([vector((0.6, 0, -2)), vector((0.1, 0.2, -0.3)), vector((2, 0.5, -3))]).requires_grad_(True)
     directions = vector((0, 0, 1)).expand(3, 3).clone().requires_grad_(True)
@@ -281,12 +222,6 @@ def test_gradients_of_spans_and_distances_are_exact_and_finite():
     edge = torch.stack([vector((1, 0, -2)), vector((0, 0, -2)), vector((0, 0, 0))]).requires_grad_(True)
     total = sum(part.sum() for part in spans(edge, directions))
     assert torch.autograd.grad(total, edge)[0].isfinite().all()
-
-
-def test_moved_by_nothing_is_the_same_camera():
-    camera = moving()
-    same = camera.moved(torch.zeros(6, dtype=torch.float64))
-    torch.testing.assert_close(same.world_to_camera, camera.world_to_camera)
 
 
 @each(
@@ -308,32 +243,12 @@ def test_a_twist_moves_the_world_in_the_cameras_axes(twist, seen):
     )
 
 
-def test_gradients_flow_to_the_twist():
-    camera, step = moving(), 1e-6
-    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(2, 5, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-
-    def weighed(twist: torch.Tensor) -> torch.Tensor:
-        rays = camera.moved(twist).rays()
-        return (weight * torch.stack([rays.origins, rays.directions])).sum()
-
-    (found,) = torch.autograd.grad(weighed(twist), twist)
-    for axis, offset in enumerate(step * torch.eye(6, dtype=torch.float64)):
-        assert found[axis].item() == pytest.approx(((weighed(offset) - weighed(-offset)) / (2 * step)).item(), abs=1e-8)
-
-
 def test_resized_sees_the_same_in_other_pixels():
     camera = moving()
     fine = camera.resized(15, 12)  # three times each way: the middle of a block is its pixel
     torch.testing.assert_close(fine.rays().directions[1::3, 1::3], camera.rays().directions)
     torch.testing.assert_close(fine.center, camera.center)
     assert (camera.height, camera.width) == (5, 4)
-
-
-def test_double_is_the_same_in_float64():
-    camera = Camera(torch.eye(3), torch.eye(4), 2, 2)
-    assert camera.double().rays().origins.dtype is torch.float64
-    torch.testing.assert_close(camera.double().rays().directions.float(), camera.rays().directions)
 
 
 def moving() -> Camera:

@@ -57,16 +57,13 @@ def plane_queries(degrees: float, alpha: float) -> int:
     return 1 + ceil((log(EPSILON) - log(cosine)) / log(rate)) if rate > 1e-12 else 2
 
 
-@each("degrees", [5.0, 20.0, 33.0, 47.0, 60.0, 72.0])
-@each("alpha", [1.0, 1.2, 1.5, 1.9])
+@each("degrees", [5.0, 33.0, 60.0, 72.0])
+@each("alpha", [1.0, 1.5, 1.9])
 def test_dist_on_a_plane_asks_as_often_as_equation_8_says(degrees, alpha):
     renderer = replace(PLAIN, alpha=alpha, steps=200)
     assert forward(renderer, GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, alpha)
-
-
-@each("degrees", [5.0, 33.0, 60.0, 72.0])
-def test_idr_on_a_plane_asks_as_often_as_plain_sphere_tracing(degrees):
-    assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, 1.0)
+    if alpha == 1:
+        assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, 1.0)
 
 
 def test_the_papers_example_of_a_grazing_ray():
@@ -77,12 +74,6 @@ def test_the_papers_example_of_a_grazing_ray():
     for alpha, most in steps.items():
         count = forward(replace(PLAIN, alpha=alpha, steps=200), GROUND, down(80.0))
         assert count == plane_queries(80.0, alpha) < most
-
-
-def test_a_ray_that_does_not_converge_asks_once_a_step():
-    for steps in (1, 5, 9):
-        for renderer in (replace(PLAIN, steps=steps), load("renderer", "idr", steps=steps)):
-            assert forward(renderer, GROUND, down(80.0, 2)) == 2 * steps
 
 
 @each("radius", [0.4, 0.6])  # smaller, and the first step passes the centre
@@ -131,8 +122,7 @@ def test_who_asks_all_rays_asks_steps_times_the_rays_that_meet_the_sphere(name):
     assert forward(renderer, sphere(0.5), rays) == steps * meets
 
 
-@each("samples", [2, 16, 33])
-@each("refinement", [0, 8])
+@each("samples, refinement", [(2, 8), (16, 0), (33, 8)])
 def test_dvr_asks_all_samples_of_all_rays_and_refines_each_hit(samples, refinement):
     renderer = load("renderer", "dvr", n_ray_samples=samples, refinement_steps=refinement)
     rays = picture()
@@ -159,18 +149,6 @@ def test_dvr_that_stops_early_asks_up_to_the_surface(samples, asked):
     assert forward(renderer, GROUND, aside) == 0  # they miss the sphere
     above = Rays(vector((0, 0.5, -2)).expand(3, 3), vector((0, 0, 1)).expand(3, 3))
     assert forward(renderer, GROUND, above) == 3 * samples  # nothing to stop at
-
-
-def test_coarse_to_fine_counts_by_hand():
-    # 8 x 8 rays that are all the same: 4, then 16, then 64. Plain, 2 queries hit the wall, and each finer ray
-    # finds itself there. At alpha = 1.5 it takes 16: 3, 3 and then 10.
-    wall = plane((0, 0, -1), 0.0)
-    origins = vector((0, 0, -2)).expand(8, 8, 3)
-    rays = Rays(origins, vector((0, 0, 1)).expand(8, 8, 3), image=True)
-    fine = replace(PLAIN, coarse_to_fine=True, careful_split=False)
-    assert forward(fine, wall, rays) == 2 * 4 + 16 + 64
-    assert forward(replace(fine, alpha=1.5), wall, rays) == 3 * 4 + 3 * 16 + 10 * 64
-    assert forward(replace(fine, alpha=1.5, steps=8), wall, rays) == 3 * 4 + 3 * 16 + 2 * 64
 
 
 @each("name", ["dist", "idr", "dvr", "naive"])

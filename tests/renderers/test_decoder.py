@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Field, Flops, Kind
+from renderers.field import Flops
 from renderers.fields import mlp
 from renderers.fields.mlp import Decoder
 from tests.looped import each
@@ -78,7 +78,7 @@ def test_a_batch_of_codes_is_each_code_by_itself(name, batch):
         torch.testing.assert_close(values[one], plain(decoder, codes[one], points[one]), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("count", [0, 1, 6, 7, 8, 20])
+@pytest.mark.parametrize("count", [0, 7, 20])
 def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
     decoder = make("skip")
     code, points = draw(decoder, count)
@@ -98,45 +98,27 @@ def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
 def test_flops_are_two_a_weight_without_the_code():
     # Layers 3 -> 8, 8 -> 8, (8 + 3) -> 8, 8 -> 8, 8 -> 1: 24 + 64 + 88 + 64 + 8 = 248 weights.
     assert make("skip").at(torch.zeros(4, dtype=torch.float64)).flops == Flops(496, 2 * 496)
+    frozen = make("skip").requires_grad_(False).at(torch.zeros(4, dtype=torch.float64))
+    assert frozen.flops == Flops(496, 496)
     # 3 -> 12, 12 -> 5 (narrowed by 4 + 3), 5 + 3 -> 12, 12 -> 12, 12 -> 1: 36 + 60 + 96 + 144 + 12 = 348.
     assert make("narrow").at(torch.zeros(4, dtype=torch.float64)).flops == Flops(696, 2 * 696)
     # 3 -> 8, 8 -> 5, (5 + 3) -> 8, 8 -> 1: 24 + 40 + 64 + 8 = 136.
     assert make("no-code-skip").at(torch.zeros(0, dtype=torch.float64)).flops == Flops(272, 2 * 272)
 
 
-def test_the_paper_network_has_deepsdfs_layers():
-    decoder = Decoder(layers=8, width=512, code_length=256, skip=4, narrow=True)
-    sizes = [(layer.in_features, layer.out_features) for layer in (*decoder.hidden, decoder.last)]
-    narrow = 512 - 259
-    assert sizes == [(259, 512), (512, 512), (512, 512), (512, narrow), *[(512, 512)] * 4, (512, 1)]
-
-
-def test_a_bound_decoder_is_a_field_that_claims_a_distance_and_no_lipschitz_bound():
-    field = make("skip").at(torch.zeros(4, dtype=torch.float64))
-    assert isinstance(field, Field)
-    assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
-
-
 @each(
     "change, message",
     [
         ({"skip": 4}, "skip must lie between 0 .* layers - 1 = 3, not 4"),
-        ({"skip": -1}, "skip must lie between 0 .*, not -1"),
         ({"width": 7, "narrow": True}, r"width must exceed code_length \+ 3 = 7 .*, not 7"),
         ({"layers": 0, "skip": 0}, "layers must be at least 1, not 0"),
-        ({"width": 0}, "width must be at least 1, not 0"),
-        ({"code_length": -1}, "code_length must be at least 0, not -1"),
     ],
 )
 def test_impossible_networks_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Decoder(**(NETWORKS["skip"] | change))
-
-
-@each("length", [3, 5, 0])
-def test_a_code_of_the_wrong_length_is_refused(length):
-    with pytest.raises(ValueError, match=f"code must end in 4 numbers, not {length}"):
-        make("skip").at(torch.zeros(length, dtype=torch.float64))
+    with pytest.raises(ValueError, match="code must end in 4 numbers, not 3"):
+        make("skip").at(torch.zeros(3, dtype=torch.float64))
 
 
 def pair(dtype: torch.dtype) -> tuple[Decoder, Decoder]:
@@ -199,13 +181,3 @@ def test_the_slope_of_a_network_of_fixed_weights_has_a_gradient_of_zero():
     loss = slope.square().sum() + code.square().sum()
     (found,) = torch.autograd.grad(loss, code)
     torch.testing.assert_close(found, 2 * code.detach())
-
-
-def test_weights_that_are_free_have_their_gradient():
-    _, free = pair(torch.float64)
-    free.at(torch.ones(5, dtype=torch.float64))(torch.ones(3, 3, dtype=torch.float64)).sum().backward()
-    assert all(parameter.grad is not None for parameter in free.parameters())
-    assert (
-        free.at(torch.ones(5, dtype=torch.float64)).flops.gradient
-        == 2 * free.at(torch.ones(5, dtype=torch.float64)).flops.value
-    )

@@ -7,12 +7,11 @@ import torch
 
 from bench.config import load
 from bench.tables import choice, names
-from renderers.adaptive_samples import follow
 from renderers.camera import Camera
 from renderers.field import Field, Moved, steepest
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Observed, at_iteration
+from renderers.rendering import Observed
 from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
 
 CPU = torch.device("cpu")
@@ -57,8 +56,6 @@ def fields() -> dict[str, Field]:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
     renderer = load("renderer", name)
-    if name == "dvr":
-        renderer = at_iteration(follow(renderer), 0)
     size = 4 if name.startswith("naive") else 12  # pixels per side; with a default device all operations are slow
     for field in fields().values():
         rays = camera(size).rays()

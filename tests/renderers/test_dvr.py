@@ -10,11 +10,10 @@ from torch.nn.functional import softplus
 
 from bench.config import load
 from renderers.camera import Rays
-from renderers.field import Kind, Meter, occupancy_field
-from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.fields.occupancy import OccupancyNetwork
+from renderers.field import Kind
+from renderers.fields.analytic import Shape, box, sphere
 from renderers.gradients import implicit
-from renderers.rendering import Observed, Rendering, Spaced, Status, at_iteration
+from renderers.rendering import Observed, Rendering, Status, at_iteration
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, vector
@@ -56,17 +55,6 @@ def test_stopping_early_changes_nothing():
         assert torch.equal(getattr(plain, part), getattr(early, part)), part
 
 
-def test_the_secant_is_sooner_there_than_bisection():
-    ray, truth = along_z(0.1), 2 - (0.25 - 0.01) ** 0.5
-    errors = {}
-    for method in ("secant", "bisection"):
-        for steps in (0, 3, 6):
-            renderer = replace(DVR, n_ray_samples=16, refinement=method, refinement_steps=steps)
-            errors[method, steps] = abs(renderer.render(sphere(0.5), ray).distance.item() - truth)
-        assert errors[method, 0] > errors[method, 3] > errors[method, 6]
-    assert errors["secant", 6] < 1e-6 < errors["bisection", 6]
-
-
 def test_samples_double_on_schedule_up_to_all():
     renderer = replace(DVR, n_ray_samples=128, doublings=(50, 150, 250))
     assert [renderer.at_iteration(i).n_ray_samples for i in (0, 49, 50, 149, 150, 249, 250, 10_000)] == [
@@ -80,31 +68,10 @@ def test_samples_double_on_schedule_up_to_all():
             replace(renderer, doublings=wrong)
 
 
-def test_samples_set_from_outside_leave_no_doublings():
-    assert isinstance(DVR, Spaced) and not isinstance(load("renderer", "dist"), Spaced)
-    assert DVR.with_samples(33) == replace(DVR, n_ray_samples=33, doublings=())
-
-
 def test_any_level_set_will_do():
     bent = Shape(lambda p: torch.tanh(9 * (sphere(0.5)(p))) ** 3, Kind.LEVEL, None)
     found = replace(DVR, refinement="bisection", refinement_steps=40).render(bent, along_z(0.0, 0.3))
     assert found.distance.tolist() == pytest.approx([1.5, 1.6], abs=1e-6)
-
-
-def test_an_occupancy_network_is_rendered_where_its_probability_is_the_threshold():
-    torch.manual_seed(0)
-    network = OccupancyNetwork(width=16, code_length=0).double().at(torch.zeros(0, dtype=torch.float64))
-    there = along_z(-0.4, -0.2, 0.0, 0.2, 0.4)
-    back = Rays(there.at(torch.full((5,), 4.0, dtype=torch.float64)), -there.directions)
-    rays = Rays(torch.cat([there.origins, back.origins]), torch.cat([there.directions, back.directions]))
-    renderer = replace(DVR, refinement="bisection", refinement_steps=40)
-    threshold = torch.sigmoid(network.logits(vector((0, 0, 0)))).item()  # met from one side, if not from both
-    field = occupancy_field(network.logits, threshold)
-    rendering = renderer.render(field, rays)
-    hit = rendering.hit
-    assert hit.any()
-    probability = torch.sigmoid(network.logits(rendering.points[hit]))
-    assert probability.tolist() == pytest.approx([threshold] * int(hit.sum()), abs=1e-9)
 
 
 @by_name
@@ -119,14 +86,6 @@ def test_the_implicit_gradient_is_exact(name, case: Case):
     torch.testing.assert_close(by_origin[0], case.origin_rate, rtol=1e-7, atol=1e-7)
     # A turn of the ray moves its end by the distance times what an origin moves it by.
     torch.testing.assert_close(by_direction[0], case.distance * case.origin_rate, rtol=1e-7, atol=1e-7)
-
-
-@by_name
-def test_no_field_is_asked_for_a_gradient_that_nobody_wants(name):
-    meter = Meter(sphere(0.5))
-    rendering = EXACT[name].render(meter, along_z(0.1, 0.8))
-    assert not rendering.distance.requires_grad
-    assert meter.counts.gradient == 0
 
 
 @each("slope, used", [(-2e-4, -1e-3), (2e-4, 1e-3), (-0.5, -0.5), (0.5, 0.5), (0.0, -1e-3)])
@@ -215,27 +174,12 @@ def test_at_random_given_distances_change_no_digit():
     assert moved != without
 
 
-def test_a_place_that_is_not_built_is_refused():
-    with pytest.raises(ValueError, match="occupied_at must be one of random, depth, not 'hull'"):
-        replace(DVR, occupied_at="hull")
-
-
 def test_the_loss_takes_values_of_a_level_set_as_logits():
     field = Shape(lambda p: sphere(0.5)(p) * 3, Kind.LEVEL, None)
     loss, _, shares = masks(DVR, field, along_z(0.8), [False])
     z = 0.6 * (2 * shares.item() - 1)
     logit = -3 * ((0.64 + z**2) ** 0.5 - 0.5)
     assert loss.item() == pytest.approx(log1p(torch.tensor(logit).exp().item()), rel=1e-6)
-
-
-def test_mask_losses_push_the_right_way():
-    for renderer in (DVR, load("renderer", "idr")):
-        for mask, sign in (([True], -1), ([False], 1)):
-            radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-            height = 0.6 if mask[0] else 0.4  # missed though wanted, hit though not
-            loss, _, _ = masks(renderer, sphere(radius), along_z(height), mask)
-            (found,) = torch.autograd.grad(loss, radius)
-            assert found.item() * sign > 0
 
 
 def test_idr_mask_loss_by_hand():
@@ -245,14 +189,6 @@ def test_idr_mask_loss_by_hand():
     entropies = [softplus(-20 * rendering.closest[i]) for i in (1, 2)] + [softplus(20 * rendering.closest[3])]
     assert rendering.closest[2].item() == pytest.approx(0.3, abs=0.1)
     assert loss.item() == pytest.approx(sum(e.item() for e in entropies) / (20 * 4), rel=1e-9)
-
-
-def test_idr_has_the_hits_of_plain_sphere_tracing():
-    rays = along_z(0.0, 0.2, 0.45, 0.499, 0.6, 1.2)
-    plain = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False)
-    one, other = load("renderer", "idr").render(sphere(0.5), rays), plain.render(sphere(0.5), rays)
-    for part in ("distance", "status", "residual", "closest"):
-        assert torch.equal(getattr(one, part), getattr(other, part)), part
 
 
 def test_naive_is_the_same_one_by_one_and_its_practical_gradient_is_that_of_dist():
@@ -275,11 +211,3 @@ def test_naive_is_the_same_one_by_one_and_its_practical_gradient_is_that_of_dist
     assert torch.equal(other.distance, found["practical", False][0].distance)
     assert rate.item() == pytest.approx(found["practical", False][1].item())
     assert rate.item() != pytest.approx(found["unrolled", False][1].item(), rel=0.01)
-
-
-def test_a_plane_that_grazes_is_crossed_once():
-    tilted = plane((0.02, 1.0, 0.0), 0.0)
-    ray = Rays(vector((-2, 0, 0))[None], vector((1, 0, 0))[None])
-    assert replace(DVR, refinement_steps=40).render(tilted, ray).status.item() == Status.STARTED_INSIDE
-    back = Rays(vector((2, 0, 0))[None], vector((-1, 0, 0))[None])
-    assert DVR.render(tilted, back).distance.item() == pytest.approx(2.0, abs=1e-9)

@@ -1,6 +1,6 @@
 """Fields: distances worked out by hand, bounds against sampled surfaces, kinds, normals, and what the Meter counts."""
 
-from math import pi, sqrt
+from math import sqrt
 
 import pytest
 import torch
@@ -19,7 +19,6 @@ from renderers.fields.analytic import (
     sphere,
     torus,
 )
-from renderers.fields.mlp import CHUNK, Decoder
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, vector
 
@@ -59,53 +58,34 @@ CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
     "shape, point, distance",
     [
         (sphere(0.5, (1, 0, 0)), (1, 0, 0), -0.5),
-        (sphere(0.5, (1, 0, 0)), (1, 2, 0), 1.5),
-        (sphere(0.5, (1, 0, 0)), (0.5, 0, 0), 0),
         (sphere(), (3, 4, 0), 4),
-        (BOX, (0, 0, 0), -1),
         (BOX, (0, 1.75, 0), -0.25),  # inside, nearest to a face that is not the nearest of the centre
-        (BOX, (3, 0, 0), 2),
         (BOX, (-4, -6, 0), 5),  # off an edge by 3 and 4
         (BOX, (2, -4, 5), 3),  # off a corner by 1, 2 and 2
-        (BOX, (1, 0.5, 0), 0),
-        (BOX, (1, 2, 0.5), 0),  # on an edge
         (BOX, (-1, 2, -3), 0),  # on a corner
-        (ROUND, (0, 0, 0), -1),
         (ROUND, (3, 0, 0), 2),  # the size over all is that of the sharp box
-        (ROUND, (1, 0, 0), 0),
         (ROUND, (3.5, 5.5, 0), 4.5),  # 3 and 4 off the core's edge, less the rounding
         (ROUND, (1, 2, 3), sqrt(0.75) - 0.5),  # the corner that was rounded away
         (TORUS, (0, 0, 0), 0.75),
         (TORUS, (1, 0, 0), -0.25),
-        (TORUS, (0, 0.25, -1), 0),
         (TORUS, (4, 4, 0), 4.75),  # 3 and 4 off the ring
         (CAPSULE, (0, 1, 0), -0.5),
-        (CAPSULE, (1, 1, 0), 0.5),
         (CAPSULE, (0, 3, 0), 0.5),  # beyond the end
         (CAPSULE, (0, -1, 0), 0.5),  # before the start
         (CAPSULE, (0, 6, -3), 4.5),  # 3 and 4 off the end
-        (CAPSULE, (0.5, 0, 0), 0),
         (capsule((1, 0, 0), (1, 0, 4), 1), (1, 3, 2), 2),
-        (CYLINDER, (0, 0, 0), -1),
         (CYLINDER, (0, 1.75, 0), -0.25),
         (CYLINDER, (0, 0, -3), 2),
-        (CYLINDER, (0, 5, 0), 3),
         (CYLINDER, (4, -6, 0), 5),  # 3 and 4 off the rim
         (CYLINDER, (0, 2, 1), 0),  # on the rim
-        (plane((0, 1, 0), 0.5), (7, 2, 3), 1.5),
         (plane((0, 1, 0), 0.5), (7, -1, 3), -1.5),
         (plane((3, 0, 4)), (1, 5, 1), 1.4),  # the normal is made a unit vector
+        (plane((0, 2, 0), 1), (3, 2.5, 4), 2),  # and the offset is that of the normal as given
     ],
 )
 def test_distances_worked_out_by_hand(shape, point, distance):
     assert value(shape, *point) == pytest.approx(distance, abs=1e-12)
     assert shape.kind is Kind.DISTANCE
-
-
-def test_the_plane_is_where_normal_times_x_is_the_offset_whatever_the_length_of_the_normal():
-    # Stated in `plane`: "The half space below `normal . x = offset`", and the normal need not have unit length.
-    assert value(plane((0, 2, 0), 1), 3, 0.5, 4) == pytest.approx(0)
-    assert value(plane((0, 2, 0), 1), 3, 2.5, 4) == pytest.approx(2)
 
 
 @pytest.mark.parametrize("name", [*PRIMITIVES, *COMBINATIONS])
@@ -123,50 +103,14 @@ def test_no_field_changes_faster_than_distance(name, seed, size):
     assert (gradient.norm(dim=-1) <= 1 + 1e-12).all()
 
 
-def box_surface(half: torch.Tensor, grid: int = 41) -> torch.Tensor:
-    """Points on all six faces of a box, edges included."""
-    line = torch.linspace(-1, 1, grid, dtype=torch.float64)
-    u, v = (part.reshape(-1) for part in torch.meshgrid(line, line, indexing="ij"))
-    faces = [torch.stack([s * torch.ones_like(u), u, v], -1).roll(axis, -1) for s in (-1, 1) for axis in range(3)]
-    return torch.cat(faces) * half
-
-
-def sphere_surface(radius: float, center: torch.Tensor, grid: int = 100) -> torch.Tensor:
-    polar, around = torch.meshgrid(
-        torch.linspace(0, pi, grid, dtype=torch.float64), torch.linspace(0, 2 * pi, grid, dtype=torch.float64),
-        indexing="ij",
-    )  # fmt: skip
-    unit = torch.stack([polar.sin() * around.cos(), polar.sin() * around.sin(), polar.cos()], -1).reshape(-1, 3)
-    return center + radius * unit
-
-
-@pytest.mark.parametrize("name", ["union", "intersection", "difference"])
-@settings(max_examples=8)
-@given(
-    half=st.tuples(*[st.floats(0.2, 0.8)] * 3),
-    radius=st.floats(0.2, 0.7),
-    center=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
-    seed=st.integers(0, 2**32),
-)
-def test_a_combination_never_overshoots_its_sampled_surface(name, half, radius, center, seed):
-    half, center = vector(half), vector(center)
-    on_box, on_sphere = box_surface(half), sphere_surface(radius, center)
-    box_in_sphere = (on_box - center).norm(dim=-1) < radius
-    sphere_in_box = (on_sphere.abs() < half).all(-1)
-    a, b = box(half), sphere(radius, center)
-    shape, surface = {
-        "union": (a | b, torch.cat([on_box[~box_in_sphere], on_sphere[~sphere_in_box]])),
-        "intersection": (a & b, torch.cat([on_box[box_in_sphere], on_sphere[sphere_in_box]])),
-        "difference": (a - b, torch.cat([on_box[~box_in_sphere], on_sphere[sphere_in_box]])),
-    }[name]
-    if len(surface) == 0:  # apart, or one swallowed by the other
-        return
-    points = torch.rand(60, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 3 - 1.5
-    truth = torch.cdist(points, surface).amin(1)
-    assert (shape(points).abs() <= truth + 1e-9).all()
-    in_box, in_sphere = (points.abs() < half).all(-1), (points - center).norm(dim=-1) < radius
-    inside = {"union": in_box | in_sphere, "intersection": in_box & in_sphere, "difference": in_box & ~in_sphere}[name]
-    assert torch.equal(shape(points) < 0, inside)
+def test_the_inside_of_a_combination_is_that_of_its_parts():
+    """With no field that changes faster than distance, none overshoots its surface."""
+    points = 3 * torch.rand(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1.5
+    in_box, in_sphere = A(points) < 0, B(points) < 0
+    assert torch.equal((A | B)(points) < 0, in_box | in_sphere)
+    assert torch.equal((A & B)(points) < 0, in_box & in_sphere)
+    assert torch.equal((A - B)(points) < 0, in_box & ~in_sphere)
+    assert (in_box & in_sphere).any() and (in_box & ~in_sphere).any() and (in_sphere & ~in_box).any()
 
 
 def test_a_smooth_union_fills_the_seam_by_a_quarter_of_its_radius_and_is_the_union_elsewhere():
@@ -178,21 +122,6 @@ def test_a_smooth_union_fills_the_seam_by_a_quarter_of_its_radius_and_is_the_uni
     assert value(blend, -0.1, 0, 0) == pytest.approx(0)
     assert value(a | b, -0.1, 0, 0) == pytest.approx(0)
     assert value(blend, 0.05, 0, 0) == pytest.approx(0.05 - 0.25 * 0.2 * 0.5**2)  # half overlapped
-
-
-def test_a_smooth_union_is_a_bound_of_its_own_surface():
-    generator = torch.Generator().manual_seed(0)
-    shape = COMBINATIONS["smooth_union"]
-    surface = torch.randn(4000, 3, dtype=torch.float64, generator=generator)
-    for _ in range(40):  # Newton's method onto the zero set
-        leaf = surface.requires_grad_(True)
-        values = shape(leaf)
-        (gradient,) = torch.autograd.grad(values.sum(), leaf)
-        surface = (leaf - values[:, None] * gradient / gradient.square().sum(-1, keepdim=True)).detach()
-    surface = surface[shape(surface).abs() < 1e-12]
-    assert len(surface) > 2000
-    points = torch.rand(200, 3, dtype=torch.float64, generator=generator) * 3 - 1.5
-    assert (shape(points).abs() <= torch.cdist(points, surface).amin(1) + 1e-9).all()
 
 
 def test_every_shape_states_its_kind():
@@ -314,38 +243,20 @@ def test_the_meter_counts_points_and_leaves_values_and_gradients_as_they_are(sha
     assert meter.counts == Counts(value=count, gradient=count)
 
 
-def test_the_meter_counts_every_backward_pass_once():
+def test_the_meter_counts_every_backward_pass_once_and_none_where_there_is_none():
     meter, points = Meter(B), torch.randn(5, 3, requires_grad=True)
     values = meter(points)
     (values.sum() + values.square().mean()).backward(retain_graph=True)  # two uses of the values, one pass
     assert meter.counts == Counts(5, 5)
-    values.sum().backward()
-    assert meter.counts == Counts(5, 10)
-    meter(points)  # never back-propagated
-    assert meter.counts == Counts(10, 10)
-    (meter(points).sum() + meter(points[:2]).sum()).backward()
-    assert meter.counts == Counts(17, 17)
-
-
-def test_the_meter_counts_no_gradient_where_there_is_none():
-    meter, points = Meter(B), torch.randn(5, 3, requires_grad=True)
+    values[:2].sum().backward()
+    assert meter.counts == Counts(5, 7)  # the others have a gradient of zero
     with torch.no_grad():
         meter(points)
     meter(points.detach())
-    assert meter.counts == Counts(10, 0)
+    assert meter.counts == Counts(15, 7)
     radius = torch.tensor(0.5, requires_grad=True)
-    to_parameter = Meter(sphere(radius), meter.counts)  # counts can be shared
-    to_parameter(points.detach()).sum().backward()
-    assert meter.counts == Counts(15, 5)
-
-
-def test_the_meter_counts_chunks_as_their_points():
-    torch.manual_seed(0)
-    decoder = Decoder(layers=1, width=2, code_length=0, skip=0, narrow=False)
-    count = 2 * CHUNK + 7
-    meter = Meter(decoder.at(torch.zeros(0)))
-    meter(torch.randn(count, 3)).sum().backward()
-    assert meter.counts == Counts(count, count)
+    Meter(sphere(radius), meter.counts)(points.detach()).sum().backward()  # counts can be shared
+    assert meter.counts == Counts(20, 12)
 
 
 def test_the_meter_is_the_field_that_it_wraps_and_tells_its_cost():

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from bench.config import load
 from renderers import DIST
-from renderers.camera import Camera, Rays, distance_to_origin
+from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
 from renderers.gradients import approximate
-from renderers.rendering import Rendering, Status
+from renderers.rendering import Status
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, ground, vector
 
@@ -58,7 +58,7 @@ def test_naive_is_exact_towards_the_field_and_the_ray(case):
             assert by_origin[axis].item() == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
-@each("steps", [1, 2, 5, 10])
+@each("steps", [1, 5])
 @each("name", ["plane-oblique", "plane-grazing"])
 def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
     case = next(case for case in CASES if case.name == name)
@@ -80,63 +80,22 @@ def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
     assert torch.cosine_similarity(by_origin, case.origin_rate, dim=0).item() == pytest.approx(1, abs=1e-6)
 
 
-def test_dist_head_on_on_a_sphere_gives_minus_alpha_times_the_samples_that_exist():
-    # At alpha 1 there are two queries, 0.5 away and at the hit: K = 5 finds two. The truth is -1.
-    case = CASES[0]
-    for samples, kept in ((1, 1), (2, 2), (5, 2)):
-        assert rates(replace(DIST_PLAIN, n_gradient_samples=samples), case)[0] == pytest.approx(-kept)
-    assert rates(replace(DIST_PLAIN, alpha=1.5, n_gradient_samples=3), case)[0] == pytest.approx(-4.5)
-
-
-def test_dist_keeps_the_values_that_it_marched_to():
-    case = CASES[1]
-    rendering, _, _ = render(replace(DIST_PLAIN, n_gradient_samples=3), case)
-    with torch.no_grad():
-        plain, _, _ = render(replace(DIST_PLAIN, n_gradient_samples=3), case)
-    assert torch.equal(rendering.distance, plain.distance)
-    assert rendering.distance.requires_grad
-    assert not plain.distance.requires_grad
-
-
 @each("steps", [30, 300])
 @each("samples", [1, 3])
 def test_dist_back_propagates_one_value_a_sample_whatever_the_steps(steps, samples):
     case = CASES[2]
     parameter = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     meter = Meter(sphere(parameter))
-    with graph_size() as saved:
-        rendering = replace(DIST_PLAIN, epsilon=1e-3, steps=steps, n_gradient_samples=samples).render(
-            meter, case.rays()
-        )
+    dist = replace(DIST_PLAIN, epsilon=1e-3, steps=steps, n_gradient_samples=samples)
+    rendering = dist.render(meter, case.rays())
     assert rendering.hit.all()
     assert meter.counts.value > 10 + samples
     rendering.distance.sum().backward()
     assert meter.counts.gradient == samples
-    assert saved[0] < 150  # numbers kept for the backward pass: a few vectors, none for a step
     naive = Meter(sphere(parameter))
-    with graph_size() as unrolled:
-        replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
+    replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
     assert naive.counts.value == steps
     assert samples < naive.counts.gradient <= steps  # none goes through the steps behind the last
-    assert unrolled[0] > 3 * steps
-
-
-class graph_size:
-    """Counts the numbers that autograd keeps for the backward pass."""
-
-    def __enter__(self) -> list[int]:
-        self.count = [0]
-
-        def pack(tensor: Tensor) -> Tensor:
-            self.count[0] += tensor.numel()
-            return tensor
-
-        self.hooks = torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor)
-        self.hooks.__enter__()
-        return self.count
-
-    def __exit__(self, *what) -> None:
-        self.hooks.__exit__(*what)
 
 
 def test_rays_that_hit_nothing_carry_one_sample_and_no_gradient_of_distance():
@@ -197,30 +156,6 @@ def test_rays_that_pass_the_unit_sphere_tell_the_camera_by_how_much(renderer):
     torch.testing.assert_close(rendering.closest, torch.full((4, 4), far - 1, dtype=torch.float64))
     (gradient,) = torch.autograd.grad(rendering.closest[0, 0], origin)
     torch.testing.assert_close(gradient, vector((1.5, 0.5, 0)) / far)
-
-
-@each("renderer", [replace(NAIVE, steps=50), replace(DIST_PLAIN, coarse_to_fine=True, epsilon=1e-6)])
-def test_gradients_reach_the_camera_from_hits_and_misses(renderer):
-    def see(height: Tensor) -> tuple[Rendering, Camera]:
-        world_to_camera = torch.eye(4, dtype=torch.float64)
-        world_to_camera[1, 3], world_to_camera[2, 3] = height, 2.5
-        camera = Camera(vector((12, 0, 8, 0, 12, 8, 0, 0, 1)).view(3, 3), world_to_camera, 16, 16)
-        return renderer.render(sphere(0.5), camera.rays()), camera
-
-    height = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
-    rendering, camera = see(height)
-    beyond = distance_to_origin(camera.rays()) > 1
-    assert rendering.hit.any()
-    assert beyond.any()
-    for part, where in ((rendering.distance, rendering.hit), (rendering.closest, beyond)):
-        (gradient,) = torch.autograd.grad(part[where][0], height, retain_graph=True)
-        assert gradient.isfinite()
-        assert gradient != 0
-    # The outer silhouette is exact: compare with central differences.
-    h = 1e-6
-    (gradient,) = torch.autograd.grad(rendering.closest[beyond].sum(), height)
-    ahead, behind = (see(height.detach() + s)[0].closest[beyond].sum().item() for s in (h, -h))
-    assert gradient.item() == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
 
 
 def test_the_approximate_rule_counts_the_samples_that_exist():

@@ -78,29 +78,6 @@ def test_aggressive_steps_halve_the_distance_and_change_side():
     assert front.sample_value.tolist() == [[-(2**-15), 2**-14, -(2**-13), 2**-12]]
 
 
-def test_the_distance_is_that_of_equation_1():
-    values = []
-    recording = Shape(lambda p: values.append(WALL(p)) or values[-1])
-    direction = torch.nn.functional.normalize(vector((0.3, 0, 1)), dim=0)
-    rays = Rays(vector((-0.6, 0, -2))[None], direction[None])
-    front, count = trace(recording, rays, AGGRESSIVE)
-    entry = front.distance - sum(values) * 1.5 + 0.5 * values[-1]  # d = entry + alpha * sum + (1 - alpha) * last
-    assert rays.at(entry).norm().item() == pytest.approx(1)
-    assert count == len(values) > 3
-
-
-def test_the_extra_step_is_capped():
-    # 1 moves by 1.1 to z = 0.1; then -0.1, 0.05, -0.025, ...: 0.1 * 2^-11 is the first below 5e-5, the 13th.
-    assert trace(WALL, HEAD_ON, replace(AGGRESSIVE, extra_step_cap=0.1))[1] == 13
-
-
-def test_the_value_that_makes_a_step_is_clamped():
-    # From z = -1 to 0 by quarters, and once at 0.
-    front, count = trace(WALL, HEAD_ON, replace(PLAIN, step_clamp=0.25))
-    assert count == 5
-    assert front.distance.item() == 2
-
-
 @each(
     "alpha, cap, clamp, expected",
     [
@@ -139,7 +116,7 @@ def test_finished_rays_are_asked_only_where_every_ray_is():
 
 @each(
     "steps, queries",
-    [(1, 4), (2, 2 * 4), (3, 12), (4, 12 + 16), (6, 12 + 48), (7, 12 + 48 + 64), (10, 12 + 48 + 4 * 64)],
+    [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)],
 )
 def test_coarse_to_fine_asks_blocks_of_16_then_of_4_then_pixels(steps, queries):
     # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. At 0.01 a step none of them ends.
@@ -163,52 +140,12 @@ def test_coarse_to_fine_on_a_sphere_head_on():
     assert (front.status == Status.HIT).all()
 
 
-def test_every_finer_ray_goes_on_from_its_own_coarse_ray():
-    # The value grows with x and y, so after 3 coarse steps each block stands elsewhere; 5 x 7 pixels, 2 images.
-    slope = Shape(lambda p: 0.01 + 0.02 * p[..., 0].abs() + 0.005 * p[..., 1].abs())
-    rays = sheet(5, 7, 2, pitch=0.01)
-    front, _ = trace(slope, rays, PLAIN, steps=6)
-    blocks = rays
-    expected = torch.zeros(2, 5, 7, dtype=torch.float64)
-    entry = None
-    for factor in (4, 2):  # by hand: three steps of each block's constant value, on top of where its parent stands
-        blocks = rays.coarser(factor)
-        steps = 3 * slope(blocks.origins)
-        spread = steps.repeat_interleave(factor, 1).repeat_interleave(factor, 2)[:, :5, :7]
-        start = 2 - (1 - blocks.origins[..., :2].square().sum(-1)).sqrt()
-        start = start.repeat_interleave(factor, 1).repeat_interleave(factor, 2)[:, :5, :7]
-        entry = start if entry is None else torch.maximum(expected, start)
-        expected = entry + spread
-    own = 2 - (1 - rays.origins[..., :2].square().sum(-1)).sqrt()
-    expected = torch.maximum(expected, own)
-    torch.testing.assert_close(front.distance.view(2, 5, 7), expected, rtol=0, atol=1e-12)
-
-
 def pinhole(size: int = 64) -> Rays:
     """An image of the whole unit sphere from z = -2.5, in float64."""
     intrinsics = vector((1.07 * size, 0, size / 2, 0, 1.07 * size, size / 2, 0, 0, 1)).view(3, 3)
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[2, 3] = 2.5
     return Camera(intrinsics, world_to_camera, size, size).rays()
-
-
-def test_coarse_to_fine_finds_the_same_surface():
-    # Away from the outline, where a coarse ray that passes the shape takes the rays of its block along.
-    shape, rays = sphere(0.5, (0.1, -0.2, 0.1)), pinhole()
-    coarse, fine = COARSE.render(shape, rays), FINE.render(shape, rays)
-    clear = (fine.closest.abs() > 0.1) | (fine.hit & (rays.directions[..., 2] > 0) & (facing(shape, fine.points) > 0.5))
-    assert clear.double().mean() > 0.6
-    assert torch.equal(coarse.status[clear], fine.status[clear])
-    hit = fine.hit & clear
-    assert (coarse.distance - fine.distance)[hit].abs().max() < 2 * 5e-5 / 0.5
-
-
-def facing(shape: Shape, points: Tensor) -> Tensor:
-    """How much the surface about a point of a sphere faces the camera at z = -2.5: the cosine of the angle."""
-    leaf = points.detach().requires_grad_(True)
-    (normal,) = torch.autograd.grad(shape(leaf).sum(), leaf)
-    toward = torch.nn.functional.normalize(vector((0, 0, -2.5)) - points, dim=-1)
-    return (normal * toward).sum(-1)
 
 
 def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
@@ -281,12 +218,10 @@ def stuck(limit: float) -> Shape:
         (sphere(0.5), (0, 0, -2), 50, Status.HIT, 1.5),
         (sphere(0.2, (0, 0.5, 0)), (0, 0, -2), 50, Status.MISS, 3),  # leaves the unit sphere
         (sphere(0.5), (0, 0, 2), 50, Status.MISS, None),  # behind the camera
-        (sphere(0.5), (2, 0, -2), 50, Status.MISS, None),  # passes the unit sphere by
         (sphere(0.5), (0, 0, 0.1), 50, Status.STARTED_INSIDE, 0),
         (sphere(1.5), (0, 0, -2), 50, Status.STARTED_INSIDE, 1),  # the shape sticks out of the unit sphere
         (sphere(0.5), (0.49, 0, -2), 3, Status.OUT_OF_STEPS, None),  # grazing, with few steps
         (constant(0.001), (0, 0, -2), 50, Status.OUT_OF_STEPS, None),
-        (stuck(-0.5), (0, 0, -2), 50, Status.OUT_OF_STEPS, None),  # NaN on the way
         (stuck(-5.0), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),  # NaN from the start
         (constant(torch.inf), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),
     ],
@@ -318,11 +253,10 @@ def bumpy(points: Tensor) -> Tensor:
 
 
 @each("samples", [1, 3, 80])
-@each("alpha", [1.0, 1.5])
-def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples, alpha):
-    rays = beam(*((0.1 * i, -0.05 * i, -2) for i in range(8)))
-    together, _ = trace(Shape(bumpy, Kind.LEVEL, None), rays, replace(PLAIN, alpha=alpha), steps=60, samples=samples)
-    for index in range(8):
+def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples):
+    rays = beam(*((0.1 * i, -0.05 * i, -2) for i in range(4)))
+    together, _ = trace(Shape(bumpy, Kind.LEVEL, None), rays, AGGRESSIVE, steps=60, samples=samples)
+    for index in range(4):
         points, values = [], []
 
         def record(p: Tensor, points=points, values=values) -> Tensor:
@@ -331,7 +265,7 @@ def test_the_samples_of_least_magnitude_are_kept_with_their_places(samples, alph
             return values[-1][None]
 
         one = Rays(rays.origins[index : index + 1], rays.directions[index : index + 1])
-        trace(Shape(record, Kind.LEVEL, None), one, replace(PLAIN, alpha=alpha), steps=60, samples=samples)
+        trace(Shape(record, Kind.LEVEL, None), one, AGGRESSIVE, steps=60, samples=samples)
         assert len(values) == 60
         assert {value.sign().item() for value in values} == {-1, 1}
         order = sorted(range(len(values)), key=lambda i: abs(values[i].item()))[:samples]  # first come, first kept
@@ -371,12 +305,6 @@ def test_the_field_is_asked_for_the_kept_samples_again_and_no_more():
     meter = Meter(constant(0.5))
     replace(FINE, alpha=1.0, n_gradient_samples=3).render(meter, HEAD_ON)
     assert meter.counts == Counts(value=5 + 1)
-
-
-def test_naive_asks_every_ray_that_meets_the_sphere_at_every_step():
-    meter = Meter(WALL)
-    replace(NAIVE, steps=17).render(meter, THREE)
-    assert meter.counts == Counts(value=2 * 17)
 
 
 def test_naive_does_not_hit_what_is_behind_the_sphere():

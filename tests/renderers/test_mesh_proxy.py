@@ -12,6 +12,7 @@ from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Status
+from tests.looped import each
 from tests.renderers.analytic_cases import vector
 
 RENDERER = load("renderer", "mesh_proxy", grid=48)
@@ -25,10 +26,9 @@ def aimed(count: int) -> Rays:
     return Rays(origins, normalize(targets - origins, dim=-1))
 
 
-@pytest.mark.parametrize("steep", [1.0, 5.0])
-def test_its_gradients_are_those_of_the_field_up_to_the_grid(steep):
+def test_its_gradients_are_those_of_the_field_up_to_the_grid(steep=5.0):
     """Also of a field that is no distance: the gradient of a vertex is divided by the field's slope."""
-    leaf, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(200)
+    leaf, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(60)
     origins = rays.origins.requires_grad_(True)
     field = Shape(lambda p: steep * sphere(leaf)(p), Kind.LEVEL, None)
     found, exact = (
@@ -59,8 +59,7 @@ def test_what_is_thinner_than_the_grid_is_lost():
     assert not replace(RENDERER, grid=22).render(thin, ray).hit.item()
 
 
-@pytest.mark.parametrize("slope", [1e-2, 5e-4])
-def test_a_grazing_hit_stays_where_it_is(slope):
+def test_a_grazing_hit_stays_where_it_is(slope=5e-4):
     """Only its derivative is limited."""
     ray = Rays(vector((-1.5, 0, 0.5 * slope + 1e-9))[None], normalize(vector((1, 0, -slope))[None], dim=-1))
     rendering = RENDERER.render(Shape(lambda p: p[..., 2], Kind.DISTANCE, 1.0), ray)
@@ -75,7 +74,7 @@ def test_the_cost_is_that_of_the_grid_whatever_the_rays():
         assert 48**3 < counts.value < 48**3 + 1000
 
 
-@pytest.mark.parametrize("value", [1.0, -1.0, float("nan")])
+@each("value", [1.0, -1.0, float("nan")])
 def test_a_field_without_a_surface_has_no_mesh(value):
     field = Shape(lambda p: value + 0 * p[..., 0], Kind.LEVEL, None)
     rendering = RENDERER.render(field, aimed(5))

@@ -1,13 +1,13 @@
 """Newton's hits, gradients and evaluations, on what the march alone would get wrong."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from torch import Tensor
 
 from bench.config import load
-from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
@@ -34,6 +34,7 @@ def camera(size: int = 64, dtype: torch.dtype = torch.float32) -> Camera:
     return seen.double() if dtype is torch.float64 else seen
 
 
+@cache
 def exact(shape: Shape, size: int = 64) -> Rendering:
     """DIST in float64 with plain steps to 1e-12: the same hits, as exact as the field."""
     steady = replace(DIST, epsilon=1e-12, alpha=1.0, extra_step_cap=None, coarse_to_fine=False, steps=2000)
@@ -134,12 +135,11 @@ WRONG = {  # fields with the zero set of a distance d, and the most values that 
 }
 
 
-@each("image", [True, False])
 @each("of, most", WRONG.values())
-def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most, image):
-    ring, seen = SHAPES["ring"], camera().rays()
+def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most):
+    ring = SHAPES["ring"]
     truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p))))
-    rendering = NEWTON.render(wrong, seen if image else Rays(seen.origins, seen.directions))
+    rendering = NEWTON.render(wrong, camera().rays())
     both = truth.hit & rendering.hit
     assert (truth.hit ^ rendering.hit).sum() <= 0.01 * truth.hit.sum()
     assert (rendering.distance - truth.distance)[both].abs().quantile(0.9) < 1e-5
@@ -155,15 +155,6 @@ def test_residuals_and_closest_values_of_a_steep_field_are_its_own():
     inside = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]))
     ball = Shape(lambda p: 4 * SHAPES["ball"](p))
     assert NEWTON.render(ball, inside).residual.item() == pytest.approx(4 * -0.6)
-
-
-def test_values_of_a_bound_are_lengths_however_steep_they_are():
-    wire = SHAPES["brick"] | capsule((-0.8, 0.7, 0.0), (0.8, 0.7, 0.0), 0.02)
-    jumps = Shape(lambda p: torch.where(wire(p) > 0.3, wire(p), wire(p).clamp_max(0.1)), Kind.BOUND)
-    meters = [Meter(wire), Meter(jumps)]
-    plain, jumping = (NEWTON.render(meter, camera().rays()) for meter in meters)
-    assert (jumping.hit ^ plain.hit).sum() <= 3
-    assert meters[1].counts.value < 2.5 * meters[0].counts.value
 
 
 def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():
@@ -215,7 +206,7 @@ def test_the_silhouette_asks_values_only_where_a_ray_is_wrong():
             assert gradient.item() == pytest.approx(sign)  # the mean over rays that violate it
 
 
-@each("steps", [1, 2, 3, 6, 7, 10])
+@each("steps", [1, 3, 7])
 def test_in_an_image_few_steps_leave_all_hits_to_the_search(steps):
     rays, few = camera(48).rays(), replace(NEWTON, steps=steps)
     apart, together = few.render(sphere(0.6), rays.flat()), few.render(sphere(0.6), rays)
@@ -243,73 +234,18 @@ def test_a_ray_that_begins_inside_has_started_inside_however_little():
         torch.testing.assert_close(rendering.distance, torch.zeros(3, dtype=torch.float64))
 
 
-def test_a_thin_sheet_in_front_of_a_wall_is_hit_and_not_the_wall():
-    angle = torch.tensor(0.5, dtype=torch.float64)
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    turn = torch.stack([angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos()]).view(3, 3)
-    sheet = box((0.6, 0.6, 0.006)).rotate(turn)
-    rays = beam(*((x / 100, 0.0, -1.5 + x / 3000) for x in range(-20, 20)))
-    alone, before = NEWTON.render(sheet, rays), NEWTON.render(sheet | plane((0, 0, -1), -0.15), rays)
-    assert alone.hit.all()
-    torch.testing.assert_close(before.distance, alone.distance, rtol=0, atol=1e-6)
-
-
-@each(
-    "thin",
-    [
-        capsule((-0.5, 0.1, -0.3), (0.5, -0.1, 0.4), 0.015),
-        box((0.5, 0.01, 0.3)).translate((0.0, 0.2, 0.0)) | box((0.01, 0.3, 0.5)),
-    ],
-)
-def test_in_an_image_what_is_thin_is_hit_and_not_the_wall_behind(thin):
-    rays = camera(64, torch.float64).rays()
-    wall = plane(tuple(torch.nn.functional.normalize(rays.origins[0, 0], dim=0).tolist()), -0.5)
-    image, truth = replace(NEWTON, unseen=1e-4, steps=100).render(thin | wall, rays), exact(thin | wall)
-    in_front = thin(truth.points) < 1e-9
-    assert in_front.sum() > 20
-    assert ((image.distance - truth.distance).abs()[in_front] < 0.05).all()
-    assert (thin(image.points)[in_front] < NEWTON.march_epsilon).all()
-
-
 def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
     y, x = torch.meshgrid(*[torch.linspace(-0.8, 0.8, 16, dtype=torch.float64)] * 2, indexing="ij")
     origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
     focus = torch.tensor([0.0, 0.0, 0.98], dtype=torch.float64)
     rays = Rays(origins, torch.nn.functional.normalize(focus - origins, dim=-1), image=True)
     draw, hits = torch.Generator().manual_seed(0), 0
-    places = torch.rand(40, 3, generator=draw) * torch.tensor([0.6, 0.6, 0.3]) - torch.tensor([0.3, 0.3, 0.7])
+    places = torch.rand(12, 3, generator=draw) * torch.tensor([0.6, 0.6, 0.3]) - torch.tensor([0.3, 0.3, 0.7])
     for place in places.tolist():
         image, alone = (NEWTON.render(sphere(0.04, place), some) for some in (rays, rays.flat()))
         assert torch.equal(image.hit.flatten(), alone.hit)
         hits += int(alone.hit.sum())
-    assert hits > 40
-
-
-def test_a_field_that_is_infinite_somewhere_gives_finite_distances():
-    infinite = Shape(lambda p: torch.where(p.norm(dim=-1) > 0.8, torch.inf, sphere(0.6)(p)), Kind.BOUND)
-    for rays in (camera(48).rays(), camera(48).rays().flat()):
-        rendering = NEWTON.render(infinite, rays)
-        assert rendering.distance.isfinite().all() and rendering.points.isfinite().all()
-
-
-def test_steps_too_short_for_the_dtype_end_a_march_at_a_finite_distance():
-    rays = ViewSampler(2.5, 5.0, (0.0, 360.0), (15.0, 35.0), 4).camera(68.4, 25.0).resized(1, 1).rays()
-    plain = replace(NEWTON, unseen=1e-4)
-    image, alone = (plain.render(box((0.4, 0.3, 0.5)), some) for some in (rays, rays.flat()))
-    assert image.distance.item() == pytest.approx(alone.distance.item(), abs=1e-5)
-    assert replace(NEWTON, march_epsilon=1e-8, steps=60).render(sphere(0.6), camera().rays()).distance.isfinite().all()
-
-
-def test_a_miss_beside_a_surface_at_the_rim_of_the_sphere_has_a_closest_sample():
-    at_the_rim, mask = sphere(0.1, (0.82, 0.042, -0.369)), torch.zeros(64, 64, dtype=torch.bool)
-    image = NEWTON.render(at_the_rim, camera().rays())
-    assert (image.closest[image.status == Status.MISS] > 0).all()
-    alone = NEWTON.render(at_the_rim, camera().rays().flat())
-    losses = [
-        NEWTON.silhouette_loss(at_the_rim, rays, found, wanted).item()
-        for rays, found, wanted in ((camera().rays(), image, mask), (camera().rays().flat(), alone, mask.flatten()))
-    ]
-    assert losses[0] == pytest.approx(losses[1], rel=0.01)
+    assert hits > 12
 
 
 @by_shape
@@ -362,6 +298,7 @@ def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unse
     taken_back = marched(0.4, 0.58, 0.005)
     assert taken_back.stopped(Stop.ON_THE_WAY).item()
     assert taken_back.distance.item() == pytest.approx(0.4025 + 0.58)
+    assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()  # however little
 
 
 def test_what_a_step_was_taken_back_from_is_no_closest_sample():
@@ -370,10 +307,6 @@ def test_what_a_step_was_taken_back_from_is_no_closest_sample():
     assert taken_back.least.item() == pytest.approx(0.3)
     assert taken_back.distance.item() == pytest.approx(0.8225)  # and no further
     assert marched(0.4, 0.39, -0.005, 0.3, -0.005).stopped(Stop.CROSSED).item()
-
-
-def test_a_ray_that_begins_a_little_inside_began_inside():
-    assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()
 
 
 def test_a_step_of_no_length_has_no_slope():
@@ -412,18 +345,10 @@ def test_a_step_whose_spheres_lie_apart_is_taken_back():
     assert at.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + FURTHER))
 
 
-def test_a_plate_that_a_long_step_would_pass_is_hit():
-    """Beside a sphere the slope along the ray is small and steps are long; a plate lies behind."""
-    plate = box((0.5, 0.5, 0.004)).translate((0.0, 0.0, 0.31))
-    rays = beam(*((0.4 + x / 500, 0.0, -2.0) for x in range(40)))
-    found = NEWTON.render(sphere(0.38) | plate | plane((0, 0, -1), -0.5), rays)
-    torch.testing.assert_close(found.distance, torch.full((40,), 2.306).double(), rtol=0, atol=1e-6)
-
-
 @each("thickness", [0.008, 0.02])
 def test_a_step_that_lands_in_a_wall_does_not_pass_the_plate_before_it(thickness):
     """Rays over a floor take long steps; behind the plate across them stands a wall."""
-    for place in range(12):
+    for place in range(0, 12, 3):
         front = 0.1 + 0.007 * place
         plate = box((0.5, 0.5, thickness / 2)).translate((0.0, 0.0, front + thickness / 2))
         scene = plane((0, 1, 0), 0.0) | plate | plane((0, 0, -1), -(front + thickness + 0.005))
@@ -436,7 +361,7 @@ def test_finer_rays_do_not_pass_what_their_coarse_ray_left_unseen(pitch):
     y, x = torch.meshgrid(*[pitch * torch.arange(32).double()] * 2, indexing="ij")
     origins = torch.stack([x, 0.03 + y, torch.full_like(x, -2.0)], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).double().expand_as(origins), image=True)
-    for place in range(8):
+    for place in range(0, 8, 2):
         front = 0.0137 * 5 * place - 0.4
         plate = box((0.5, 0.5, 0.006)).translate((0.0, 0.0, front + 0.006))
         found = replace(NEWTON, steps=200).render(plane((0, 1, 0), 0.0) | plate | plane((0, 0, -1), -0.6), rays)
@@ -452,12 +377,6 @@ def test_rays_that_cut_little_off_an_edge_hit_it(half_side):
     assert NEWTON.render(shape, rays).hit.all()
 
 
-def test_the_search_begins_at_the_last_value_above_the_threshold():
-    reached = marched(0.4, 0.002, 5e-5)
-    assert reached.stopped(Stop.NEAR).item()
-    assert (reached.free.item(), reached.free_value.item()) == pytest.approx((0.4025, 0.002))
-
-
 def test_the_tip_of_a_cone_is_hit_and_spoils_no_gradient():
     height = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
 
@@ -470,63 +389,3 @@ def test_the_tip_of_a_cone_is_hit_and_spoils_no_gradient():
     assert rendering.distance.tolist() == pytest.approx([1.7, 1.775, 1.85], abs=1e-6)
     (gradient,) = torch.autograd.grad(rendering.distance[1:].sum(), height)
     assert gradient.item() == pytest.approx(-2.0)
-
-
-def test_the_gradient_of_an_image_is_that_of_each_of_its_rays():
-    radius, image = torch.tensor(0.6, dtype=torch.float64, requires_grad=True), camera(24, torch.float64).rays()
-    origins = image.origins.clone().requires_grad_()
-    rendering = NEWTON.render(sphere(radius), Rays(origins, image.directions, image=True))
-    hit = rendering.hit
-    normal = torch.nn.functional.normalize(rendering.points.detach(), dim=-1)
-    cosine = -(normal * image.directions).sum(-1)
-    weight = (
-        torch.rand(hit.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * (cosine > 0.3) * hit
-    )
-    towards = torch.autograd.grad((weight * rendering.distance).sum(), (radius, origins))
-    assert towards[0].item() == pytest.approx(-(weight / cosine)[hit].sum().item(), rel=0.01)
-    expected = torch.where(hit[..., None], weight[..., None] * normal / cosine[..., None], 0.0)
-    torch.testing.assert_close(towards[1], expected, rtol=0.05, atol=0.02)
-
-
-@each(
-    "setting, value, remedy",
-    [
-        ("steps", 0, "at least 1"),
-        ("march_epsilon", 0.0, "positive"),
-        ("unseen", 0.0, "positive"),
-        ("newton_steps", 0, "at least 1"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(setting, value, remedy):
-    with pytest.raises(ValueError, match=f"{setting} must be .*{remedy}"):
-        replace(NEWTON, **{setting: value})
-
-
-@each("image", [True, False])
-def test_from_where_a_ray_has_cleared_the_field_is_large_to_its_end(image):
-    field, rays = SHAPES["ring"] | sphere(0.2, (0.0, 0.0, -0.7)), camera().rays()
-    reached = NEWTON.tracer.trace(field, rays if image else rays.flat())[0]
-    left = reached.stopped(Stop.LEFT).nonzero().squeeze(-1)
-    cleared = reached.cleared[left]
-    assert ((cleared < reached.leave[left]) & (reached.least[left] < CLEAR)).sum() > 50
-    shares = torch.linspace(0, 1, 200)
-    behind = field(rays.flat()[left].at_each(cleared[:, None] + shares * (reached.leave[left] - cleared)[:, None]))
-    assert behind.min() > CLEAR - 0.01
-
-
-def test_rays_that_begin_inside_do_so_beside_rays_that_do_not():
-    """Parallel rays that begin on a plane, which the surface cuts: nothing behind their beginnings is met."""
-    x, y = torch.meshgrid(0.01 * torch.arange(-32, 32) + 0.005, 0.01 * torch.arange(-32, 32), indexing="xy")
-    origins = torch.stack([x, y, torch.full_like(x, -0.5)], dim=-1)
-    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand_as(origins), image=True)
-    with torch.no_grad():
-        found = NEWTON.render(plane((0.3, 0.0, -1.0), 0.5 / 1.0), rays)
-    within = x < -0.004  # else the first value is below the march's threshold
-    assert (found.status == torch.where(within, Status.STARTED_INSIDE, Status.HIT)).all()
-    assert torch.allclose(found.distance[~within], 0.3 * x[~within], atol=1e-4)
-
-
-def test_a_surface_just_before_the_end_of_the_sphere_is_met():
-    rendering = NEWTON.render(plane((0.0, 0.0, -1.0), -0.995), beam((0.0, 0.0, -2.0)))
-    assert rendering.hit.all()
-    assert rendering.distance.item() == pytest.approx(2.995, abs=1e-6)

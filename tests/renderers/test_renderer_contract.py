@@ -1,7 +1,7 @@
 """What every renderer in conf/renderer must hold to, built as the command line builds it.
 
 A renderer is tested on fields of the kinds that it says it needs, and only for the gradients that it says it has.
-A variant, whose YAML builds on another, may give up accuracy for speed, or safety as the paper does: it may find fewer
+A variant, a row of conf/variants.yaml, may give up accuracy for speed, or safety as the paper does: it may find fewer
 hits, but those that it finds are right, and all else holds.
 """
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from bench.config import build
+from bench.config import build, load
 from bench.tables import choice, names
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
@@ -25,16 +25,19 @@ from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 PARTS = ("distance", "status", "points", "residual", "closest")
 
 
-VARIANTS = [name for name in names("renderer") if "defaults" in choice("renderer", name)]
+# Those with code of their own; the others have other numbers.
+VARIANTS = ["naive_practical", "dist_paper", "dist_slope_bound", "dist_auto_relaxed", "dvr_early_stop", "volsdf_budget"]
 
 
-@pytest.fixture(scope="module", params=[name for name in names("renderer") if name not in VARIANTS])
+@pytest.fixture(
+    scope="module", params=[name for name in names("renderer") if "defaults" not in choice("renderer", name)]
+)
 def renderer(request, compose_config) -> Renderer:
-    changed = {
-        "custom": [f"renderer._target_={request.config.getoption('--renderer')}"],
-        "mesh_proxy": ["renderer.grid=48"],  # an eighth of the values; its accuracy is stated
-    }
-    return build(compose_config(f"renderer={request.param}", *changed.get(request.param, [])).renderer, "renderer")
+    if request.param == "custom":
+        own = f"renderer._target_={request.config.getoption('--renderer')}"
+        return build(compose_config("renderer=custom", own).renderer, "renderer")
+    changed = {"mesh_proxy": {"grid": 48}}  # an eighth of the values; its accuracy is stated
+    return load("renderer", request.param, **changed.get(request.param, {}))
 
 
 def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:
@@ -85,7 +88,7 @@ def mixed(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Ray
     return Rays(origins.view(*shape, 3).to(dtype), directions.view(*shape, 3).to(dtype))
 
 
-def aimed(seed: int, count: int = 20) -> Rays:
+def aimed(seed: int, count: int = 12) -> Rays:
     """Rays from all around at what lies about the origin, so that none grazes it."""
     generator = torch.Generator().manual_seed(seed)
     around = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
@@ -196,7 +199,7 @@ def test_rays_that_find_nothing_miss(renderer):
 
 
 def test_splitting_the_rays_changes_nothing(renderer):
-    rays, field = mixed(60), box((0.4, 0.3, 0.5))
+    rays, field = mixed(15), box((0.4, 0.3, 0.5))
     whole = renderer.render(field, rays)
     for size in (1, 7):
         parts = [
@@ -286,8 +289,8 @@ def test_the_right_mask_costs_less_than_its_opposite(renderer):
 
 
 @pytest.fixture(scope="module", params=VARIANTS)
-def variant(request, compose_config) -> Renderer:
-    return build(compose_config(f"renderer={request.param}").renderer, "renderer")
+def variant(request) -> Renderer:
+    return load("renderer", request.param)
 
 
 def test_a_variant_gives_what_a_renderer_gives_and_what_it_hits_is_there(variant):
@@ -303,9 +306,6 @@ def test_a_variant_gives_what_a_renderer_gives_and_what_it_hits_is_there(variant
     wrong = (rendering.distance - truth).abs()[rendering.hit]
     assert wrong.numel() == 0 or wrong.max() < tolerance(variant, 0.9)
     assert (rendering.residual.abs()[rendering.hit] <= getattr(variant, "epsilon", torch.inf)).all()
-
-
-def test_a_variants_gradients_are_finite(variant):
     test_gradients_are_finite_on_every_kind_of_ray(variant)
 
 
@@ -316,7 +316,7 @@ def rotation(seed: int) -> Tensor:
     return q * torch.linalg.det(q)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(
     seed=st.integers(0, 2**32),
     offset=st.tuples(*[st.floats(-0.15, 0.15)] * 3),
@@ -333,7 +333,7 @@ def test_a_rigid_motion_moves_the_hit_with_the_ray(renderer, seed, offset, half)
     torch.testing.assert_close(after.points, before.points @ turn.T + offset, rtol=0, atol=tolerance(renderer, 0.25))
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seed=st.integers(0, 2**32), factor=st.floats(0.5, 1.6))
 def test_scaling_scales_the_distance(renderer, seed, factor):
     rays = aimed(seed)
@@ -345,7 +345,7 @@ def test_scaling_scales_the_distance(renderer, seed, factor):
     assert (factor * before.distance - after.distance).abs().max() < 2 * tolerance(renderer, 0.25)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seed=st.integers(0, 2**32))
 def test_a_tighter_epsilon_never_raises_the_residual(renderer, seed):
     if not hasattr(renderer, "epsilon"):

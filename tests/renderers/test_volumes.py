@@ -21,7 +21,6 @@ NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "
 BAND = load("renderer", "relaxed_boundary")
 VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda one: type(one).__name__)
 BLURRED = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda one: type(one).__name__)
-HARDER = [(0.05, 0.1), (0.01, 0.01), (0.002, 0.1), (0.002, 0.01)]  # widths and bounds of VolSDF's error
 PLANES = [case for case in CASES if case.name.startswith("plane")]
 
 
@@ -52,8 +51,7 @@ def test_neus_is_unbiased_and_volsdf_is_not(case):
 
 
 @pytest.mark.parametrize(
-    ("width", "error_bound"),
-    [(0.05, 0.01), (0.01, 0.1), *(pytest.param(*one, marks=pytest.mark.slow) for one in HARDER)],
+    ("width", "error_bound"), [(0.05, 0.01), (0.01, 0.1), pytest.param(0.002, 0.01, marks=pytest.mark.slow)]
 )
 def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
     """VolSDF, Theorem 1 and Algorithm 1, against 20,000 samples of the opacity along each ray."""
@@ -77,6 +75,7 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
         assert sharp / len(entry) > (0.9 if error_bound == 0.1 else 0.5)  # others are sampled for more
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("renderer", "least"), [(VOLSDF, 1.0), (load("renderer", "volsdf_budget"), 0.6)])
 def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(renderer, least):
     rays = parallel(12).flat()
@@ -99,10 +98,7 @@ def area_rates(renderer, radius: float, side: int) -> tuple[float, float, float]
     return cell * opacity.sum().item(), cell * rate.item(), each.std().item()
 
 
-@pytest.mark.parametrize(
-    ("blur", "side"),
-    [(0.1, 200), (0.03, 200), *(pytest.param(blur, 400, marks=pytest.mark.slow) for blur in (0.01, 0.003))],
-)
+@pytest.mark.parametrize(("blur", "side"), [(0.1, 200), pytest.param(0.01, 400, marks=pytest.mark.slow)])
 def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_width(blur, side):
     """A circle's area grows by its circumference; the mean over a band outside of it is that of a radius half a band
     larger (Wang et al. 2024, Sec. 4), and the noise grows as the band gets thinner."""
@@ -112,12 +108,7 @@ def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_wi
     assert noise > area_rates(BAND.with_blur(2 * blur), 0.5, side)[2]
 
 
-def test_without_a_band_the_silhouette_has_no_gradient():
-    leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    rendering = load("renderer", "idr").render(sphere(leaf), parallel(40))
-    assert not rendering.opacity.requires_grad
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("renderer", "share", "margin"),
     [(NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97)],
@@ -218,19 +209,6 @@ def test_a_narrower_blur_brings_the_image_closer_to_the_hits(renderer):
     assert errors == sorted(errors, reverse=True)
 
 
-@VOLUMES
-def test_a_wide_blur_puts_weight_before_the_surface(renderer):
-    """What users of these methods report as floaters: light that stays in front of the surface."""
-    ray, field = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None]), sphere(0.5)
-    shares = []
-    for blur in (0.1, 0.01):
-        volume = renderer.with_blur(blur).render(field, ray).volume
-        early = volume.distance < 1.5 - 0.05
-        shares.append((volume.weight * early).sum().item())
-    assert shares[0] > 0.1
-    assert shares[1] < 0.05
-
-
 @BLURRED
 def test_a_sharpening_ends_at_the_setting(renderer):
     if not isinstance(renderer, Scheduled):
@@ -285,15 +263,7 @@ def test_a_volume_sums_any_values():
 
 
 def test_settings_that_cannot_be_are_refused():
-    for renderer, settings in (
-        (NEUS, ("samples", "sharpness", "round_samples", "sphere_radius")),
-        (VOLSDF, ("width", "error", "fine_samples", "sphere_radius")),
-        (UNISURF, ("interval", "occupancy_width", "sphere_radius")),
-        (BAND, ("band", "steps", "least_slope", "mask_sharpness", "sphere_radius")),
-    ):
-        for setting in settings:
-            with pytest.raises(ValueError, match=setting):
-                replace(renderer, **{setting: 0})
-    for renderer in (NEUS, BAND):
-        with pytest.raises(ValueError, match="mask_weight must be at least 0, not -1"):
-            replace(renderer, mask_weight=-1)
+    for renderer, setting in ((NEUS, "sharpness"), (VOLSDF, "error"), (UNISURF, "interval"), (BAND, "band")):
+        for wrong in (setting, "sphere_radius"):
+            with pytest.raises(ValueError, match=f"{wrong} must be positive, not 0"):
+                replace(renderer, **{wrong: 0})

@@ -66,7 +66,7 @@ def test_epsilon_and_steps_are_resolved_in_order_with_notes():
 
 
 def test_auto_without_an_equation_is_an_error():
-    with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps, n_ray_samples"):
+    with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps have one"):
         resolved({"alpha": "auto"}, VIEW, TEN)
     with pytest.raises(ValueError, match=r"view\.distance - 1 must be positive.*outside of the unit sphere"):
         epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), {}, TEN)
