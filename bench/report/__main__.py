@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from bench.records.read import RESULTS, read_records
-from bench.report.data.frame import NO_PARQUET, write_frame
+from bench.report.data.frame import write_frame
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, write_index
 from bench.report.write.paper import write_paper, write_readme
@@ -32,12 +32,10 @@ def main(arguments: list[str]) -> None:
         if ship := given.get("ship"):
             print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
             return
-        frames = write_frame(records, results_dir)
-        if len(frames) == 1:
-            print(f"note: {NO_PARQUET}", file=sys.stderr)
+        table = write_frame(records, results_dir)
         broken: list[str] = []
         papers = write_paper(records, results_dir, problems=broken)
-        for path in (*frames, *papers, *write_sweeps(records, results_dir)):
+        for path in (table, *papers, *write_sweeps(records, results_dir)):
             print(path)
         for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
             print(problem, file=sys.stderr)

@@ -6,7 +6,7 @@
 
 from bench.pictures import style
 from bench.records import format
-from bench.report import compare, gallery, medians
+from bench.report import compare, conditions, gallery, medians, single_view
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import Runs, Selection
 from bench.report.write import chart, table
@@ -18,11 +18,13 @@ __all__ = [
     "Selection",
     "chart",
     "compare",
+    "conditions",
     "curves",
     "format",
     "gallery",
     "medians",
     "records",
+    "single_view",
     "statistics",
     "style",
     "table",

@@ -1,6 +1,5 @@
-"""The table of all runs has typed columns, whatever the runs are, and is the same as CSV and as Parquet."""
+"""The table of all runs has typed columns, whatever the runs are, and is the same as CSV."""
 
-import importlib.util
 import sys
 
 import pandas as pd
@@ -10,7 +9,6 @@ import bench
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
 from bench.report.data.frame import COLUMNS, write_frame
-from datasets.extras import install
 from tests.report.test_report import crashed, record, write_run
 
 
@@ -53,18 +51,9 @@ def test_the_files_have_the_columns_of_the_table(results, capsys):
     report([f"results_dir={results}"])
     runs = bench.load(results)
     said = capsys.readouterr()
-    assert said.out.splitlines()[:2] == [str(results / name) for name in ("runs.csv", "results.parquet")]
-    pd.testing.assert_frame_equal(pd.read_parquet(results / "results.parquet"), runs, check_categorical=False)
+    assert said.out.splitlines()[0] == str(results / "runs.csv")
     table = pd.read_csv(results / "runs.csv")
     assert list(table) == list(runs) and list(table.folder) == list(runs.folder)
-
-
-def test_without_pyarrow_a_note_says_what_is_missing(results, monkeypatch, capsys):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name))
-    report([f"results_dir={results}"])
-    assert f"needs pyarrow: {install('parquet')}" in capsys.readouterr().err
-    assert not (results / "results.parquet").exists() and (results / "runs.csv").is_file()
 
 
 @pytest.mark.parametrize("odd", [{"threads": "auto"}, {"threads": 1.5}, {"threads": 10**400}, {"dirty": "yes"}])
@@ -74,11 +63,11 @@ def test_a_record_from_elsewhere_with_an_odd_value_leaves_the_table_whole(result
     runs = bench.load(results)
     (name, value), *_ = odd.items()
     assert len(runs) == 4 and str(runs[name].dtype) == "string" and runs[name][0] == str(value)
-    assert write_frame(read_records(results)[0], results)[0].is_file()
+    assert write_frame(read_records(results)[0], results).is_file()
 
 
 def test_no_runs_are_a_table_and_no_folder_an_error(tmp_path):
-    assert [path.name for path in write_frame([], tmp_path)] == ["runs.csv", "results.parquet"]
+    assert write_frame([], tmp_path).name == "runs.csv"
     with pytest.raises(ValueError, match="there is no such folder"):
         bench.load(tmp_path / "nowhere")
 

@@ -191,18 +191,12 @@ def test_no_runs_yet(tmp_path):
     assert page.runs["count"] == 0 and page.runs["tasks"] == []
 
 
-def command(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
-
-
-def test_command_prints_the_page_last(results):
-    done = command("-m", "bench.report", f"results_dir={results}")
-    assert done.returncode == 0
-    assert [line.split(": ")[:2] for line in done.stderr.splitlines()] == [
-        ["not read", name] for name in ("damaged", "future", "unfinished")
-    ]
-    assert done.stdout.splitlines()[-1] == str(results / "index.html")
-    assert (results / "index.html").is_file()
+def test_command_prints_the_page_last(results, capsys):
+    main([f"results_dir={results}"])
+    said = capsys.readouterr()
+    unread = [["not read", name] for name in ("damaged", "future", "unfinished")]
+    assert [line.split(": ")[:2] for line in said.err.splitlines()] == unread
+    assert said.out.splitlines()[-1] == str(results / "index.html") and (results / "index.html").is_file()
 
 
 @pytest.mark.parametrize(
@@ -229,7 +223,7 @@ def test_report_never_imports_torch():
         "[importlib.import_module('bench.report.' + m.name) for m in pkgutil.iter_modules(bench.report.__path__)];"
         "assert 'bench.report.write.html' in sys.modules; assert 'torch' not in sys.modules"
     )
-    done = command("-c", code)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

@@ -10,7 +10,8 @@ from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import choose
 from bench.report.write import paper
-from bench.report.write.paper import find_paper, studies, write_paper
+from bench.report.write.paper import find_paper, papers, studies, write_paper
+from bench.report.write.result import Shown
 from bench.studies import table1
 from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
 
@@ -102,6 +103,19 @@ def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch)
     problems: list[str] = []
     written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
     assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
+
+
+def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path, monkeypatch):
+    own, shipped = tmp_path / "own" / "paper", tmp_path / "shipped" / "paper"
+    monkeypatch.setattr(paper, "SHIPPED", shipped.parent)
+    for folder, row in ((own, "mine"), (shipped, "ours")):
+        folder.mkdir(parents=True)
+        for name, last in (("alike", "Error"), ("other", f"Error of {row}")):
+            shown = Shown(title="T.", columns=["Row", last], rows=[[row, "1"]])
+            (folder / f"{name}.json").write_text(shown.to_json())
+    entries, wholes = papers(own.parent)
+    rows = {entry["name"]: wholes[entry["key"]]["rows"] for entry in entries}
+    assert rows == {"alike": [["mine", "1"], ["shipped: ours", "1"]], "other": [["mine", "1"]]}
 
 
 def test_every_study_has_pages_of_its_own():

@@ -13,6 +13,7 @@ import trimesh
 from bench.records.names import differences
 from bench.records.read import RESULTS, not_run
 from bench.records.record import NOT_RUN, RunStatus
+from bench.report.data.records import definition
 from bench.report.site.columns import names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
@@ -21,6 +22,7 @@ from bench.report.site.words import STATUSES, TASKS, asked, command
 from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
 from tests.browser import made
+from tests.looped import each
 from tests.report.page_data import Page
 from tests.report.test_report import record, write_run
 
@@ -130,6 +132,20 @@ def test_the_lines_for_python_open_the_run(tmp_path):
     exec(Page(results).run("completion-0001")["python"], found)  # as a reader would paste them
     assert found["run"].folder == "completion-0001" and found["run"].chamfer_l2 == 0.002
     assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+
+
+@each(
+    "key, name",
+    [
+        ("lost, false", "false"),
+        ("saved_...", "saved_steps"),
+        ("frontal.code_cosine", "grazing.code_cosine"),
+        ("depth_error", "depth_error_p99"),
+    ],
+)
+def test_a_metric_has_its_definition(key, name):
+    assert definition({"hull": "Another.", key: "Known."}, name) == "Known."
+    assert definition({key: "Known."}, "unlike") == definition({key: "Known."}, "savedsteps") == ""
 
 
 def test_costs_are_by_phase_and_add_up(tmp_path):

@@ -1,6 +1,5 @@
-"""All runs of a results folder as one table with typed columns, for pandas, a spreadsheet or Parquet."""
+"""All runs of a results folder as one table with typed columns, for pandas or a spreadsheet."""
 
-import importlib.util
 import os
 import warnings
 from collections.abc import Iterable
@@ -13,7 +12,6 @@ from bench.records.names import flat
 from bench.records.read import RESULTS, read_records
 from bench.records.record import row_name, started
 from bench.report.data.records import index
-from datasets.extras import install
 
 TEXT, CATEGORY, WHOLE, NUMBER, TRUTH, TIME = (
     *("string", "category", "Int64", "Float64", "boolean"),
@@ -36,8 +34,6 @@ COLUMNS = {  # that every table has, with their types
 MACHINE = ("cpu", "device", "threads", "commit", "dirty")  # of the record's environment
 PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
-PARQUET = "results.parquet"
-NO_PARQUET = f"{PARQUET} was not written, as it needs pyarrow: {install('parquet')}"
 
 
 def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
@@ -75,14 +71,11 @@ def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame({name: _series(values, _type(name, values)) for name, values in columns.items()})
 
 
-def write_frame(records: Iterable[dict[str, Any]], results_dir: Path) -> list[Path]:
-    """Writes `runs.csv` of a results folder, and `results.parquet` where pyarrow is installed; gives the paths."""
-    frame, table = to_frame(records), results_dir / "runs.csv"
-    frame.to_csv(table, index=False)
-    if importlib.util.find_spec("pyarrow") is None:
-        return [table]
-    frame.to_parquet(results_dir / PARQUET, index=False)
-    return [table, results_dir / PARQUET]
+def write_frame(records: Iterable[dict[str, Any]], results_dir: Path) -> Path:
+    """Writes `runs.csv` of a results folder, and gives its path."""
+    table = results_dir / "runs.csv"
+    to_frame(records).to_csv(table, index=False)
+    return table
 
 
 def _row(record: dict[str, Any]) -> dict[str, Any]:

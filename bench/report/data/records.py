@@ -167,7 +167,7 @@ def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
     """A line with the headings and the definition of each metric that is shown; `names` has the heading by metric."""
     lines: dict[str, list[str]] = {}
     for name, heading in names.items():
-        told = next(filter(None, (definition(record["definitions"], name) for record in records)), "")
+        told = next(filter(None, (str(definition(record["definitions"], name)) for record in records)), "")
         lines.setdefault(told, []).append(heading)
     return [f"{', '.join(dict.fromkeys(headings))}: {told}" for told, headings in lines.items() if told]
 

@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -113,7 +113,7 @@ def find_paper(results_dir: Path) -> list[Found]:
     names = {one.name for one in own}
     others = [] if results_dir.resolve() == SHIPPED else _in(SHIPPED)
     shipped = [one for one in others if one.name not in names and one.shown.title]
-    return own + [Found(one.name, one.shown, None, {}, one.base, shipped=True) for one in shipped]
+    return own + [replace(one, picture=None, files={}, shipped=True) for one in shipped]
 
 
 def _in(results_dir: Path) -> list[Found]:
@@ -121,7 +121,7 @@ def _in(results_dir: Path) -> list[Found]:
     folder = results_dir / FOLDER
     kinds = (*SUFFIXES, ".png", ".json")
     seen = {path.stem for path in folder.glob("[!.]*") if path.suffix in kinds and path.is_file()}
-    found = [found_at(folder, name, (FOLDER,)) for name in seen]
+    found = [found_at(folder / name, results_dir) for name in seen]
     known = [one for one in found if one.files or one.picture or one.shown.title]
     return sorted(known, key=lambda one: (one.shown.place or 10**6, one.name))
 
@@ -130,8 +130,7 @@ def find_sweeps(results_dir: Path) -> list[Found]:
     """The tables of sweeps, the sweep that was asked for last first, each by the name of its sweep."""
     tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.json")
     folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
-    found = [(folder.name, found_at(folder, TABLE, (SWEEPS, folder.name))) for folder in folders]
-    return [Found(name, one.shown, one.picture, one.files, one.base) for name, one in found]
+    return [replace(found_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
 
 
 def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
@@ -154,7 +153,7 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
     """The shipped rows of a table of the user's, marked; none where its columns are others, or it is shipped itself."""
     if found.shipped or found.base.parents[1] != results_dir or results_dir.resolve() == SHIPPED:
         return []
-    shipped = found_at(SHIPPED / FOLDER, found.name, (FOLDER,)).shown
+    shipped = found_at(SHIPPED / FOLDER / found.name, SHIPPED).shown
     same = shipped.columns and shipped.columns == found.shown.columns
     return [[BESIDE + row[0], *row[1:]] for row in shipped.rows] if same else []
 
@@ -180,15 +179,14 @@ def _asked(folder: Path) -> float:
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
-def found_at(folder: Path, name: str, place: tuple[str, ...]) -> Found:
-    """The table or figure of that name, whose folder is at a place in the results folder; links out are left out."""
-    root = folder.parents[len(place) - 1]
-    files = {suffix: folder / (name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
+def found_at(base: Path, root: Path) -> Found:
+    """The table or figure whose files in a results folder have that path before their suffix, but for links out."""
+    files = {suffix: base.with_name(base.name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
     within = {suffix: path for suffix, path in files.items() if path.is_file() and not leads_out(path, root)}
-    links = {suffix: link(*place, path.name) for suffix, path in within.items()}
+    links = {suffix: link(*path.relative_to(root).parts) for suffix, path in within.items()}
     named = {suffix[1:].upper(): links[suffix] for suffix in SUFFIXES if suffix in links}
     shown = read_shown(within[".json"]) if ".json" in within else Shown()
-    return Found(name, shown, links.get(".png"), named, folder / name)
+    return Found(base.name, shown, links.get(".png"), named, base)
 
 
 def link(*parts: str) -> str:
