@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+BANDS = ("red", "green", "blue")
 LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float32
 
 
@@ -97,6 +98,17 @@ class Mesh:
         heights = self.vertices[self.faces[:, 0]] - self.vertices.mean(axis=0)
         return np.bincount(self.parts, weights=(heights * self.crosses).sum(axis=1) / 6)
 
+    @property
+    def holes(self) -> int:
+        """Number of loops of edges that have a face on one side only."""
+        import trimesh
+
+        steps = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, uses = np.unique(steps, axis=0, return_counts=True)
+        rim = edges[uses == 1]
+        labels = trimesh.graph.connected_component_labels(rim, node_count=len(self.vertices))
+        return len(np.unique(labels[rim]))
+
     def compact(self) -> "Mesh":
         """The mesh without unused vertices."""
         used, faces = np.unique(self.faces, return_inverse=True)
@@ -104,15 +116,25 @@ class Mesh:
         return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3), colours=colours)
 
     def save(self, path: str | Path) -> None:
-        """Writes a binary .ply file; coordinates are float32."""
-        import trimesh
-
+        """Writes a binary .ply file."""
         path = Path(path)
         if path.suffix.lower() != ".ply":
             raise ValueError(f"path: must end in .ply, found '{path.name}'; name it '{path.stem}.ply'")
-        colours = None if self.colours is None else (255 * self.colours.clip(0, 1)).round().astype(np.uint8)
-        made = trimesh.Trimesh(self.vertices, self.faces, vertex_colors=colours, process=False)
-        made.export(path, vertex_normal=False)
+        coloured = "" if self.colours is None else "".join(f"property uchar {name}\n" for name in BANDS)
+        header = (
+            "ply\nformat binary_little_endian 1.0\n"
+            f"element vertex {len(self.vertices)}\n"
+            "property double x\nproperty double y\nproperty double z\n"
+            f"{coloured}element face {len(self.faces)}\n"
+            "property list uchar int vertex_indices\nend_header\n"
+        )
+        rows = np.empty(len(self.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+        rows["count"], rows["corners"] = 3, self.faces
+        places = np.empty(len(self.vertices), dtype=[("place", "<f8", 3), ("colour", "u1", 3 if coloured else 0)])
+        places["place"] = self.vertices
+        if self.colours is not None:
+            places["colour"] = (255 * self.colours.clip(0, 1)).round()
+        path.write_bytes(header.encode("ascii") + places.tobytes() + rows.tobytes())
 
 
 def normalise(mesh: Mesh, radius: float) -> Mesh:

@@ -16,7 +16,7 @@ WRAP_OFFSET = 0.1  # % of the diagonal: how far outside the surface a wrap lies
 HOLLOW_SHARE = 0.15  # of the coarser wrap's volume: a finer wrap that loses more has entered the inside,
 HOLLOW_SIZE = 0.005  # unless it loses less than this share of the cubed diagonal, as around a sheet
 OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired solid than this was cut away
-CHANGED = 0.25  # growth of the area: more gives a warning. Closing a box that lacks one of six sides adds 20 %
+CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
 SHEET = 0.003  # of the diagonal: a wrap of less mean thickness is that of a sheet, two offsets thick
 OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
 
@@ -24,7 +24,7 @@ OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
 def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Mesh:
     """Makes a mesh a closed solid, wound outward and without overlaps, with as little change as possible.
 
-    Where its area grows by more than `CHANGED`, the first entry of `repairs` is a warning.
+    Where that changes its area or volume by more than `CHANGED`, the first entry of `repairs` is a warning.
 
     Args:
         mesh: any mesh.
@@ -40,12 +40,12 @@ def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Me
     if not closed.watertight:
         solid = close(mesh) if close else None
         return _warned(mesh, solid or _wrap(closed, "its parts do not close into a solid"))
-    if _overlaps(closed):
-        return _warned(mesh, _wrap(closed, "its parts overlap, or lie within one another"))
-    solid = _turn_outward(closed)
+    solid = _merge(_turn_outward(closed))
+    if solid is None:
+        return _warned(mesh, _wrap(closed, "its overlapping parts could not be merged into a solid"))
     if solid.repairs != mesh.repairs and not _covers(solid, mesh):
-        return _warned(mesh, _wrap(mesh, "closing its holes would cut away some of its surface"))
-    return _warned(mesh, solid)
+        return _warned(mesh, _wrap(mesh, "closing its holes and merging its parts would cut away some of its surface"))
+    return _warned(mesh, solid, closed)
 
 
 def _tidy(mesh: Mesh) -> Mesh:
@@ -89,8 +89,8 @@ def _close(mesh: Mesh) -> Mesh:
         fill = ("meshing_close_holes", {"maxholesize": len(mesh.vertices), "selfintersection": False})
         shells = apply(shells, cut, split, wind)
         closed = apply(shells, fill, wind)
-        if len(closed.faces) > len(shells.faces):
-            closed = with_note(closed, "holes closed")
+        if (count := shells.holes - closed.holes) > 0:
+            closed = with_note(closed, f"{_count(count, 'hole')} closed")
     faces = np.concatenate([mesh.faces[~opened], closed.faces + len(mesh.vertices)])
     return replace(closed, vertices=np.concatenate([mesh.vertices, closed.vertices]), faces=faces).compact()
 
@@ -106,25 +106,46 @@ def _drop_flat_parts(mesh: Mesh) -> Mesh | None:
     return with_note(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
 
 
-def _overlaps(mesh: Mesh) -> bool:
-    """Whether faces cut through others, or the box about a part lies within that about another part."""
-    meshes = mesh_set(mesh)
-    meshes.compute_selection_by_self_intersections_per_face()
-    if meshes.current_mesh().selected_face_number():
-        return True
-    parts = [mesh.vertices[mesh.faces[mesh.parts == part]] for part in range(mesh.parts.max() + 1)]
-    low, high = (np.array([end(part, axis=(0, 1)) for part in parts]) for end in (np.min, np.max))
-    within = ((low[:, None] >= low) & (high[:, None] <= high)).all(axis=2)
-    return int(within.sum()) > len(parts)  # each lies within its own
-
-
 def _turn_outward(mesh: Mesh) -> Mesh:
-    """Turns the parts that are inside out."""
-    turn = mesh.part_volumes < 0
+    """Turns parts that are inside out, except cavities: inverted parts that lie within another."""
+    parts = mesh.parts
+    volumes = mesh.part_volumes
+    sign = 1 if volumes.sum() > 0 else -1  # the whole mesh, with its cavities, may be inside out
+    outward = sign * volumes > 0
+    for part in np.flatnonzero(~outward):
+        points = mesh.vertices[mesh.faces[parts == part, 0]][:16]
+        around = mesh.faces[outward[parts]]
+        outward[part] = bool((sign * _winding(points, mesh.vertices, around) > 0.5).all())
+    turn = ~outward if sign > 0 else outward
     if not turn.any():
         return mesh
-    faces = np.where(turn[mesh.parts][:, None], mesh.faces[:, ::-1], mesh.faces)
+    faces = np.where(turn[parts][:, None], mesh.faces[:, ::-1], mesh.faces)
     return with_note(replace(mesh, faces=faces), f"{_count(int(turn.sum()), 'part')} turned outward")
+
+
+def _merge(mesh: Mesh) -> Mesh | None:
+    """Merges overlapping parts, so that surfaces inside the solid vanish; None where that fails."""
+    import pymeshlab
+
+    count = mesh.parts.max() + 1
+    meshes = mesh_set(mesh)
+    meshes.compute_selection_by_self_intersections_per_face()
+    crossing = meshes.current_mesh().selected_face_number()
+    if count == 1 and not crossing:
+        return mesh
+    try:
+        meshes.generate_boolean_union(first_mesh=0, second_mesh=0)
+    except pymeshlab.PyMeshLabException:
+        return None
+    if meshes.current_mesh().face_number() == 0:
+        return None
+    merged = current(meshes, mesh)
+    if not (merged.watertight and merged.volume > 0):
+        return None
+    left = merged.parts.max() + 1
+    if left < count:
+        return with_note(merged, f"{count} overlapping parts merged into {left}")
+    return with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
 
 
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
@@ -170,13 +191,48 @@ def _wrap_flat(mesh: Mesh) -> Mesh:
     )
 
 
-def _warned(before: Mesh, after: Mesh) -> Mesh:
-    """The repaired mesh, with a warning where its area has grown much."""
-    if after.area <= (1 + CHANGED) * before.area:
+def _warned(before: Mesh, after: Mesh, closed: Mesh | None = None) -> Mesh:
+    """The repaired mesh, with a warning where its area or volume changed much.
+
+    Args:
+        before: the mesh as read.
+        after: the repaired mesh.
+        closed: the mesh before overlapping parts were merged, which counts overlaps twice: the smaller change counts.
+    """
+    if after.repairs == before.repairs:
         return after
-    change = f"area from {before.area:.4g} to {after.area:.4g} ({after.area / before.area - 1:+.0%})"
-    warning = f"warning: repair changed the {change}, in the file's units: check the pictures, or repair the file"
+    wound = apply(before, ("meshing_re_orient_faces_coherently", {}))
+    changes = []
+    for name, was, *now in (
+        ("area", before.area, after.area, *([closed.area] if closed else [])),
+        ("volume", _enclosed(wound), after.volume, *([_enclosed(closed)] if closed else [])),
+    ):
+        if was > 0 and min(abs(value - was) for value in now) > CHANGED * was:
+            changes.append(f"{name} from {was:.4g} to {now[0]:.4g} ({now[0] / was - 1:+.0%})")
+    if not changes:
+        return after
+    what = " and ".join(changes)
+    warning = f"warning: repair changed the {what}, in the file's units: check the pictures, or repair the file"
     return replace(after, repairs=(warning, *after.repairs))
+
+
+def _enclosed(mesh: Mesh) -> float:
+    """The volume of all parts; of an open part, that between its faces and their centroid."""
+    parts = mesh.parts
+    faces = np.bincount(parts)
+    corners = mesh.vertices[mesh.faces]
+    middles = np.stack([np.bincount(parts, weights=axis) / faces for axis in corners.mean(axis=1).T], axis=1)
+    heights = ((corners[:, 0] - middles[parts]) * mesh.crosses).sum(axis=1)
+    return float(np.abs(np.bincount(parts, weights=heights / 6)).sum())
+
+
+def _winding(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Winding numbers of faces around points: the solid angle in turns (van Oosterom and Strackee 1983)."""
+    a, b, c = np.moveaxis(vertices[faces][None] - points[:, None, None], 2, 0)
+    x, y, z = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
+    top = (a * np.cross(b, c)).sum(-1)
+    bottom = x * y * z + (a * b).sum(-1) * z + (b * c).sum(-1) * x + (c * a).sum(-1) * y
+    return np.arctan2(top, bottom).sum(axis=1) / (2 * np.pi)
 
 
 def mesh_set(mesh: Mesh):

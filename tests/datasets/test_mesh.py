@@ -41,7 +41,23 @@ def test_a_rim_or_a_wrong_winding_is_not_watertight(spoil):
     assert 0 < spoilt.open_faces.sum() <= 4
 
 
-@each("bad", [np.nan, 1e30])
+def test_holes_are_counted_by_their_rims():
+    mesh = box()
+    assert mesh.holes == 0
+    assert Mesh(mesh.vertices, mesh.faces[1:]).holes == 1
+    opposite = np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, 0]) < 0.49  # without the two sides across x
+    assert Mesh(mesh.vertices, mesh.faces[opposite]).holes == 2
+
+
+def test_compact_drops_only_unused_vertices():
+    mesh = box()
+    padded = Mesh(np.concatenate([[[9.0, 9.0, 9.0]], mesh.vertices]), mesh.faces + 1)
+    assert len(padded.compact().vertices) == 8
+    assert padded.compact().volume == pytest.approx(6)
+    assert padded.diagonal == pytest.approx(mesh.diagonal)
+
+
+@each("bad", [np.nan, np.inf, 1e30])
 def test_numbers_that_are_no_positions_are_refused(bad):
     vertices = np.zeros((3, 3))
     vertices[1, 2] = bad
@@ -53,12 +69,24 @@ def test_numbers_that_are_no_positions_are_refused(bad):
     "faces, message",
     [
         ([[0, 1, 3]], "faces: must index the 3 vertices from 0, found 0 to 3"),
+        ([[-1, 1, 2]], "faces: must index the 3 vertices from 0, found -1 to 2"),
         (np.zeros((0, 3), dtype=int), "faces: must be one or more triangles"),
     ],
 )
 def test_faces_that_are_no_triangles_of_the_vertices_are_refused(faces, message):
     with pytest.raises(ValueError, match=message):
         Mesh(np.eye(3), np.array(faces))
+
+
+def test_save_writes_what_others_read(tmp_path):
+    mesh = box()
+    path = tmp_path / "a böx.ply"
+    mesh.save(path)
+    read = trimesh.load_mesh(path, process=False)
+    assert np.array_equal(read.vertices, mesh.vertices)
+    assert np.array_equal(read.faces, mesh.faces)
+    with pytest.raises(ValueError, match=r"name it 'a\.ply'"):
+        mesh.save(tmp_path / "a.obj")
 
 
 def coloured(mesh: Mesh) -> Mesh:
@@ -73,13 +101,15 @@ def test_colours_are_saved_with_their_vertices(tmp_path):
     mesh.save(tmp_path / "a.ply")
     read = trimesh.load_mesh(tmp_path / "a.ply", process=False)
     assert np.array_equal(read.vertices, mesh.vertices) and np.array_equal(read.faces, mesh.faces)
+    assert read.visual.kind == "vertex"
     assert np.array_equal(read.visual.vertex_colors[:, :3], np.round(255 * mesh.colours))
     assert (read.visual.vertex_colors[:, 3] == 255).all()
-    box().save(tmp_path / "c ü.ply")
-    plain = trimesh.load_mesh(tmp_path / "c ü.ply", process=False)
-    assert plain.visual.kind is None and np.array_equal(plain.vertices, mesh.vertices)
-    with pytest.raises(ValueError, match=r"name it 'a\.ply'"):
-        mesh.save(tmp_path / "a.obj")
+    beyond = Mesh(mesh.vertices, mesh.faces, colours=3 * mesh.colours - 1)
+    beyond.save(tmp_path / "b.ply")
+    found = trimesh.load_mesh(tmp_path / "b.ply", process=False).visual.vertex_colors[:, :3]
+    assert np.array_equal(found, np.round(255 * (3 * mesh.colours - 1).clip(0, 1)))
+    box().save(tmp_path / "c.ply")
+    assert trimesh.load_mesh(tmp_path / "c.ply", process=False).visual.kind is None
 
 
 def test_compact_keeps_colours_with_their_vertices():
