@@ -25,7 +25,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
 HALF = 0.5  # pixels: where the first pixel's centre is at whole numbers, the principal point moves by this
 KNOWN = (
     "cameras*.npz with image/ (IDR, NeuS), transforms.json or transforms_train.json (NeRF, nerfstudio), *_par.txt "
-    "(Middlebury), sparse/0 with images/ (COLMAP)"
+    "(Middlebury), poses_bounds.npy with images/ (LLFF), sparse/0 with images/ (COLMAP)"
 )
 BROWN = ("k1", "k2", "p1", "p2")
 DISTORTIONS = {  # of COLMAP's camera models: which of these stand behind focal lengths and principal point
@@ -91,7 +91,7 @@ def find_layout(folder: Path) -> Layout:
     if not folder.is_dir():
         what = f"{folder} is a file" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(f"{what}: name the folder that has the photographs and their cameras")
-    found = [layout for read in (idr, transforms, middlebury, colmap) if (layout := _read(read, folder))]
+    found = [layout for read in (idr, transforms, middlebury, llff, colmap) if (layout := _read(read, folder))]
     if not found:
         raise BadInput(f"{folder} has no cameras that are known: {KNOWN}")
     usable = [layout for layout in found if layout.frames]
@@ -202,6 +202,28 @@ def middlebury(folder: Path) -> Layout | None:
         raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
     notes = (f"no image for {', '.join(missing)}",) if missing else ()
     return Layout("Middlebury", tuple(frames), None, notes)
+
+
+def llff(folder: Path) -> Layout | None:
+    """LLFF: for each image, by name, camera_to_world with axes down, right, backward, then height, width and focal."""
+    file = folder / "poses_bounds.npy"
+    if not file.is_file():
+        return None
+    rows, images = np.load(file), _images(folder, "images", "images_2", "images_4", "images_8")
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) != len(images):
+        raise BadInput(
+            f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)} and {len(images)} "
+            "images: copy the images that were removed, or make it again"
+        )
+    masks, frames = _matched(images, _images(folder, "mask", "masks")), []
+    for image, row in zip(images, rows, strict=True):
+        pose = row[:15].reshape(3, 5)
+        down, right, back, centre, (height, width, focal) = pose.T
+        rotation = np.stack([right, down, -back])
+        motion = _motion(rotation, -rotation @ centre)
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        frames.append(Frame(image, intrinsics, motion, masks.get(image), (int(height), int(width))))
+    return Layout("LLFF", tuple(frames))
 
 
 def colmap(folder: Path) -> Layout | None:

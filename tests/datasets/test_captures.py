@@ -10,12 +10,13 @@ import torch
 from PIL import Image
 
 from bench.photos import main
-from datasets.captures.capture import read_capture
+from datasets.captures.capture import Capture, read_capture
 from datasets.captures.formats import OPENGL, decomposed, find_layout
 from datasets.captures.hull import hull_mesh, hull_views
 from datasets.captures.take import take
 from datasets.views import look_at
 from renderers.camera import Camera
+from renderers.fields.analytic import sphere
 
 CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
 SIZE = 40, 48  # height and width
@@ -120,6 +121,13 @@ def colmap(folder: Path) -> None:
 FORMATS = {"IDR/NeuS": idr, "NeRF": nerf, "Middlebury": middlebury, "COLMAP": colmap}
 
 
+def found(capture: Capture) -> np.ndarray:
+    """The hull's vertices in the world of the files, from the ball's centre."""
+    hull = hull_mesh(capture.shots, 64)
+    assert hull is not None
+    return hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_ball_is_where_it_is(tmp_path, name):
     FORMATS[name](tmp_path)
@@ -132,18 +140,44 @@ def test_the_ball_is_where_it_is(tmp_path, name):
         stated = capture.format == "IDR/NeuS"  # whose scale_mat is part of its cameras
         if not stated:
             torch.testing.assert_close(moved.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-4)
-    hull = hull_mesh(capture.shots, 48)
-    assert hull is not None
     if not capture.sphere.found.startswith("as"):
-        vertices = hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE  # from the ball's centre
+        vertices = found(capture)
         assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).max() < 0.06  # a pixel is .025 wide there
         assert np.abs(vertices.mean(axis=0)).max() < 0.02
         assert np.linalg.norm(capture.sphere.centre - CENTRE) + RADIUS < capture.sphere.radius < 1.4 * RADIUS
     covered = [
         float((seen & shot.mask).sum() / shot.mask.sum())
-        for shot, seen in zip(capture.shots, hull_views(capture.shots, hull), strict=True)
+        for shot, seen in zip(capture.shots, hull_views(capture.shots, hull_mesh(capture.shots, 64)), strict=True)
     ]
     assert min(covered) > 0.9
+
+
+def test_the_unit_sphere_of_idr_is_that_of_its_scale_mat(tmp_path):
+    idr(tmp_path)
+    hull = hull_mesh(read_capture(tmp_path, longest=48).shots, 64)
+    assert hull is not None
+    middle = (hull.vertices.min(axis=0) + hull.vertices.max(axis=0)) / 2
+    np.testing.assert_allclose(middle, -0.05 / 0.5, atol=0.02)
+    np.testing.assert_allclose(np.ptp(hull.vertices, axis=0), 2 * RADIUS / 0.5, atol=0.1)
+
+
+def test_llff_has_axes_down_right_and_backward_and_a_camera_for_another_size(tmp_path):
+    write_images(tmp_path, "images_4")
+    rows = []
+    for camera in cameras():
+        world = camera.camera_to_world.double().numpy()
+        right, down, forward, centre = world[:3].T
+        pose = np.stack([down, right, -forward, centre, np.array([4.0 * SIZE[0], 4.0 * SIZE[1], 4.0 * FOCAL])], axis=1)
+        rows.append([*pose.flatten(), 0.5, 3.0])
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
+    layout = find_layout(tmp_path)
+    assert layout.format == "LLFF"
+    for frame, camera in zip(layout.frames, cameras(), strict=True):
+        np.testing.assert_allclose(frame.world_to_camera, camera.world_to_camera.numpy(), atol=1e-5)
+        assert take(frame, 48).camera.intrinsics[0, 0].item() == pytest.approx(FOCAL)
+    (tmp_path / "images_4" / "003.png").unlink()
+    with pytest.raises(ValueError, match=r"found shape \[10, 17\] and 9 images"):
+        find_layout(tmp_path)
 
 
 def test_a_projection_is_taken_apart_whatever_its_scale_and_sign():
@@ -203,6 +237,14 @@ def spoilt(folder: Path, how: str) -> None:
         Image.new("L", SIZE[::-1]).save(folder / "mask" / "004.png")
     elif how == "broken image":
         (folder / "image" / "000004.png").write_bytes(b"no image")
+    elif how == "no numbers":
+        np.savez(folder / "cameras_sphere.npz", **{f"world_mat_{i}": np.full((4, 4), np.nan) for i in range(10)})
+    elif how == "broken cameras":
+        (folder / "cameras_sphere.npz").write_bytes(b"no archive")
+    elif how == "gap in the cameras":
+        with np.load(folder / "cameras_sphere.npz") as stored:
+            known = {name: stored[name] for name in stored if name != "world_mat_0"}
+        np.savez(folder / "cameras_sphere.npz", **known)
     elif how == "no images":
         shutil.rmtree(folder / "image")
     elif how == "no cameras":
@@ -217,8 +259,11 @@ def spoilt(folder: Path, how: str) -> None:
         ("mask of another size", ("004.png has 10 x 10 pixels, its image 48 x 40",)),
         ("empty mask", ("the mask of 000004.png is empty", "use no masks")),
         ("broken image", ("000004.png cannot be read as an image", "copy or export it again")),
+        ("no numbers", ("idr cameras of", "cannot be read", "export them again")),
+        ("broken cameras", ("idr cameras of", "cannot be read", "export them again")),
+        ("gap in the cameras", ("idr cameras of", "world_mat_0", "export them again")),
         ("no images", ("has cameras (IDR/NeuS) but none of their images",)),
-        ("no cameras", ("has no cameras that are known", "transforms.json", "sparse/0")),
+        ("no cameras", ("has no cameras that are known", "transforms.json", "poses_bounds.npy")),
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(tmp_path, capsys, how, words):
@@ -267,16 +312,18 @@ def test_of_two_formats_the_one_with_images_is_taken_and_the_other_named(tmp_pat
     assert capture.format == "NeRF" and capture.notes == ("other cameras in the folder are not used: IDR/NeuS",)
 
 
-def test_broken_transforms_are_told(tmp_path):
+@pytest.mark.parametrize("key", ["camera_angle_x", "transform_matrix"])
+def test_broken_transforms_are_told(tmp_path, key):
     nerf(tmp_path)
     stored = json.loads((tmp_path / "transforms.json").read_text())
-    stored["frames"][3]["transform_matrix"] = [[1.0, 0.0], [0.0, 1.0]]
+    if key == "camera_angle_x":
+        del stored["fl_x"]
+        stored[key] = 39.6
+    else:
+        stored["frames"][3][key] = [[1.0, 0.0], [0.0, 1.0]]
     (tmp_path / "transforms.json").write_text(json.dumps(stored))
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_capture(tmp_path, longest=48)
-    del stored["fl_x"]
-    (tmp_path / "transforms.json").write_text(json.dumps(stored | {"camera_angle_x": 39.6}))
-    with pytest.raises(ValueError, match="between 0 and pi, not 39"):
+    words = "between 0 and pi, not 39.6: it is in radians" if key == "camera_angle_x" else "cannot be read"
+    with pytest.raises(ValueError, match=words):
         read_capture(tmp_path, longest=48)
 
 
@@ -305,9 +352,42 @@ def test_an_alpha_channel_that_is_opaque_is_no_mask(tmp_path):
     assert read_capture(tmp_path, longest=48).masks == ""
 
 
+def test_images_of_two_sizes_each_have_their_camera(tmp_path):
+    idr(tmp_path)
+    for name in ("image/000003.png", "mask/003.png"):
+        Image.open(tmp_path / name).resize((24, 20)).save(tmp_path / name)
+    with np.load(tmp_path / "cameras_sphere.npz") as stored:
+        known = dict(stored)
+    known["world_mat_3"] = np.diag([0.5, 0.5, 1.0, 1.0]) @ known["world_mat_3"]
+    np.savez(tmp_path / "cameras_sphere.npz", **known)
+    capture = read_capture(tmp_path, longest=48)
+    assert "24 x 20 and 48 x 40 pixels" in capture.summary
+
+
 def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
     middlebury(tmp_path)
     capture = read_capture(tmp_path, longest=48, masks=False)
     assert all(shot.mask is None for shot in capture.shots) and "no masks" in capture.summary
     np.testing.assert_allclose(capture.sphere.centre, CENTRE, atol=1e-3)
     assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
+
+
+def test_a_hull_is_no_smaller_than_the_ball(tmp_path):
+    nerf(tmp_path)
+    capture = read_capture(tmp_path, longest=48)
+    hull = hull_mesh(capture.shots, 64)
+    assert hull is not None
+    place = torch.from_numpy((CENTRE - capture.sphere.centre) / capture.sphere.radius).float()
+    ball = sphere(RADIUS / capture.sphere.radius, tuple(place.tolist()))
+    assert hull.watertight and ball(torch.from_numpy(hull.vertices).float()).min() > -0.05
+
+
+def test_photographs_that_are_smaller_than_was_asked_for_are_told(tmp_path):
+    nerf(tmp_path)
+    small = read_capture(tmp_path, longest=16)
+    assert not any("pixels, not" in note for note in small.notes)
+    size = max(small.shots[0].colours.shape)
+    assert size == 16
+    whole = read_capture(tmp_path, longest=4096)
+    largest = max(max(shot.colours.shape) for shot in whole.shots)
+    assert whole.notes[-1] == f"the photographs have at most {largest} pixels, not 4096"

@@ -57,6 +57,13 @@ def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_p
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.97, abs=1e-9)
 
 
+def test_shapes_are_always_the_same_wherever_the_file_lies(tmp_path):
+    first = local(write_box(tmp_path / "box.ply"))
+    second = local(shutil.copy(tmp_path / "box.ply", tmp_path / "elsewhere.ply"))
+    for split, index in ((Split.TRAIN, 0), (Split.TRAIN, 3), (Split.TEST, 0)):
+        assert np.array_equal(first.mesh(split, index).vertices, second.mesh(split, index).vertices)
+
+
 def test_a_folder_is_dealt_out_whole_and_no_part_shares_a_file(folder):
     dataset = local(folder)
     parts = {split: dataset.files(split) for split in Split}
@@ -88,15 +95,27 @@ def test_few_files_are_enough(tmp_path, count):
         assert not set(dataset.files(Split.TEST)) & set(dataset.files(Split.TRAIN))
 
 
+def test_paths_with_spaces_and_other_letters_work_and_name_the_dataset(tmp_path):
+    path = write_box(tmp_path / ODD_NAME / "Stuhl für Ümit.ply")
+    assert local(path).name == "Stuhl für Ümit"
+    assert local(path).mesh(Split.TEST, 0).watertight
+    assert local(path.parent).mesh(Split.TEST, 0).watertight
+
+
 def test_contents_decide_identity_not_the_path(tmp_path):
     path = write_box(tmp_path / "box.ply")
     moved = shutil.copy(path, tmp_path / ODD_NAME.replace("?", ".ply"))
     other = write_box(tmp_path / "other" / "box.ply", (1.0, 0.6, 0.5))
     assert local(path).identity() == local(moved).identity()
-    assert np.array_equal(local(path).mesh(Split.TEST, 0).vertices, local(moved).mesh(Split.TEST, 0).vertices)
     assert local(path).identity() != local(other).identity()
     assert local(path).identity() != local(path, strength=0.5).identity()
     assert local(path).identity() != LocalMeshes(str(path), radius=0.9, strength=1.0).identity()
+
+
+def test_identity_sees_a_file_that_is_added_to_the_folder(folder):
+    before = local(folder).identity()
+    write_box(folder / "one more.stl")
+    assert local(folder).identity() != before
 
 
 def test_no_strength_leaves_the_mesh_as_it_is(tmp_path):
@@ -107,8 +126,11 @@ def test_no_strength_leaves_the_mesh_as_it_is(tmp_path):
 
 def test_invalid_settings_are_errors_at_once(tmp_path):
     path = write_box(tmp_path / "box.ply")
+    (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"found nothing at .*boks.ply'; did you mean .*box.ply"):
         local(tmp_path / "boks.ply")
+    with pytest.raises(ValueError, match="a folder must hold mesh files"):
+        local(tmp_path / "empty")
     with pytest.raises(ValueError, match=r"dataset.strength must be at least 0, not -1"):
         local(path, strength=-1.0)
     with pytest.raises(ValueError, match=r"dataset.radius must be above 0 and at most 1, not 0"):
