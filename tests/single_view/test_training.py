@@ -228,7 +228,7 @@ def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path,
     model, _ = made.load(path)
     image = torch.rand(1, 4, 16, 16)
     assert torch.equal(model(image), made.load(path)[0](image))
-    monkeypatch.setattr("bench.single_view.store.train", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("bench.single_view.store.Lessons.train", lambda *_: pytest.fail("trained again"))
     assert made.make(tmp_path, CPU, silent) == path
     assert not list(tmp_path.glob("*.state"))
 
@@ -259,7 +259,7 @@ def test_one_that_fails_has_a_record(renderer, tmp_path, monkeypatch):
     def failing(*arguments):
         raise Failed(7, 4, tmp_path / "x.state")
 
-    monkeypatch.setattr("bench.single_view.store.train", failing)
+    monkeypatch.setattr("bench.single_view.store.Lessons.train", failing)
     made = recipe(renderer)
     with pytest.raises(Failed):
         made.make(tmp_path, CPU, silent)
