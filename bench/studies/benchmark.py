@@ -6,8 +6,7 @@ from typing import Any
 import pandas as pd
 
 from bench.report.data.records import Record, measured, setting
-from bench.report.study import Result, Runs, Selection, format
-from bench.report.write.table import Column, shown, text, together, whole
+from bench.report.study import Result, Runs, Selection, format, table
 
 PLACE = 15
 BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.ablation
@@ -93,7 +92,7 @@ def _lines(record: Record) -> list[dict[str, Any]]:
     ]
 
 
-def _ratio(cost: str) -> Column:
+def _ratio(cost: str) -> table.Column:
     """The median of a ratio, and between which ends it lay."""
 
     def words(line: dict[str, Any]) -> str:
@@ -102,25 +101,33 @@ def _ratio(cost: str) -> Column:
             return format.MISSING
         return "1" if line["first"] else f"{middle:.2f} ({low:.2f}–{high:.2f})"
 
-    return Column(f"{cost}_ratio", COSTS[cost], words=words)
+    return table.Column(f"{cost}_ratio", COSTS[cost], words=words)
 
 
 COLUMNS = (
-    *(Column("size", "Size", show=whole), Column("threads", "Threads", show=whole), text("renderer", "Renderer")),
-    *(*map(text, ("status", "reason", "folder")), Column("rounds")),
-    Column("queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))),
-    Column("coarse_queries"),
-    Column("forward_seconds", "Forward", show=format.seconds),
-    Column("step_seconds", "Step", show=format.seconds),
-    *map(Column, ("forward_cpu", "step_cpu")),
+    *(
+        table.Column("size", "Size", show=table.whole),
+        table.Column("threads", "Threads", show=table.whole),
+        table.text("renderer", "Renderer"),
+    ),
+    *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
+    table.Column(
+        "queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))
+    ),
+    table.Column("coarse_queries"),
+    table.Column("forward_seconds", "Forward", show=format.seconds),
+    table.Column("step_seconds", "Step", show=format.seconds),
+    *map(table.Column, ("forward_cpu", "step_cpu")),
     *map(_ratio, COSTS),
-    *(Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
-    Column("peak_memory_bytes", "Memory of a step", show=format.size),
-    Column("work_over_bound", "Work over bound"),
-    *map(Column, ("rays", "hits", "lost", "false", "wrong")),
-    shown("Missed / spurious / wrong depth", together(dict.get, whole, "lost", "false", "wrong")),
-    *map(Column, ("depth_error_median", "depth_error_p99", "depth_error_max")),
-    shown("Depth error median / p99", together(dict.get, format.number, "depth_error_median", "depth_error_p99")),
+    *(table.Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
+    table.Column("peak_memory_bytes", "Memory of a step", show=format.size),
+    table.Column("work_over_bound", "Work over bound"),
+    *map(table.Column, ("rays", "hits", "lost", "false", "wrong")),
+    table.shown("Missed / spurious / wrong depth", table.together(dict.get, table.whole, "lost", "false", "wrong")),
+    *map(table.Column, ("depth_error_median", "depth_error_p99", "depth_error_max")),
+    table.shown(
+        "Depth error median / p99", table.together(dict.get, format.number, "depth_error_median", "depth_error_p99")
+    ),
 )
 
 PAGES = {"benchmark": make}

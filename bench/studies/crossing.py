@@ -6,14 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.compare import ERROR, EVERY, FAILURE, INTERVAL, LABEL, RATIO, Compared, Gap, excluding_one
-from bench.report.data.records import setting
-from bench.report.data.runs import Runs, Selection
-from bench.report.write import chart
-from bench.report.write.result import Result
-from bench.report.write.table import COMPLETION, FAMILY, LOOP, Column, configured, text, to_data, to_table, whole
+from bench.report.study import Result, Runs, Selection, chart, compare, format, records, style, table
 
 PLACE = 32
 READS = (Selection("crossing", ("task.points",)),)
@@ -34,8 +27,8 @@ PARTS = (
     "either of the two others (Shapley values of the logarithm)."
 )
 RUNS = (
-    *(FAMILY, configured("points", "task", "points"), configured("loss", "silhouette", "_label_")),
-    *(*COMPLETION, *LOOP),
+    *(table.FAMILY, table.configured("points", "task", "points"), table.configured("loss", "silhouette", "_label_")),
+    *(*table.COMPLETION, *table.LOOP),
 )
 Line = dict[str, Any]
 Setting = tuple[str, str]  # a renderer, by its preset, and a loss, by its class
@@ -52,7 +45,7 @@ class Crossed:
         own: the loss of each renderer's paper, where it is known.
     """
 
-    found: Compared
+    found: compare.Compared
     rows: dict[Setting, tuple[str, str]]
     labels: dict[str, str]
     own: dict[str, str]
@@ -67,7 +60,7 @@ class Crossed:
         """All losses."""
         return list(dict.fromkeys(loss for _, loss in self.rows))
 
-    def gap(self, family: str, first: list[Setting], second: list[Setting]) -> Gap | None:
+    def gap(self, family: str, first: list[Setting], second: list[Setting]) -> compare.Gap | None:
         """The gap between two groups of settings; None where one of them was not run."""
         if not {*first, *second} <= {*self.rows}:
             return None
@@ -76,14 +69,16 @@ class Crossed:
 
 def crossed(runs: Runs) -> Crossed:
     """The settings of the runs."""
-    found = Compared(runs)
+    found = compare.Compared(runs)
     rows, labels, own = {}, {}, {}
     for record, preset, row in zip(runs.records, found.cells.preset, found.cells.row, strict=True):
-        target, mask = (str(setting(record["config"], part, "_target_") or "") for part in ("renderer", "silhouette"))
+        target, mask = (
+            str(records.setting(record["config"], part, "_target_") or "") for part in ("renderer", "silhouette")
+        )
         renderer, loss = record["renderer"], mask.rpartition(".")[2]
         rows[renderer, loss] = preset, row
         for name, part in ((renderer, "renderer"), (loss, "silhouette")):
-            labels[name] = str(setting(record["config"], part, "_label_") or name)
+            labels[name] = str(records.setting(record["config"], part, "_label_") or name)
         if target in OWN:
             own[renderer] = OWN[target]
     return Crossed(found, rows, labels, own)
@@ -98,8 +93,8 @@ def make(runs: Runs) -> Result:
         "Every renderer under every loss of the mask.",
         "Which renderer is best under which loss of the mask?",
         ratio="",
-        remarks=(ERROR, FAILURE, f"Under its own paper's loss: {own}.", LOSSES),
-        data=to_data(RUNS, runs.records),
+        remarks=(compare.ERROR, compare.FAILURE, f"Under its own paper's loss: {own}.", LOSSES),
+        data=table.to_data(RUNS, runs.records),
         figure=draw(settings),
     )
 
@@ -118,7 +113,7 @@ def draw(settings: Crossed) -> Figure:
         axis.set_xticks(range(len(losses)), [settings.labels[loss].removesuffix(" mask loss") for loss in losses])
         axis.set(title=family, xlabel="loss of the mask")
         axis.grid(False, axis="x")
-    axes[0].set_ylabel(LABEL)
+    axes[0].set_ylabel(compare.LABEL)
     means = [line["error"] for line in found.lines]
     style.log_axis(axes[0], "y", [end for mean in means for end in (mean.value, mean.low, *mean.points)])
     style.legend_below(figure, axes[0])
@@ -129,7 +124,7 @@ def make_gaps(runs: Runs) -> Result:
     """A line per pair of renderers and family: their gap under own losses, its two parts, and that under each loss."""
     settings = crossed(runs)
     others = [one for one in settings.renderers if one != REFERENCE and REFERENCE in settings.renderers]
-    lines = [_gaps(settings, one, name) for one in others for name in (EVERY, *settings.found.families)]
+    lines = [_gaps(settings, one, name) for one in others for name in (compare.EVERY, *settings.found.families)]
     compared = {"own": "Own losses", "renderer": "of it the renderer", "loss": "of it the loss"}
     compared |= {loss: settings.labels[loss] for loss in settings.losses}
     return Result(
@@ -137,12 +132,12 @@ def make_gaps(runs: Runs) -> Result:
         "Which part of a gap between renderers is their loss of the mask.",
         "Ratio of two renderers' errors, each under its own paper's loss and both under one.",
         question="Which part of a gap between two methods is the renderer, and which their loss?",
-        verdict=_verdict(settings, [line for line in lines if line["family"] == EVERY]),
-        interval=INTERVAL,
+        verdict=_verdict(settings, [line for line in lines if line["family"] == compare.EVERY]),
+        interval=compare.INTERVAL,
         estimates=[line[key].ratio for line in lines for key in compared if line[key] is not None],
-        remarks=(RATIO, PARTS, LOSSES, ERROR, FAILURE),
-        data=to_data(_columns(compared), lines),
-        table=to_table(_columns(compared), lines),
+        remarks=(compare.RATIO, PARTS, LOSSES, compare.ERROR, compare.FAILURE),
+        data=table.to_data(_columns(compared), lines),
+        table=table.to_table(_columns(compared), lines),
     )
 
 
@@ -158,7 +153,7 @@ def _gaps(settings: Crossed, renderer: str, family: str) -> Line:
     return names | {key: settings.gap(family, *of) for key, of in compared.items()}
 
 
-def _columns(compared: dict[str, str]) -> list[Column]:
+def _columns(compared: dict[str, str]) -> list[table.Column]:
     """Names, shapes, and for each compared pair its gap; the CSV has its numbers."""
     numbers = {
         "": lambda of: of.ratio.value,
@@ -167,11 +162,13 @@ def _columns(compared: dict[str, str]) -> list[Column]:
         "_better": lambda of: of.better,
     }
     return [
-        *(text("compared", "Compared"), text("family", "Family")),
-        Column("shapes", "Shapes", lambda line: max(line[key].shapes if line[key] else 0 for key in compared), whole),
-        *(text("", label, lambda line, key=key: line[key]) for key, label in compared.items()),
+        *(table.text("compared", "Compared"), table.text("family", "Family")),
+        table.Column(
+            "shapes", "Shapes", lambda line: max(line[key].shapes if line[key] else 0 for key in compared), table.whole
+        ),
+        *(table.text("", label, lambda line, key=key: line[key]) for key, label in compared.items()),
         *(
-            Column(f"{key}{end}", value=lambda line, key=key, get=get: get(line[key]) if line[key] else None)
+            table.Column(f"{key}{end}", value=lambda line, key=key, get=get: get(line[key]) if line[key] else None)
             for key in compared
             for end, get in numbers.items()
         ),
@@ -183,7 +180,7 @@ def _verdict(settings: Crossed, pooled: list[Line]) -> str:
     known = [line for line in pooled if line["own"] is not None and line["loss"] is not None]
     names = settings.labels
     under_one = [(f"{x['compared']} under {names[loss]}", x[loss]) for x in pooled for loss in settings.losses]
-    said = [excluding_one(under_one, "under one loss")]
+    said = [compare.excluding_one(under_one, "under one loss")]
     if known:
         line = max(known, key=lambda line: line["own"].ratio.value)
         value, ends = format.number(line["own"].ratio.value), line["own"].ratio.ends()

@@ -2,9 +2,8 @@
 
 import math
 
-from bench.report import single_view
 from bench.report.data.records import Record, Row, error, grouped, row_of
-from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, single_view, table
 
 PLACE = 41
 READS = (Selection("dvr_table1", setup=("machine",)),)

@@ -4,12 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.records.format import plural
 from bench.report.data.records import SCALE, Record, grouped, row_of, setting
-from bench.report.gallery import Arrays, Block, Cell, Scene, coloured
-from bench.report.medians import COST, best, draw_runs, medians, scene_of, scored
-from bench.report.study import Result, Runs, Selection, gallery, style
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, text, thousandfold
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, style, table
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -34,16 +30,21 @@ NOTES = (
     "measured rows.",
 )
 COLUMNS = (
-    text("method", "Method"),
-    Column("seen_accuracy", "Accuracy", show=thousandfold),
-    Column("seen_completeness", "Completeness", show=thousandfold),
-    Column("seen_chamfer_l1", "Chamfer-L1, seen", show=thousandfold),
-    Column("chamfer_l1", "all", show=thousandfold),
-    *(Column("psnr", "PSNR"), Column("ssim", "SSIM"), Column("mask_iou", "Mask IoU")),
-    *COST,
+    table.text("method", "Method"),
+    table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
+    table.Column("seen_completeness", "Completeness", show=table.thousandfold),
+    table.Column("seen_chamfer_l1", "Chamfer-L1, seen", show=table.thousandfold),
+    table.Column("chamfer_l1", "all", show=table.thousandfold),
+    *(table.Column("psnr", "PSNR"), table.Column("ssim", "SSIM"), table.Column("mask_iou", "Mask IoU")),
+    *medians.COST,
 )
-RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"), *LOOP)
-PICTURED = (FAMILY, *IDENTITY, *metrics("seen_chamfer_l1", "psnr"))
+RUNS = (
+    table.FAMILY,
+    *table.IDENTITY,
+    *table.metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"),
+    *table.LOOP,
+)
+PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("seen_chamfer_l1", "psnr"))
 
 SCENES = 2  # of `figures`
 ALIKE = {  # rows that are not shown there, since they look as another does
@@ -65,13 +66,13 @@ AMBIENT = 0.25  # of a light; the rest falls off with the cosine
 
 def make(runs: Runs) -> Result:
     """A line per row, and the published ones."""
-    lines, scenes = medians(runs, NAMES), plural(len(grouped(runs.records, scene_of)), "scene")
+    lines, scenes = medians.medians(runs, NAMES), format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
     published = [
         {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
         for name, values in PUBLISHED.items()
     ]
     panels = {
-        "Chamfer-L1, seen × 1000 (scene units)": SCALE * scored(runs, "seen_chamfer_l1"),
+        "Chamfer-L1, seen × 1000 (scene units)": SCALE * medians.scored(runs, "seen_chamfer_l1"),
         "seconds in the loop": runs.frame.loop,
     }
     return Result(
@@ -80,12 +81,14 @@ def make(runs: Runs) -> Result:
         f"Medians over {scenes} of errors on what the photographs see; in the figure a point per scene, and the "
         f"median.{_conditions(runs)}",
         question="Which method finds shape and colour from photographs?",
-        verdict=best(lines, "seen_chamfer_l1", "Chamfer-L1 × 1000 of what the photographs see", scenes, scale=SCALE),
+        verdict=medians.best(
+            lines, "seen_chamfer_l1", "Chamfer-L1 × 1000 of what the photographs see", scenes, scale=SCALE
+        ),
         remarks=NOTES,
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
-        figure=draw_runs(runs, panels),
+        figure=medians.draw_runs(runs, panels),
     )
 
 
@@ -103,16 +106,16 @@ def _conditions(runs: Runs) -> str:
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, one row of those that look alike."""
     rows = [row for row in runs.rows() if row.preset not in ALIKE] or list(runs.rows())
-    every = grouped(runs.records, scene_of)
+    every = grouped(runs.records, medians.scene_of)
     shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
-    scenes = {name: Scene(runs, of, ARRAYS) for name, of in shown.items()}
+    scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
     photograph = ("held out", "colours", lambda found: [found["photograph"]])
     blocks = [gallery.colours_above_normals(scenes[name], name, rows, of, photograph) for name, of in shown.items()]
     return Result(
         runs,
         "Shapes from photographs in pictures.",
         f"Colours, and normals (right, up, towards the camera as red, green, blue), of {len(shown)} of "
-        f"{plural(len(every), 'scene')}, seen by the camera of a held-out photograph.",
+        f"{format.plural(len(every), 'scene')}, seen by the camera of a held-out photograph.",
         remarks=(
             "A mesh row shows its mesh with the colours of the photographs that see a vertex, another row its field.",
             "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
@@ -127,13 +130,13 @@ def rerendering(runs: Runs) -> Result:
     """The shapes of one row in several sizes, from other sides, and under other lights."""
     ended = [row for row, of in runs.rows().items() if any(run["status"] == "ok" for run in of)] or list(runs.rows())
     row = next((row for row in ended if row.preset == PRESET), ended[0])
-    of_scene = grouped([record for record in runs.records if row_of(record) == row], scene_of)
+    of_scene = grouped([record for record in runs.records if row_of(record) == row], medians.scene_of)
     kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
     shown = replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept))
     lines = {name: _line(runs, record) for name, record in kept.items()}
     columns = max((list(pictures) for pictures, _ in lines.values()), key=len)
     cells = {
-        name: list(pictures.values()) or [Cell(note=_status(kept[name]) or "no picture")]
+        name: list(pictures.values()) or [gallery.Cell(note=_status(kept[name]) or "no picture")]
         for name, (pictures, _) in lines.items()
     }
     return Result(
@@ -147,11 +150,11 @@ def rerendering(runs: Runs) -> Result:
             *(f"No pictures of {name}: {why}." for name, (_, why) in lines.items() if why),
         ),
         run_columns=PICTURED,
-        figure=gallery.draw([Block("", columns, cells)]),
+        figure=gallery.draw([gallery.Block("", columns, cells)]),
     )
 
 
-def _line(runs: Runs, record: Record) -> tuple[dict[str, Cell], str]:
+def _line(runs: Runs, record: Record) -> tuple[dict[str, gallery.Cell], str]:
     """The cells of a scene by the names of their columns, and why there are none."""
     parts = ("colours", "normals", "hit")
     prefixes = (*SIZES, *TURNED)
@@ -166,19 +169,21 @@ def _line(runs: Runs, record: Record) -> tuple[dict[str, Cell], str]:
         name = TURNED.get(prefix, f"{max(found[f'{prefix}hit'].shape)} pixels")
         shown[name] = _lit(found, prefix), found[f"{prefix}hit"]
     shown |= {name: (_lit(last, SIZES[-1], light), hit) for name, light in LIGHTS.items()}
-    return {name: Cell([(picture, style.window([hit]))], _status(record)) for name, (picture, hit) in shown.items()}, ""
+    return {
+        name: gallery.Cell([(picture, style.window([hit]))], _status(record)) for name, (picture, hit) in shown.items()
+    }, ""
 
 
 def _status(record: Record) -> str:
     return "" if record["status"] == "ok" else record["status"]
 
 
-def _lit(found: Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> np.ndarray:
+def _lit(found: gallery.Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> np.ndarray:
     """The picture of a shape, as it is or under a light."""
     colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
     if light is not None:
         colours = colours * (AMBIENT + (1 - AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)[..., None])
-    return coloured(colours, hit)
+    return gallery.coloured(colours, hit)
 
 
 PAGES = {"dvr_table2": make, "dvr_figures": figures, "rerendering": rerendering}

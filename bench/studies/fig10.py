@@ -1,12 +1,11 @@
 """Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
 
-from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, run_columns
-from bench.report.study import Result, Runs, Selection, format, records
+from bench.report.study import Result, Runs, Selection, conditions, format, records
 
 PLACE = 50
 CONDITIONS = (
-    Condition("focal", "focal length / the scene's", 1.0),
-    Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
+    conditions.Condition("focal", "focal length / the scene's", 1.0),
+    conditions.Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
 )
 READS = (Selection("fig10", tuple(f"task.{one.key}" for one in CONDITIONS)),)
 NOTES = (
@@ -19,20 +18,20 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = lines_of(runs.records, CONDITIONS)
+    lines = conditions.lines_of(runs.records, CONDITIONS)
     return Result(
         runs,
         "Shape from many views under other focal lengths and starts.",
-        f"{BELOW[0].upper()}{BELOW[1:]}.",
+        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}.",
         question="Does another focal length or start change the shape that is found?",
         verdict=_verdict(runs),
-        interval=INTERVALS,
+        interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        columns=(*NAMED, *MEDIAN),
+        columns=(*conditions.NAMED, *conditions.MEDIAN),
         lines=lines,
-        run_columns=run_columns(CONDITIONS),
-        figure=draw(lines, CONDITIONS),
+        run_columns=conditions.run_columns(CONDITIONS),
+        figure=conditions.draw(lines, CONDITIONS),
     )
 
 

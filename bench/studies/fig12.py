@@ -3,19 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from bench.records.format import plural
-from bench.report.conditions import BELOW, INTERVALS, MEDIAN, NAMED, Condition, draw, lines_of, middle, run_columns
 from bench.report.data.records import ONE_WAY, SCALE, Record, error, family, grouped, row_of, setting, solid
-from bench.report.data.statistics import share
-from bench.report.gallery import FOUND, SHAPES, START, TRUE, Block, Scene
-from bench.report.study import Result, Runs, Selection, gallery
-from bench.report.write.table import counted, shown
+from bench.report.study import Result, Runs, Selection, conditions, format, gallery, statistics, table
 
 PLACE = 55
 CONDITIONS = (
-    Condition("shift", "shift (scene units)", 0.0),
-    Condition("degrees", "rotation (degrees)", 0.0),
-    Condition("scale", "size / true size", 1.0),
+    conditions.Condition("shift", "shift (scene units)", 0.0),
+    conditions.Condition("degrees", "rotation (degrees)", 0.0),
+    conditions.Condition("scale", "size / true size", 1.0),
 )
 READS = (Selection("fig12", (*(f"task.{one.key}" for one in CONDITIONS), "task.similarity")),)
 SUCCESS = 1.0  # squared scene units x 1000, about what DIST publishes in its Table 3
@@ -27,7 +22,7 @@ NOTES = (
     "A run that did not end ok counts as infinite, drawn at the upper edge.",
     "The paper (Fig. 12) shows pictures of real chairs and no numbers; here shapes and photographs are synthetic.",
 )
-RUNS = run_columns(CONDITIONS, "similarity")
+RUNS = conditions.run_columns(CONDITIONS, "similarity")
 KNOWN = "place known"
 UNITS = {"shift": "shifted by {:g}", "degrees": "turned by {:g}°", "scale": "{:g} times\nas large"}
 
@@ -41,25 +36,25 @@ def place_known(record: Record) -> bool:
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = lines_of([record for record in runs.records if not place_known(record)], CONDITIONS)
+    lines = conditions.lines_of([record for record in runs.records if not place_known(record)], CONDITIONS)
     known = grouped(filter(place_known, runs.records), lambda record: (family(record), row_of(record)))
     others = [
-        {"family": name, "method": row.name, "condition": KNOWN, "runs": own, "error": middle(own)}
+        {"family": name, "method": row.name, "condition": KNOWN, "runs": own, "error": conditions.middle(own)}
         for (name, row), own in known.items()
     ]
     return Result(
         runs,
         "Shape from many views, misplaced at the start.",
-        f"Runs that succeeded, and {BELOW}, over the displacement.",
+        f"Runs that succeeded, and {conditions.BELOW}, over the displacement.",
         question="Is a shape found from a wrong similarity?",
         verdict=_verdict(runs),
-        interval=INTERVALS,
+        interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        columns=(*NAMED, shown("Success", lambda line: _successes(line["runs"])), *MEDIAN),
+        columns=(*conditions.NAMED, table.shown("Success", lambda line: _successes(line["runs"])), *conditions.MEDIAN),
         lines=lines + others,
         run_columns=RUNS,
-        figure=draw(lines, CONDITIONS, success=SUCCESS) if lines else None,
+        figure=conditions.draw(lines, CONDITIONS, success=SUCCESS) if lines else None,
     )
 
 
@@ -69,7 +64,9 @@ def _succeeded(record: Record) -> bool:
 
 def _successes(records: Sequence[Record]) -> str:
     of_shape = [[_succeeded(run) for run in runs] for runs in grouped(records, solid).values()]
-    return counted(sum(map(sum, of_shape)), len(records), share(list(map(sum, of_shape)), list(map(len, of_shape))))
+    return table.counted(
+        sum(map(sum, of_shape)), len(records), statistics.share(list(map(sum, of_shape)), list(map(len, of_shape)))
+    )
 
 
 def _verdict(runs: Runs) -> str:
@@ -77,14 +74,14 @@ def _verdict(runs: Runs) -> str:
     off = [record for record in runs.records if not place_known(record)]
     counts = {row.name: (sum(map(_succeeded, own)), len(own)) for row, own in grouped(off, row_of).items()}
     said = "; ".join(f"{row} *{right} of {of}*" for row, (right, of) in counts.items())
-    shapes = plural(len({solid(record) for record in off}), "shape")
+    shapes = format.plural(len({solid(record) for record in off}), "shape")
     return f"Runs with an error below {SUCCESS:g}: {said}; n = {shapes}." if said else ""
 
 
 def pictures(runs: Runs) -> Result:
     """A block per family: the start over the displacement, and what each row found below it."""
     first = gallery.first_shapes(runs, 1)
-    scenes = {name: Scene(first, records, SHAPES) for name, records in first.families().items()}
+    scenes = {name: gallery.Scene(first, records, gallery.SHAPES) for name, records in first.families().items()}
     return Result(
         first,
         "Shapes from many views, misplaced at the start, in pictures.",
@@ -102,14 +99,14 @@ def pictures(runs: Runs) -> Result:
     )
 
 
-def _block(name: str, records: list[Record], scene: Scene) -> Block:
+def _block(name: str, records: list[Record], scene: gallery.Scene) -> gallery.Block:
     of_place = dict(sorted(grouped(records, _place).items()))
-    starts = [scene.shared(of, gallery.normals(START)) for of in of_place.values()]
-    rows: dict[str, Any] = {"start": [*starts, scene.shared(records, gallery.normals(TRUE))]}
+    starts = [scene.shared(of, gallery.normals(gallery.START)) for of in of_place.values()]
+    rows: dict[str, Any] = {"start": [*starts, scene.shared(records, gallery.normals(gallery.TRUE))]}
     for row, of_row in grouped(records, row_of).items():
         at = {_place(record): record for record in of_row}
-        rows[row.name] = [scene.cell(at.get(place), gallery.normals(FOUND)) for place in of_place]
-    return Block(name, [*map(_words, of_place), "truth"], rows)
+        rows[row.name] = [scene.cell(at.get(place), gallery.normals(gallery.FOUND)) for place in of_place]
+    return gallery.Block(name, [*map(_words, of_place), "truth"], rows)
 
 
 def _place(record: Record) -> tuple[float, ...]:

@@ -1,7 +1,6 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
-from bench.report.study import Result, Runs, Selection, gallery
-from bench.report.write.table import IDENTITY, Column, metric, through, to_data
+from bench.report.study import Result, Runs, Selection, gallery, table
 
 PLACE = 210
 READS = (Selection("fig4", alike=("dataset", "view", "prior", "task")),)
@@ -11,9 +10,9 @@ NOTES = (
 )
 MOST_COLUMNS = 5
 COLUMNS = (  # of a record and the counts of its picture
-    *through(lambda line: line[0], *IDENTITY),
-    *through(lambda line: line[1], *map(Column, gallery.COUNTED)),
-    *through(lambda line: line[0], metric("depth_error_median")),
+    *table.through(lambda line: line[0], *table.IDENTITY),
+    *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
+    *table.through(lambda line: line[0], table.metric("depth_error_median")),
 )
 
 
@@ -21,7 +20,7 @@ def make(runs: Runs) -> Result:
     """The reference and a column per row; rows without pictures keep their place."""
     chosen = runs.of_newest_scene()
     found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
-    data = to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
+    data = table.to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
     wrong = (data["lost"] + data["false"]).dropna().astype(float)
     least, most = (data.loc[wrong.idxmin()], data.loc[wrong.idxmax()]) if len(wrong) else ({}, {})
     return Result(

@@ -9,16 +9,22 @@ from matplotlib.figure import Figure
 
 from bench.report.data.records import SCALE, Row, setting
 from bench.report.data.runs import shared_loss
-from bench.report.study import Result, Runs, Selection, chart, curves, format, style
-from bench.report.write.table import IDENTITY, Column, text, thousandfold, to_data, whole
+from bench.report.study import Result, Runs, Selection, chart, curves, format, style, table
 
 PLACE = 220
 READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
 QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", SCALE)}
 COLUMNS = (
-    *(text("row", "Method"), Column("runs", "Runs", show=whole)),
-    *(Column(key, heading, show=thousandfold) for key, heading in (("end", "End"), ("low", "least"), ("high", "most"))),
-    *(Column("seconds", "Loop", show=format.seconds), Column("spearman", "ρ"), Column("n", "of", show=whole)),
+    *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.whole)),
+    *(
+        table.Column(key, heading, show=table.thousandfold)
+        for key, heading in (("end", "End"), ("low", "least"), ("high", "most"))
+    ),
+    *(
+        table.Column("seconds", "Loop", show=format.seconds),
+        table.Column("spearman", "ρ"),
+        table.Column("n", "of", show=table.whole),
+    ),
 )
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
@@ -113,7 +119,9 @@ def draw(medians: dict[Row, Medians]) -> Figure:
 def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:
     """The CSV, with three kinds of lines: of runs, of medians over a row's runs, and of a row's rank correlation."""
     rows: list[dict[str, Any]] = []
-    for record, identity in zip(runs.records, to_data(IDENTITY, runs.records).to_dict("records"), strict=True):
+    for record, identity in zip(
+        runs.records, table.to_data(table.IDENTITY, runs.records).to_dict("records"), strict=True
+    ):
         rows += [{"kind": "run", **identity, **point} for point in _points(read[record["folder"]]) or [{}]]
     for (row, own), line in zip(medians.items(), lines, strict=True):
         for name, shown in own.items():

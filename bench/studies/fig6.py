@@ -6,11 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.records.format import plural
-from bench.report.data.records import setting
-from bench.report.data.statistics import Interval, share
-from bench.report.study import Result, Runs, Selection, chart, format, style
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, configured, counted, metrics, text
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
@@ -25,9 +21,14 @@ NOTES = (
     "Times and evaluations are those of the loop, over runs that ended ok; markers of one angle stand side by side.",
 )
 RUNS = (
-    *(FAMILY, configured("degrees", "task", "degrees"), configured("starts", "task", "starts"), *IDENTITY),
-    *metrics("success", "rotation_error_deg", "translation_error", "mask_iou", "depth_mae"),
-    *LOOP,
+    *(
+        table.FAMILY,
+        table.configured("degrees", "task", "degrees"),
+        table.configured("starts", "task", "starts"),
+        *table.IDENTITY,
+    ),
+    *table.metrics("success", "rotation_error_deg", "translation_error", "mask_iou", "depth_mae"),
+    *table.LOOP,
 )
 
 
@@ -36,12 +37,12 @@ def make(runs: Runs) -> Result:
     found = _poses(runs)
     rows = dict(list(found.groupby(["row", "preset"], sort=False)))
     angles = sorted(found.degrees.unique())
-    settings = setting(runs.requested(), "task") or {}
+    settings = records.setting(runs.requested(), "task") or {}
     columns = [
-        text("method", "Method"),
-        *(Column(str(angle), f"{angle:g}°", show=_share) for angle in angles),
-        Column("seconds", "Loop", show=format.seconds),
-        Column("evaluations", "Evaluations", show=format.count),
+        table.text("method", "Method"),
+        *(table.Column(str(angle), f"{angle:g}°", show=_share) for angle in angles),
+        table.Column("seconds", "Loop", show=format.seconds),
+        table.Column("evaluations", "Evaluations", show=format.count),
     ]
     return Result(
         runs,
@@ -76,14 +77,14 @@ def _line(row: str, own: pd.DataFrame) -> dict[str, Any]:
     return {"method": row, **costs, **{str(angle): of_angle for angle, of_angle in own.groupby("degrees")}}
 
 
-def _rate(found: pd.DataFrame) -> Interval:
+def _rate(found: pd.DataFrame) -> statistics.Interval:
     """The share of poses that were found, with its interval over shapes, each of which may have several views."""
     shapes = found.groupby(["family", "solid"], sort=False, dropna=False).found
-    return share(shapes.sum().to_numpy(float), shapes.size().to_numpy(float))
+    return statistics.share(shapes.sum().to_numpy(float), shapes.size().to_numpy(float))
 
 
 def _share(found: pd.DataFrame | None) -> str:
-    return "" if found is None else counted(found.found.sum(), len(found), _rate(found))
+    return "" if found is None else table.counted(found.found.sum(), len(found), _rate(found))
 
 
 def _verdict(far: pd.DataFrame, angle: float) -> str:
@@ -91,7 +92,7 @@ def _verdict(far: pd.DataFrame, angle: float) -> str:
     counts = far.groupby("row", sort=False).found.agg(["sum", "size"])
     most, least = counts["sum"].idxmax(), counts["sum"].idxmin()
     said = {row: f"{counts['sum'][row]} of {counts['size'][row]}" for row in (most, least)}
-    shapes = plural(len(far[far.row == most][["family", "solid"]].drop_duplicates()), "shape")
+    shapes = format.plural(len(far[far.row == most][["family", "solid"]].drop_duplicates()), "shape")
     return f"From {angle:g} degrees {most} finds *{said[most]}* cameras, {least} {said[least]}; n = {shapes}."
 
 

@@ -7,9 +7,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure, SubFigure
 
-from bench.report.data.records import Record, measured, setting
-from bench.report.study import Result, Runs, Selection, chart, gallery, style
-from bench.report.write.table import IDENTITY, Column, metric, through, to_data
+from bench.report.study import Result, Runs, Selection, chart, gallery, records, style, table
 
 PLACE = 230
 READS = (Selection("fig7", alike=("dataset", "view", "prior", "task")),)
@@ -28,7 +26,7 @@ def make(runs: Runs) -> Result:
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
     found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
-    data = to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, found.counts), strict=True))
+    data = table.to_data(COLUMNS, zip(chosen.records, map(_counts, chosen.records, found.counts), strict=True))
     return Result(
         chosen,
         "Erosion and dilation of the image by the convergence threshold.",
@@ -81,24 +79,24 @@ def _chart(figure: SubFigure, data: pd.DataFrame) -> None:
         style.legend_below(figure, axis)
 
 
-def _counts(record: Record, drawn: dict[str, Any]) -> dict[str, Any]:
+def _counts(record: records.Record, drawn: dict[str, Any]) -> dict[str, Any]:
     """The counts of a record, or else of its picture, and their shares of the reference's hits."""
     counts = drawn | {
-        name: x for name in ("size", "hits", "lost", "false") if (x := measured(record, name)) is not None
+        name: x for name in ("size", "hits", "lost", "false") if (x := records.measured(record, name)) is not None
     }
     hits = counts.get("hits")
     return counts | {f"{name}_share": counts[name] / hits for name, *_ in KINDS if hits and name in counts}
 
 
-def _epsilon(record: Record) -> float | None:
-    value = setting(record["config"], "renderer", "epsilon")
+def _epsilon(record: records.Record) -> float | None:
+    value = records.setting(record["config"], "renderer", "epsilon")
     return value if isinstance(value, int | float) and value > 0 else None
 
 
 COLUMNS = (  # of a record and its counts
-    *through(lambda line: line[0], *IDENTITY, Column("epsilon", value=_epsilon)),
-    *through(lambda line: line[1], *map(Column, (*gallery.COUNTED, "lost_share", "false_share"))),
-    *through(lambda line: line[0], metric("depth_error_median")),
+    *table.through(lambda line: line[0], *table.IDENTITY, table.Column("epsilon", value=_epsilon)),
+    *table.through(lambda line: line[1], *map(table.Column, (*gallery.COUNTED, "lost_share", "false_share"))),
+    *table.through(lambda line: line[0], table.metric("depth_error_median")),
 )
 
 PAGES = {"fig7": make}

@@ -5,8 +5,7 @@ from collections.abc import Iterable, Sequence
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, style
-from bench.report.write.table import IDENTITY, Column, text, to_data, whole
+from bench.report.study import Result, Runs, Selection, chart, format, style, table
 
 PLACE = 200
 READS = (Selection("gradients", alike=("dataset", "view", "prior", "task")),)
@@ -87,7 +86,7 @@ def make_visibility(runs: Runs) -> Result:
 
 def _of_bands(runs: Runs, bands: Iterable[str], names: Sequence[str]) -> pd.DataFrame:
     """A line per run and band, with the run's preset and readable name."""
-    identity = to_data(IDENTITY, runs.records).assign(preset=list(runs.frame.preset), name=runs.names())
+    identity = table.to_data(table.IDENTITY, runs.records).assign(preset=list(runs.frame.preset), name=runs.names())
     found = [identity.assign(band=band, **{name: runs.number(f"{band}.{name}") for name in names}) for band in bands]
     return pd.concat(found).sort_index(kind="stable")
 
@@ -185,16 +184,24 @@ def _cosine(value: float | None) -> str:
     return format.number(value) if value is None else f"{value:.5f}"
 
 
-def _column(name: str) -> Column:
-    show = whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
-    return Column(name, name.replace("_", " ").capitalize(), show=show)
+def _column(name: str) -> table.Column:
+    show = table.whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
+    return table.Column(name, name.replace("_", " ").capitalize(), show=show)
 
 
-COLUMNS = (text("name", "Renderer"), text("band", "Band"), *map(_column, NUMBERS), text("status", "Status"))
+COLUMNS = (
+    table.text("name", "Renderer"),
+    table.text("band", "Band"),
+    *map(_column, NUMBERS),
+    table.text("status", "Status"),
+)
 COLUMNS_VISIBLE = (
-    *(text("name", "Renderer"), Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}")),
-    *(Column(name, heading) for name, heading in VISIBLE.items()),
-    text("status", "Status"),
+    *(
+        table.text("name", "Renderer"),
+        table.Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}"),
+    ),
+    *(table.Column(name, heading) for name, heading in VISIBLE.items()),
+    table.text("status", "Status"),
 )
 
 PAGES = {"gradients": make, "gradients_visibility": make_visibility}

@@ -1,13 +1,12 @@
 """Every renderer under one loss of the mask and at one tuned setting: errors, ratios to DIST, error over cost."""
 
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared
-from bench.report.study import Result, Runs, Selection
+from bench.report.study import Result, Runs, Selection, compare
 
 PLACE = 21
 READS = (Selection("one_loss", ("task.points",)),)
 NOTES = (
-    ERROR,
-    f"{RATIO} {FAILURE}",
+    compare.ERROR,
+    f"{compare.RATIO} {compare.FAILURE}",
     "On a front, filled in the figure, no other row has less error for less cost; a bound of range analysis counts as "
     "three field values.",
     "Under this loss a renderer is its hits, their distances and the least value along each ray: the relaxed boundary "
@@ -19,7 +18,7 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per family and row, all families first."""
-    return Compared(runs, lambda _: "dist_mask").result(
+    return compare.Compared(runs, lambda _: "dist_mask").result(
         "Every renderer under one loss, at one tuned setting.",
         "How do all renderers compare under one loss and one setting?",
         ratio="Ratio to DIST",

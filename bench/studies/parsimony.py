@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 
 from bench.pictures.size_chart import AXES, FLOPS, KINDS, Candidates
 from bench.report.study import Result, Runs, Selection, chart, format, records, style, table
-from bench.report.write.table import Column, percent, shown, text, thousandfold
 
 PLACE = 160
 READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
@@ -153,7 +152,7 @@ def _spread(line: Line, of: str) -> str:
     """The mean error of a candidate with its standard error, times 1000."""
     if f"{of}.error" not in line:
         return format.MISSING
-    return " ± ".join(thousandfold(line[f"{of}.{name}"]) for name in ("error", "standard_error"))
+    return " ± ".join(table.thousandfold(line[f"{of}.{name}"]) for name in ("error", "standard_error"))
 
 
 def _why(line: Line) -> str:
@@ -162,30 +161,32 @@ def _why(line: Line) -> str:
 
 
 SIZES = ("stored", "free", "bytes")
-SCENE = (text("scene", "Scene"), *(text(column.key) for column in table.IDENTITY))
+SCENE = (table.text("scene", "Scene"), *(table.text(column.key) for column in table.IDENTITY))
 CANDIDATES = (  # of a run and a candidate
     *SCENE,
-    *map(Column, ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")),
-    *map(Column, ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")),
-    *(Column(f"saved_{name}") for name in (*SIZES, FLOPS, "seconds")),
-    *map(Column, ("rung", "kind", "recommended", "best", *SIZES, "sparse_bytes", FLOPS, "error", "standard_error")),
-    *map(Column, ("seconds", "evaluations", "flops", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
+    *map(table.Column, ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")),
+    *map(table.Column, ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")),
+    *(table.Column(f"saved_{name}") for name in (*SIZES, FLOPS, "seconds")),
+    *map(
+        table.Column, ("rung", "kind", "recommended", "best", *SIZES, "sparse_bytes", FLOPS, "error", "standard_error")
+    ),
+    *map(table.Column, ("seconds", "evaluations", "flops", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
 )
 COLUMNS = (  # of a run
     SCENE[0],
-    shown("Recommended", lambda line: _label(line, "chosen")),
-    Column("chosen.stored", "Stored numbers", show=_whole),
-    Column("chosen.free", "Free numbers", show=_whole),
-    Column("chosen.bytes", "Size of the file", show=format.size),
-    shown("Error × 1000", lambda line: _spread(line, "chosen")),
-    *(Column("footprint", "Half a pixel × 1000", show=thousandfold), shown("Why", _why)),
-    shown("Best candidate", lambda line: _label(line, "best")),
-    shown("Best error × 1000", lambda line: _spread(line, "best")),
-    Column("held_out_seeds_held", "Seeds held", show=percent),
-    Column("saved_stored", "Saved stored numbers", show=_factor),
-    Column("saved_seconds", "Saved fit seconds", show=_factor),
-    Column("auto.overhead", "Overhead of field=auto"),
-    Column("frugal_evaluations", "Evaluations at pixel precision", show=_factor),
-    text("lost", "Failed candidates"),
+    table.shown("Recommended", lambda line: _label(line, "chosen")),
+    table.Column("chosen.stored", "Stored numbers", show=_whole),
+    table.Column("chosen.free", "Free numbers", show=_whole),
+    table.Column("chosen.bytes", "Size of the file", show=format.size),
+    table.shown("Error × 1000", lambda line: _spread(line, "chosen")),
+    *(table.Column("footprint", "Half a pixel × 1000", show=table.thousandfold), table.shown("Why", _why)),
+    table.shown("Best candidate", lambda line: _label(line, "best")),
+    table.shown("Best error × 1000", lambda line: _spread(line, "best")),
+    table.Column("held_out_seeds_held", "Seeds held", show=table.percent),
+    table.Column("saved_stored", "Saved stored numbers", show=_factor),
+    table.Column("saved_seconds", "Saved fit seconds", show=_factor),
+    table.Column("auto.overhead", "Overhead of field=auto"),
+    table.Column("frugal_evaluations", "Evaluations at pixel precision", show=_factor),
+    table.text("lost", "Failed candidates"),
 )
 PAGES = {"parsimony": make}

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from bench.report import conditions, single_view
-from bench.report.study import Result, Runs, Selection, records, table
+from bench.report.study import Result, Runs, Selection, conditions, records, single_view, table
 
 PLACE = 43
 READS = (Selection("single_view_budget", ("task.shapes", "task.views"), setup=("machine",)),)

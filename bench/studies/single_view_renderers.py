@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from bench.report import single_view
-from bench.report.study import Result, Runs, Selection, format, table
+from bench.report.study import Result, Runs, Selection, format, single_view, table
 
 PLACE = 39
 READS = (Selection("single_view_renderers", setup=("machine",)),)

@@ -6,16 +6,8 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.pictures import style
-from bench.records import format
-from bench.report.data.curves import HISTORY, history_of, spearman
 from bench.report.data.records import SCALE, Record, base_renderer, family, index, median_of_known
-from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import median
-from bench.report.write import chart
-from bench.report.write.chart import panel_data, series
-from bench.report.write.result import Result
-from bench.report.write.table import FAMILY, IDENTITY, Column, text, to_table
+from bench.report.study import Result, Runs, Selection, chart, curves, format, statistics, style, table
 
 PLACE = 90
 READS = (Selection("speed_completion"),)
@@ -30,8 +22,8 @@ NOTES = (
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
-    *(text("setting", "Setting"), text("runs", "Runs"), text("reached", "Reached")),
-    *(Column("time", "Median time to it", show=format.seconds), Column("rank", "ρ of loss and error")),
+    *(table.text("setting", "Setting"), table.text("runs", "Runs"), table.text("reached", "Reached")),
+    *(table.Column("time", "Median time to it", show=format.seconds), table.Column("rank", "ρ of loss and error")),
 )
 Line = dict[str, Any]  # of a setting of a renderer, with its records and histories
 
@@ -39,7 +31,7 @@ Line = dict[str, Any]  # of a setting of a renderer, with its records and histor
 def make(runs: Runs) -> Result:
     """A line per setting: its runs, how many reached the target, and their median time."""
     lines = [_line(runs, records) | {"setting": row.name, "preset": row.preset} for row, records in runs.rows().items()]
-    own = (*IDENTITY, FAMILY)
+    own = (*table.IDENTITY, table.FAMILY)
     data = [
         history.assign(**{column.key: column.of(record) for column in own})
         for line in lines
@@ -52,8 +44,8 @@ def make(runs: Runs) -> Result:
         question="How fast does the error fall?",
         verdict=_verdict(lines),
         remarks=NOTES,
-        data=pd.concat(data)[[*(column.key for column in own), *HISTORY]],
-        table=to_table(COLUMNS, lines),
+        data=pd.concat(data)[[*(column.key for column in own), *curves.HISTORY]],
+        table=table.to_table(COLUMNS, lines),
         figure=draw(lines),
         chart={
             "panels": [_panel(lines, along) for along in ALONG],
@@ -63,12 +55,12 @@ def make(runs: Runs) -> Result:
 
 
 def _line(runs: Runs, records: list[Record]) -> Line:
-    histories = [history_of(runs, record) for record in records]
+    histories = [curves.history_of(runs, record) for record in records]
     times = [time_to(history, record) for history, record in zip(histories, records, strict=True)]
     return {
         **{"renderer": base_renderer(records[0]), "records": records, "histories": histories},
-        **{"runs": len(times), "reached": sum(map(math.isfinite, times)), "time": float(median(times))},
-        "rank": median_of_known(spearman(history.dropna()) for history in histories),
+        **{"runs": len(times), "reached": sum(map(math.isfinite, times)), "time": float(statistics.median(times))},
+        "rank": median_of_known(curves.spearman(history.dropna()) for history in histories),
     }
 
 
@@ -124,8 +116,8 @@ def _panel(lines: list[Line], along: str) -> dict[str, Any]:
             look = {"text": [[scene, cost] for cost in costs], "link": [f"#/run/{record['folder']}"] * len(one)}
             look |= {"dash": "-", "size": 4}
             look |= {} if first[line["renderer"]] == line["setting"] else {"off": True}
-            drawn.append(series(line["setting"], record["renderer"], one[along], one["error"], **look))
-    return panel_data("", ALONG[along], ERROR, drawn, height=420)
+            drawn.append(chart.series(line["setting"], record["renderer"], one[along], one["error"], **look))
+    return chart.panel_data("", ALONG[along], ERROR, drawn, height=420)
 
 
 PAGES = {"speed_curves": make}

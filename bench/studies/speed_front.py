@@ -113,8 +113,8 @@ def _cells(runs: Runs, trial: Trial, keys: list[records.RunKey]) -> pd.DataFrame
         "error": runs.error(trial.error).clip(lower=records.SCALE * LEAST),
         "evaluations": values + sum(one.fillna(0) for one in further),
     }
-    ok = (runs.frame.status == "ok").to_numpy(bool)
-    cells = pd.DataFrame(quantities).where(ok[:, None])
+    cells = pd.DataFrame(quantities)
+    cells.loc[(runs.frame.status != "ok").to_numpy(bool)] = math.inf
     cells = cells.assign(row=runs.frame.row, key=[keys.index(records.run_key(record)) for record in runs.records])
     wide = cells.pivot(index="row", columns="key", values=[*QUANTITIES]).fillna(math.inf)
     renderers = {row.name: records.base_renderer(own[0]) for row, own in runs.rows().items()}

@@ -8,8 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records.read import curve_lines
-from bench.report.data.statistics import clopper_pearson, rank
-from bench.report.study import Result, Runs, Selection, chart, format, records, style
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style
 from bench.report.write.table import IDENTITY, Column, text, to_data
 
 PLACE = 120
@@ -90,7 +89,7 @@ def make_cost(runs: Runs) -> Result:
     shared = rendered[~rendered["axis"].isin(lacking)]
     # A run that did not end ok, or is missing, has no shade, so it ranks last.
     shades = shared.pivot(index="axis", columns="row", values="shade").reindex(columns=cells["row"].unique())
-    ranks = rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
+    ranks = statistics.rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
     lines["behind"] = lines.groupby(["cost", "rank"]).cumcount()  # of points at one place
@@ -195,7 +194,7 @@ def _failures(cell: Any, end: str) -> str:
     successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
     if not trials > 0:
         return "not tried"
-    rate = clopper_pearson(1 - successes / trials, trials)
+    rate = statistics.clopper_pearson(1 - successes / trials, trials)
     share = "" if cell.one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
     return f"{trials - successes:.0f} of {trials:.0f} failed{share}"
 
@@ -324,7 +323,7 @@ def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.Data
     tried = numbers.assign(success=tried["success"].eq(True))
     levels = tried[np.isfinite(tried["level"] + tried["severity"])].groupby("level", as_index=False)
     found = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
-    rates = [clopper_pearson(k / n, n) for k, n in zip(found["successes"], found["trials"], strict=True)]
+    rates = [statistics.clopper_pearson(k / n, n) for k, n in zip(found["successes"], found["trials"], strict=True)]
     ends = {end: [math.nan if cell["one_trial"] else getattr(rate, end) for rate in rates] for end in ("low", "high")}
     found = found.assign(
         axis=cell["axis"], row=cell["row"], preset=cell["preset"], share=[rate.value for rate in rates]

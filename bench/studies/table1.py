@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import pandas as pd
 
-from bench.report.data.records import Record, measured, repeated, row_of, setting
-from bench.report.study import Result, Runs, Selection, format
-from bench.report.write.table import IDENTITY, configured, metric, shown, text, to_data, together, whole
+from bench.report.study import Result, Runs, Selection, format, records, table
+from bench.report.write.table import metric
 
 PLACE = 10
 READS = (Selection("table1", alike=("dataset", "view", "prior", "task")),)
@@ -44,10 +43,10 @@ FINISHED = ("size", "queries", "peak_memory_bytes", "hits", "lost", "false", "wr
 def make(runs: Runs) -> Result:
     """A line per strategy: the paper's in its order, then others in the order of their runs."""
     place = {preset: number for number, preset in enumerate(PUBLISHED)}
-    presets = [row_of(record).preset for record in runs.records]
+    presets = [records.row_of(record).preset for record in runs.records]
     order = sorted(range(len(presets)), key=lambda i: place.get(presets[i], len(place)))
     runs = replace(runs, records=[runs.records[i] for i in order])
-    data, times = _data(runs), repeated(runs.records)
+    data, times = _data(runs), records.repeated(runs.records)
     return Result(
         runs,
         "The cost of each strategy of sphere tracing.",
@@ -66,14 +65,15 @@ def _data(runs: Runs) -> pd.DataFrame:
     """A line per run: what was measured at the requested size, what was published, what was finished at a smaller."""
     requested, steps = runs.number("config.view.resolution"), runs.number("config.renderer.steps")
     number = {
-        name: pd.Series([measured(r, name) for r in runs.records], dtype=float) for name in {*MEASURED, *FINISHED}
+        name: pd.Series([records.measured(r, name) for r in runs.records], dtype=float)
+        for name in {*MEASURED, *FINISHED}
     }
     done = number["size"] == requested
     full = {_key(name): number[name].where(done) for name in MEASURED}
     paper = pd.DataFrame([PUBLISHED.get(preset, (None,) * 4) for preset in runs.frame.preset], dtype=object)
     said = {f"published_{name}": paper[at] for at, name in enumerate(("size", "steps", "queries", "time"))}
     smaller = {f"finished_{_key(name)}": number[name].where(~done) for name in FINISHED}
-    return to_data(IDENTITY, runs.records).assign(size=requested, steps=steps, **full, **said, **smaller)
+    return table.to_data(table.IDENTITY, runs.records).assign(size=requested, steps=steps, **full, **said, **smaller)
 
 
 def _key(metric: str) -> str:
@@ -94,18 +94,22 @@ def _verdict(data: pd.DataFrame) -> str:
     )
 
 
-def _size(record: Record) -> str:
+def _size(record: records.Record) -> str:
     """The size at which the row was measured, with the requested size and the status where these differ."""
-    size, requested = measured(record, "size"), setting(record["config"], "view", "resolution")
+    size, requested = records.measured(record, "size"), records.setting(record["config"], "view", "resolution")
     status = "" if record["status"] == "ok" else record["status"]
     if size is not None and size == requested:
         return f"{requested} ({status})" if status else str(requested)
-    return f"{whole(size)} ({requested}: {record['status']})" if requested else f"{whole(size)} ({record['status']})"
+    return (
+        f"{table.whole(size)} ({requested}: {record['status']})"
+        if requested
+        else f"{table.whole(size)} ({record['status']})"
+    )
 
 
-def _step(record: Record) -> str:
+def _step(record: records.Record) -> str:
     """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
-    spread = [measured(record, f"step_seconds{end}") for end in ("", "_low", "_high")]
+    spread = [records.measured(record, f"step_seconds{end}") for end in ("", "_low", "_high")]
     texts = [format.seconds(x) for x in spread]
     if None in spread:
         return texts[0]
@@ -113,22 +117,33 @@ def _step(record: Record) -> str:
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
 
 
-def _published(record: Record, part: int) -> str:
-    return str(PUBLISHED.get(row_of(record).preset, ("",) * 4)[part])
+def _published(record: records.Record, part: int) -> str:
+    return str(PUBLISHED.get(records.row_of(record).preset, ("",) * 4)[part])
 
 
 COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
-    *(text("name", "Strategy"), shown("Size", _size), configured("", "renderer", "steps", heading="Steps")),
-    shown("Queries", lambda r: format.queries(measured(r, "queries"), measured(r, "coarse_queries"))),
+    *(
+        table.text("name", "Strategy"),
+        table.shown("Size", _size),
+        table.configured("", "renderer", "steps", heading="Steps"),
+    ),
+    table.shown(
+        "Queries", lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries"))
+    ),
     metric("forward_seconds", "Forward", format.seconds),
     metric("backward_seconds", "Backward", format.seconds),
-    shown("Step", _step),
+    table.shown("Step", _step),
     metric("peak_memory_bytes", "Peak memory", format.size),
-    metric("hits", "Hits", whole),
-    shown("Missed / spurious / wrong depth", together(measured, whole, "lost", "false", "wrong")),
-    shown("Depth error median / max", together(measured, format.number, "depth_error_median", "depth_error_max")),
-    shown("Published queries", lambda record: _published(record, 2)),
-    shown("Published time", lambda record: _published(record, 3)),
+    metric("hits", "Hits", table.whole),
+    table.shown(
+        "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")
+    ),
+    table.shown(
+        "Depth error median / max",
+        table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
+    ),
+    table.shown("Published queries", lambda record: _published(record, 2)),
+    table.shown("Published time", lambda record: _published(record, 3)),
 )
 
 PAGES = {"table1": make}

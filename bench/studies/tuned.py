@@ -1,15 +1,14 @@
 """Each method at its defaults, tuned, and at its paper's setting, side by side."""
 
-from bench.report.compare import ERROR, FAILURE, RATIO, Compared, excluding_one
-from bench.report.study import Result, Runs, Selection, table
+from bench.report.study import Result, Runs, Selection, compare, table
 
 PLACE = 38
 READS = (Selection("tuned", ("task.points",)),)
 FOLDER = "tuned/"  # of the presets that `python -m bench.tune` writes
 PAPERS = ("_paper", "_official")  # ends of the names of presets with a paper's setting
 NOTES = (
-    ERROR,
-    f"{RATIO} {FAILURE}",
+    compare.ERROR,
+    f"{compare.RATIO} {compare.FAILURE}",
     "Tuned rows were chosen on validation shapes by `python -m bench.tune`, at desk on sofas and planes from 20 "
     "points: other families and numbers of points are not what they were tuned for.",
     "In the figure filled points are tuned.",
@@ -25,7 +24,7 @@ def default_of(preset: str) -> str:
 
 def make(runs: Runs) -> Result:
     """A line per family and row: medians, and the ratio to the method's defaults."""
-    found = Compared(runs, default_of)
+    found = compare.Compared(runs, default_of)
     lines = [line for line in found.lines if line["family"] in found.families]
     tuned = [line for line in lines if line["preset"].startswith(FOLDER)]
     ratios = [(f"{line['row']} on {line['family']}", line["ratio"]) for line in tuned]
@@ -33,7 +32,7 @@ def make(runs: Runs) -> Result:
         "Methods at their defaults, tuned, and at their papers' settings.",
         "Are our defaults as good as tuned settings?",
         ratio="Ratio to the default",
-        verdict=excluding_one(ratios, "of tuned settings to the defaults"),
+        verdict=compare.excluding_one(ratios, "of tuned settings to the defaults"),
         remarks=NOTES,
         lines=lines,
         run_columns=RUNS,

@@ -4,8 +4,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.compare import CHAMFER
-from bench.report.study import Result, Runs, chart, format, statistics, style, table
+from bench.report.study import Result, Runs, chart, compare, format, statistics, style, table
 from bench.report.tuning import TUNING, Tuning, left_out, tunings, unfinished
 
 PLACE = 36
@@ -15,8 +14,9 @@ NOTES = (
     "conf/methods.yaml), even in the logarithm of each setting, and is judged on the same shapes.",
     "The draw with the smallest geometric mean of errors on the validation shapes is taken; the expectation is over "
     "all choices of so many of the draws.",
-    f"{CHAMFER} A run that did not end ok has the largest finite error of any draw of any method on its shape; of two "
-    "draws that with fewer failures is better. Validation runs: {validation} per draw; test runs: {test} per draw.",
+    f"{compare.CHAMFER} A run that did not end ok has the largest finite error of any draw of any method on its shape; "
+    "of two draws that with fewer failures is better. Validation runs: {validation} per draw; test runs: {test} per "
+    "draw.",
     "The interval is over test shapes, for these draws and this choice: other draws and shapes would add to it.",
 )
 RUNS = (

@@ -2,11 +2,7 @@
 
 import math
 
-from bench.records.format import plural
-from bench.report.data.records import definitions, grouped
-from bench.report.medians import COST, medians, scene_of
-from bench.report.study import Result, Runs, Selection, gallery
-from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, percent, text, thousandfold
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, records, table
 
 PLACE = 51
 READS = (Selection("unseen_back", setup=("scenes", "machine")),)
@@ -21,21 +17,21 @@ NOTES = (
     "losses, or two renderers under one.",
 )
 COLUMNS = (
-    text("method", "Method"),
-    Column("seen_roughness", "Roughness, seen (degrees)"),
-    Column("unseen_roughness", "unseen"),
-    Column("own_early_weight", "Early weight", show=percent),
-    Column("seen_chamfer_l1", "Chamfer-L1, seen", show=thousandfold),
-    Column("chamfer_l1", "all", show=thousandfold),
-    Column("mask_iou", "Mask IoU"),
-    *COST,
+    table.text("method", "Method"),
+    table.Column("seen_roughness", "Roughness, seen (degrees)"),
+    table.Column("unseen_roughness", "unseen"),
+    table.Column("own_early_weight", "Early weight", show=table.percent),
+    table.Column("seen_chamfer_l1", "Chamfer-L1, seen", show=table.thousandfold),
+    table.Column("chamfer_l1", "all", show=table.thousandfold),
+    table.Column("mask_iou", "Mask IoU"),
+    *medians.COST,
 )
-RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES), *LOOP)
+RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*NAMES), *table.LOOP)
 
 
 def make(runs: Runs) -> Result:
     """A line per row, and pictures from behind."""
-    lines, every = medians(runs, NAMES), grouped(runs.records, scene_of)
+    lines, every = medians.medians(runs, NAMES), records.grouped(runs.records, medians.scene_of)
     arrays = [BACK + part for part in ("truth", "colours", "normals", "hit")]
     scenes = {name: gallery.Scene(runs, every[name], arrays) for name in list(every)[:SCENES]}
     truth = ("truth", "normals", lambda found: [found[f"{BACK}truth"]])
@@ -46,11 +42,11 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Photographs from one side, and the back that none shows.",
-        f"Medians over {plural(len(every), 'scene')}, distances in scene units, times 1000; in the figure, colours "
-        "above and normals below, from behind.",
+        f"Medians over {format.plural(len(every), 'scene')}, distances in scene units, times 1000; in the figure, "
+        "colours above and normals below, from behind.",
         question="What leaves bumps on the side that no photograph shows?",
-        verdict=_verdict(lines, plural(len(every), "scene")),
-        remarks=(*NOTES, *definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
+        verdict=_verdict(lines, format.plural(len(every), "scene")),
+        remarks=(*NOTES, *records.definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
