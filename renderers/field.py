@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from math import log
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -284,8 +285,41 @@ def points_in_ball(count: int) -> Float[Tensor, "count 3"]:
     return torch.rand(count, 1, **draws) ** (1 / 3) * direction
 
 
+@runtime_checkable
+class Occupancy(Protocol):
+    """Points [*batch, 3] to logits [*batch] of the probability p of being inside: any callable."""
+
+    def __call__(self, points: Float[Tensor, "*batch 3"], /) -> Float[Tensor, "*batch"]: ...
+
+
+@dataclass(frozen=True)
+class _OccupancyField:
+    logits: Occupancy
+    level: float
+    flops: Flops | None
+    kind: Kind = Kind.LEVEL
+    lipschitz: float | None = None
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.level - self.logits(points)
+
+
+def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None = None) -> Field:
+    """The level set p = threshold (DVR, Sec. 3.1) as a field: logit(threshold) - logit(p), negative where p is above.
+
+    Args:
+        logits: logit(p) at points.
+        threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
+        flops: operations per point, where that is known.
+    """
+    if not 0 < threshold < 1:
+        raise ValueError(f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5")
+    level = log(threshold / (1 - threshold))
+    return _OccupancyField(logits, level, flops)  # pyright: ignore[reportReturnType] (it is frozen)
+
+
 def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:
-    """Logits of occupancy from a field's values; 0 on the surface.
+    """Logits of occupancy from a field's values; 0 on the surface, also where the threshold is not 0.5.
 
     Args:
         values: of the field.

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Flops, Kind
+from renderers.field import Field, Flops, Kind, occupancy_field
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import CHUNK
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
@@ -20,6 +20,7 @@ SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second de
 AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
 DIRECTION_OCTAVES = 2  # of the encoding of view directions
 LOGIT_WIDTH = 0.1  # scene units over which a logit of occupancy changes by 1 at its start
+THRESHOLD = 0.5  # of occupancy: DVR's tau
 COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size of those of distances
 Vectors = Float[Tensor, "*batch 3"]
 
@@ -170,7 +171,7 @@ def begin_as_sphere(network: OccupancyNetwork, radius: float) -> None:
 
 @dataclass(frozen=True)
 class OccupancyOf:
-    """The level set p = 1/2 of an occupancy network at one code (DVR, Sec. 3.1, with tau = 1/2)."""
+    """The level set p = 1/2 of an occupancy network at one code (DVR, Sec. 3.1)."""
 
     bound: BoundOccupancy
 
@@ -183,7 +184,7 @@ class OccupancyOf:
         return self.bound.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return -self.bound.logits(points)
+        return occupancy_field(self.bound.logits, THRESHOLD)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`."""

@@ -1,10 +1,12 @@
 """The occupancy network against the plain computation, in float64, and the logits of fields."""
 
+from math import log
+
 import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Flops, Kind, occupancy_logits
+from renderers.field import Flops, Kind, occupancy_field, occupancy_logits
 from renderers.fields import occupancy
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.occupancy import OccupancyNetwork
@@ -103,6 +105,23 @@ def test_flops_are_two_a_weight_without_the_code_and_twice_that_back_to_weights(
     assert network.at(torch.zeros(4, dtype=torch.float64)).flops == Flops(value, 2 * value)
     network.requires_grad_(False)
     assert network.at(torch.zeros(4, dtype=torch.float64)).flops == Flops(value, value)
+
+
+def test_the_field_of_an_occupancy_is_negative_where_the_probability_exceeds_the_threshold():
+    def logits(points: Tensor) -> Tensor:
+        return torch.tensor([0.1, 0.3, 0.6], dtype=points.dtype).logit()
+
+    low, half = occupancy_field(logits, 0.2), occupancy_field(logits, 0.5)
+    points = torch.zeros(3, 3, dtype=torch.float64)
+    assert (low(points) < 0).tolist() == [False, True, True]
+    assert (half(points) < 0).tolist() == [False, False, True]
+    # logit(0.2) = -log 4, logit(0.5) = 0; p = 0.6 is 3 to 2.
+    assert low(points)[2].item() == pytest.approx(-log(4) - log(1.5))
+    assert half(points)[2].item() == pytest.approx(-log(1.5))
+    assert (low.kind, low.lipschitz, low.flops) == (Kind.LEVEL, None, None)
+    for threshold in (0.0, 1.0, float("nan")):
+        with pytest.raises(ValueError, match="threshold must lie between 0 and 1"):
+            occupancy_field(logits, threshold)
 
 
 @each("field, factor", [(sphere(0.5), 4.0), (BOUND, 4.0), (LEVEL, 1.0)])
