@@ -56,6 +56,13 @@ def test_worked_example():
     )
 
 
+def test_a_distance_equal_to_the_threshold_does_not_count():
+    # Both ways the distances are 1/2 and 1/4; below 1/2 lies one of two, so precision, recall and F are 1/2.
+    truth = surface([[0, 0, 0], [4, 0, 0]], [[0, 0, 1], [0, 0, 1]])
+    predicted = surface([[0, 0, 0.5], [4, 0, 0.25]], [[0, 0, 1], [0, 0, 1]])
+    assert surface_metrics(predicted, truth, threshold=0.5)["fscore"] == 0.5
+
+
 def test_swapping_the_surfaces():
     first, second = random_surface(1, 40), random_surface(2, 70)
     forth = surface_metrics(first, second, threshold=0.5)

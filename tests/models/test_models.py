@@ -11,7 +11,7 @@ import torch
 from bench.config import load
 from bench.models import candidates as formulas
 from bench.models.candidates import PAPERS, REACH, by_size, candidate
-from bench.models.fit import SCREENING, Fitter, _slope_error
+from bench.models.fit import SCREENING, Fitter, _slope_error, scattered
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
@@ -386,6 +386,13 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
     given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
     with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
         hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.2, (), 0.02, 0), rays=64)
+
+
+def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
+    far = torch.tensor([[0.0, 0.0, 9.0]])  # outside of the sphere that holds the others
+    found = scattered(far, 100, torch.Generator().manual_seed(0))
+    assert int(((found - far).norm(dim=1) < 0.5).sum()) == 50
+    assert int((found.norm(dim=1) <= 1.1).sum()) == 50
 
 
 def test_a_warm_start_counts_evaluations_of_the_previous_field():

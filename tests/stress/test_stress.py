@@ -12,6 +12,7 @@ from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.solve.optimise import History
 from bench.solve.problem import Unsupported
+from bench.stress import fit
 from bench.stress.axes import Stress, Sweep
 from bench.stress.fit import FITS, _failure, judge_fit
 from bench.stress.gradient import judge_gradient
@@ -209,6 +210,15 @@ def test_a_disturbed_fit_ends_further_off(scene):
     ]
     assert outcomes[0].success
     assert outcomes[1].numbers["surface_error"] > outcomes[0].numbers["surface_error"]
+
+
+def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
+    fits, draw_spheres = [], fit._draw_spheres
+    monkeypatch.setattr(fit, "_draw_spheres", lambda draw, offset: fits.append(offset) or draw_spheres(draw, offset))
+    for name in ("far_start", "a_ball"):
+        few = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
+        judge_fit(name, 0.7, drawn(), renderer=load("renderer", "dist"), conditions=few)
+    assert fits == [0.7, FIT.offset]
 
 
 def test_a_trial_that_takes_too_many_values_is_a_failure_of_that_kind():

@@ -118,6 +118,15 @@ def test_a_guard_moves_its_breakdown(tmp_path, guard, stress):
     assert guarded["level"] > bare["level"] + 0.03
 
 
+def test_success_that_rises_with_severity_is_noted(tmp_path):
+    stress = stress_named("gap")
+    turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
+    for asked, doubted in ((stress, False), (turned, True)):
+        run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
+        Stability(asked, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(1e8, 8)).execute(run)
+        assert any(note.startswith("success does not fall with severity") for note in run.record.notes) is doubted
+
+
 def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
     metrics = run(tmp_path, "empty_scene", load("renderer", "idr", epsilon=1e-3))
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
