@@ -226,7 +226,7 @@ def test_what_was_repaired_is_told_where_the_run_fails_later(bench, no_prior, tm
     assert "the slow steps began" in err
     notes = [line for line in out.splitlines() if line.startswith("note: ")]
     assert any(note.startswith("note: warning: repair changed the area from ") for note in notes)
-    assert "note: holes closed" in notes
+    assert "note: 1 hole closed" in notes
 
 
 @each("name", ["Stühle.ply", "chair (1).ply", "a=b.ply", "a,b.ply"])

@@ -176,7 +176,7 @@ def trained(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(priors, "train", never)
     monkeypatch.setattr(priors, "distance_samples", never)
-    monkeypatch.setattr(networks, "train", never)
+    monkeypatch.setattr(networks.Lessons, "train", never)
     monkeypatch.setattr(networks.Imaging, "images", never)
 
     def run(main, *arguments: str) -> tuple[int, list[str], str]:

@@ -26,10 +26,17 @@ class Toy:
     spoil: dict[int, float] = field(default_factory=dict)
     counts: Counts = field(default_factory=Counts)
     calls: int = 0
+    rays_per_iteration: int = POINTS
 
     def __post_init__(self):
         self.radius = torch.tensor(1.0, requires_grad=True)
         self.parameters = [self.radius]
+
+    def field(self):
+        return sphere(self.radius.detach())
+
+    def objective(self):
+        return None
 
     def loss(self, iteration):
         metered = Meter(sphere(self.radius), self.counts)
