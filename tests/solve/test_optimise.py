@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
+from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
 from bench.solve.optimise import DIVERGED, History, Starts, StartSettings, optimise
 from bench.solve.problem import OptimiserSettings
@@ -27,6 +28,10 @@ class Toy:
     counts: Counts = field(default_factory=Counts)
     calls: int = 0
     rays_per_iteration: int = POINTS
+    tracked: tuple[str, ...] = ()
+    observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
+
+    shown = None
 
     def __post_init__(self):
         self.radius = torch.tensor(1.0, requires_grad=True)
@@ -37,6 +42,18 @@ class Toy:
 
     def objective(self):
         return None
+
+    def frame(self):
+        return self.field(), None
+
+    def evaluate(self, inputs):
+        return Evaluation({"radius": self.radius.item()})
+
+    def checkpoint(self, inputs):
+        return {}
+
+    def draw(self, inputs, folder, first, curve, title):
+        pass
 
     def loss(self, iteration):
         metered = Meter(sphere(self.radius), self.counts)
