@@ -11,7 +11,7 @@ from renderers import DIST
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
-from renderers.march import Front, Stepping, march, march_coarse_to_fine
+from renderers.march import Front, Stepping, march, march_coarse_to_fine, pyramid
 from renderers.rendering import Status
 from tests.looped import each
 from tests.renderers.analytic_cases import beam, sphere_hits, vector
@@ -130,6 +130,12 @@ def test_coarse_to_fine_fills_up_odd_sizes_and_takes_batches_of_images():
     # 5 x 6 pixels: 2 x 2, 3 x 3, 5 x 6 rays.
     assert trace(constant(0.01), sheet(5, 6), PLAIN, steps=8)[1] == 3 * 4 + 3 * 9 + 2 * 30
     assert trace(constant(0.01), sheet(5, 6, 2), PLAIN, steps=8)[1] == 2 * (3 * 4 + 3 * 9 + 2 * 30)
+
+
+def test_a_ray_continues_the_coarse_ray_that_covers_it():
+    for level, (columns, across) in zip(pyramid(sheet(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
+        for ray, parent in enumerate(level.parent.tolist()):
+            assert parent == ray // columns // 2 * across + ray % columns // 2
 
 
 def test_coarse_to_fine_on_a_sphere_head_on():
