@@ -8,6 +8,7 @@ import os
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import cache
@@ -16,6 +17,7 @@ from typing import Any
 
 import pytest
 from beartype import BeartypeConf, beartype
+from beartype.roar import BeartypeDecorHintPep585DeprecationWarning
 from hypothesis import settings
 from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
@@ -36,6 +38,7 @@ def checked(function: Callable) -> Callable:
 
 
 if os.environ.get("CHECK_TYPES"):  # set by `make test-types`; the hook must stand before the imports that it checks
+    warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)  # of OmegaConf's, in other conftests
     install_import_hook(["renderers", "datasets", "bench"], "tests.conftest.checked")
 
 settings.register_profile("implicit-bench", deadline=None, derandomize=True)
