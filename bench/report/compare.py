@@ -110,7 +110,10 @@ class Compared:
 
     @cached_property
     def planned(self) -> list[tuple[str, str]]:
-        """The rows in the order of the sweep that planned most of the runs; others last, in that of the runs."""
+        """The rows in the order of the sweep that planned most of the runs; others last, in that of the runs.
+
+        It reads all plans, and is asked only where one of several rows is to be chosen.
+        """
         of_run = {record["folder"]: (row.preset, row.name) for row, of in self.runs.rows().items() for record in of}
         plans, _ = read_plans(self.runs.results_dir)
         found = [[of_run[cell["id"]] for cell in plan["cells"] if cell["id"] in of_run] for plan in plans]
@@ -120,8 +123,8 @@ class Compared:
     def reference_of(self, row: tuple[str, str]) -> tuple[str, str]:
         """The row that a row is divided by; itself where there is no other."""
         wanted = row[1] if self.reference is None else self.reference(row[0])
-        named = [other for other in self.planned if other[1] == wanted]
-        return next(iter(named + [other for other in self.planned if other[0] == wanted]), row)
+        found = [other for other in self.rows if other[1] == wanted] or [r for r in self.rows if r[0] == wanted]
+        return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
 
     @cached_property
     def conditions(self) -> list[str]:
