@@ -57,8 +57,8 @@ def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = No
     """Reads one file as a closed solid, wound outward, whose `repairs` say what was changed.
 
     Vertices at the same place are merged, so that texture seams close. A mesh that is already closed keeps its
-    surface. Otherwise its holes are closed; where that gives no solid, or parts overlap, it is wrapped: a closed
-    surface is shrunk around it.
+    surface. Otherwise its holes are closed and overlapping parts merged; where that gives no solid, it is wrapped: a
+    closed surface is shrunk around it.
 
     Args:
         path: the file.
@@ -94,6 +94,8 @@ def read_mesh(path: str | Path) -> Mesh:
 
 def check_counts(path: Path, vertices: int, faces: int) -> None:
     """Refuses an .off or a .ply that holds less than its header claims: trimesh reads what is left of a cut file."""
+    if path.suffix.lower() not in (".off", ".ply"):
+        return
     header = path.read_bytes().partition(b"end_header")[0].decode("ascii", "replace")
     claims = {"vertices": 0, "faces": 0}
     if path.suffix.lower() == ".off":
