@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 METHOD, SPACE, TUNED = "method", "method/space", "method/tuned"
@@ -35,7 +35,6 @@ CHOICES = ("task", "renderer", "dataset", "stress", "silhouette", "supervision",
 LOOK = "_look_"  # of a renderer or a method: its colour, marker and line in figures
 DROPPED = ("base", "space", "chosen")  # keys of a row that are no part of what it holds
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
-MISSING = "???"
 DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
 SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
 MANY = 20  # names, beyond which a message leaves variants out

@@ -15,6 +15,7 @@ from bench.models.model import Evidence, Size
 from bench.models.observations import TILES, tiles
 from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
+from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.fields import PRIOR, parsed
@@ -165,7 +166,7 @@ class Choice:
         found = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
         if self.kept.error is None:
             found += ", though no trial ended well: lower task.optimiser.learning_rate"
-        aside = f"{self.aside} photograph{'s' if self.aside > 1 else ''} set aside"
+        aside = f"{plural(self.aside, 'photograph')} set aside"
         spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
         return f"{found}; error of colours on {aside}, after the trials: {errors}; {spent}"
 

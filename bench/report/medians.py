@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.records import format, metrics
-from bench.records.format import plural as plural
 from bench.report.data.records import Record, family, index
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import median

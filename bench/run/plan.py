@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
 
-from bench.records.format import seconds
+from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
 
@@ -111,4 +111,4 @@ def about_as_long(like: list[float]) -> str:
     """What a run will take, in words, by what runs like it took."""
     if not like:
         return "time unknown"
-    return f"about {seconds(median(like))} (median of {len(like)} finished run{'s' * (len(like) > 1)})"
+    return f"about {seconds(median(like))} (median of {plural(len(like), 'finished run')})"

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import Isolation, Rerun
 from bench.progress import display, notice
 from bench.records.folder import Identity, reusable
-from bench.records.format import number, seconds
+from bench.records.format import number, plural, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
@@ -79,7 +79,7 @@ class Planner(Callback):
             swept, workers = swept_over(config), workers_of(config)
             launcher = config.hydra.runtime.choices["hydra/launcher"]
             if not config.plan:
-                runs = f"{len(swept)} run{'s' * (len(swept) > 1)}, {workers} at a time (hydra/launcher={launcher})"
+                runs = f"{plural(len(swept), 'run')}, {workers} at a time (hydra/launcher={launcher})"
                 notice(f"sweep: {runs}; a line follows as each ends")
             if config.isolation == Isolation.process:
                 warm_up()

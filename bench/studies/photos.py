@@ -1,6 +1,6 @@
 """Shape and colour from real photographs: the rows of DVR's Table 2 that need no true shape."""
 
-from bench.report.study import Result, Runs, Selection, medians, records, table
+from bench.report.study import Result, Runs, Selection, format, medians, records, table
 
 PLACE = 46
 READS = (Selection("photos", setup=("scenes", "machine")),)
@@ -19,7 +19,7 @@ RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*NAMES, "own_psnr", "own_m
 
 def make(runs: Runs) -> Result:
     """A line per row."""
-    lines, folders = medians.medians(runs, NAMES), medians.plural(len(runs.families()), "folder")
+    lines, folders = medians.medians(runs, NAMES), format.plural(len(runs.families()), "folder")
     return Result(
         runs,
         "Shape and colour from real photographs.",

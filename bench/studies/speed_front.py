@@ -140,10 +140,9 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
                 f"{p['setting']} (*{format.seconds(p['seconds'])}*, error × 1000 {format.number(p['error'])})"
                 for p in (front[0], *front[1:][-1:])
             ]
-            n = panel[0]["shapes"]
             return (
-                f"On the front of {trial.title}: {len(front)} of {len(panel)} settings, {' to '.join(ends)}; n = {n} "
-                f"shape{'s' * (n > 1)}."
+                f"On the front of {trial.title}: {len(front)} of {len(panel)} settings, {' to '.join(ends)}; n = "
+                f"{format.plural(panel[0]['shapes'], 'shape')}."
             )
     return ""
 
@@ -234,7 +233,7 @@ COLUMNS = (  # of a line
     ),
     *map(table.Column, ("failed", "runs", "missing")),
     table.shown("Failed", _failed),
-    *(table.Column("on_front", "P(on the front)", show=table.defined), table.Column("dominated")),
+    *(table.Column("on_front", "P(on the front)"), table.Column("dominated")),
 )
 
 PAGES = {"speed_front": make}

@@ -31,11 +31,6 @@ def percent(share: float | None) -> str:
     return format.number(share) if share is None else f"{100 * share:.0f} %"
 
 
-def defined(value: float | None) -> str:
-    """A probability or a rank as text; missing where it is not a number, as there was one draw alone."""
-    return format.number(None if value is None or math.isnan(value) else value)
-
-
 def counted(part: float, whole: int, rate: Interval) -> str:
     """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
     return f"{part:g} of {whole} {rate.ends(100)}{' %' if rate.known else ''}"
