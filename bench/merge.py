@@ -26,13 +26,13 @@ def merge(sources: list[Path], into: Path) -> list[str]:
     A run with a link that leads out of its results folder is not copied, and has a line too.
 
     Raises:
-        ValueError: for a source that is not a results folder, or that contains `into`.
+        ValueError: for a source that is not a results folder, or that is or contains `into`.
     """
     for source in sources:
         if not (source / "runs").is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
-        if source.resolve() in into.resolve().parents:
-            raise ValueError(f"{into} lies within {source}: give --into a folder outside of all sources")
+        if not leads_out(into, source):
+            raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")
     check_links(into)
     (into / "runs").mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> int:
         print(write_index(options.into))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return 2
     return 0
 
 

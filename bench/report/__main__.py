@@ -13,37 +13,39 @@ USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [ship=
   results_dir   the folder with the runs; `{RESULTS}` unless given
   meshes        of how many runs, the newest first, the mesh turns on the page; 500 unless given, or all
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
-KEYS = ("results_dir", "meshes", "ship")
+KEYS = {"results_dir": "results_dir=PATH", "meshes": "meshes=all", "ship": "ship=PATH"}  # and what to type
 
 
-def main(arguments: list[str]) -> None:
-    """Writes `runs.csv`, all pages, the tables of sweeps and `index.html`.
+def main(arguments: list[str]) -> int:
+    """Writes `runs.csv`, all pages, the tables of sweeps and `index.html`; gives the exit status.
 
-    Exits with a message where an argument is wrong.
+    It is 2 where an argument is wrong, and 1 where a study could not be made.
     """
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
-        return
+        return 0
     try:
-        given = parsed(arguments)
-        results_dir = Path(given.get("results_dir", RESULTS))
-        meshes = _meshes(given.get("meshes", str(MOST_MESHES)))
-        records, unread = read_records(results_dir)
-        if ship := given.get("ship"):
-            print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
-            return
-        table = write_frame(records, results_dir)
-        broken: list[str] = []
-        papers = write_paper(records, results_dir, problems=broken)
-        for path in (table, *papers, *write_sweeps(records, results_dir)):
-            print(path)
-        for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
-            print(problem, file=sys.stderr)
-        print(write_index(results_dir, meshes=meshes))
-        if broken:
-            sys.exit(1)
+        return _report(parsed(arguments))
     except ValueError as error:
-        sys.exit(str(error))
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _report(given: dict[str, str]) -> int:
+    results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
+    records, unread = read_records(results_dir)
+    if ship := given.get("ship"):
+        print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
+        return 0
+    table = write_frame(records, results_dir)
+    broken: list[str] = []
+    papers = write_paper(records, results_dir, problems=broken)
+    for path in (table, *papers, *write_sweeps(records, results_dir)):
+        print(path)
+    for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
+        print(problem, file=sys.stderr)
+    print(write_index(results_dir, meshes=meshes))
+    return 1 if broken else 0
 
 
 def parsed(arguments: list[str]) -> dict[str, str]:
@@ -55,10 +57,10 @@ def parsed(arguments: list[str]) -> dict[str, str]:
     given = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key not in KEYS or not value:
-            raise ValueError(
-                f"argument must be one of {', '.join(f'{k}=VALUE' for k in KEYS)}, found {argument!r}\n{USAGE}"
-            )
+        if key not in KEYS:
+            raise ValueError(f"argument must be one of {', '.join(KEYS.values())}, found {argument!r}")
+        if not value:
+            raise ValueError(f"{key} has no value: type {KEYS[key]}")
         given[key] = value
     return given
 
@@ -67,9 +69,9 @@ def _meshes(text: str) -> int | None:
     if text == "all":
         return None
     if not text.isdecimal():
-        raise ValueError(f"meshes must be a number of runs or all, found {text!r}\n{USAGE}")
+        raise ValueError(f"meshes must be a number of runs or all, found {text!r}")
     return int(text)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

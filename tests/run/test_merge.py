@@ -118,10 +118,11 @@ def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path):
 
 
 def test_what_cannot_be_joined_is_an_error_and_changes_nothing(tmp_path, capsys):
-    assert main([str(tmp_path), "--into", str(tmp_path / "d")]) == 1
+    assert main([str(tmp_path), "--into", str(tmp_path / "d")]) == 2
     assert "is not a results folder" in capsys.readouterr().err
     write_run(tmp_path / "a", CELLS[0])
     before = content(tmp_path / "a")
-    assert main([str(tmp_path / "a"), "--into", str(tmp_path / "a" / "runs" / "x")]) == 1
-    assert "lies within" in capsys.readouterr().err
+    for into in (tmp_path / "a", tmp_path / "a" / "runs" / "x"):
+        assert main([str(tmp_path / "a"), "--into", str(into)]) == 2
+        assert "--into must be another folder" in capsys.readouterr().err
     assert content(tmp_path / "a") == before
