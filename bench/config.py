@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.tables import CONF as CONF
 from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers, register_rows
-from datasets.dataset import SPLIT_STRIDE, Split
+from datasets.scene import SPLIT_STRIDE, Split
 
 LEAST = {
     "seed": 0,
@@ -39,7 +39,7 @@ RESERVED = ("_target_", PACKAGE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of 
 ROLES = {  # what the class of a node of the top level must be
     "task": "bench.tasks.task.Task",
     "renderer": "renderers.rendering.Renderer",
-    "dataset": "datasets.dataset.Dataset",
+    "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
     "supervision": "bench.single_view.training.Supervision",

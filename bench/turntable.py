@@ -19,8 +19,7 @@ from bench.records.files import leads_out
 from bench.records.record import read_record
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import SUFFIXES, read_mesh
-from datasets.scene import View, see
-from datasets.truth import Truth
+from datasets.scene import Truth, View, see
 from datasets.views import ViewSampler
 
 DISTANCE, FIELD_OF_VIEW = 2.5, 50.0  # scene units, degrees: the whole unit sphere is in the picture

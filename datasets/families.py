@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from datasets.dataset import Split, seed_of
-from datasets.extract import extract
-from datasets.mesh import Mesh, fit_in_sphere, normalise
+from datasets.mesh import Mesh, extract, fit_in_sphere, normalise
+from datasets.scene import Split, seed_of
 from renderers.checks import BadInput, check_at_least, check_choice, check_share
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus

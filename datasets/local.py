@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from datasets.dataset import Split, seed_of
 from datasets.deform import deform
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
+from datasets.scene import Split, seed_of
 from renderers.checks import check_at_least, check_share
 
 VERSION = 3  # raise it when repair or deformation changes the shapes

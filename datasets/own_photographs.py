@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from datasets.captures.capture import AXES, Capture, read_capture
-from datasets.dataset import Split
 from datasets.mesh import Mesh
+from datasets.scene import Split
 from renderers.checks import BadInput, check_choice
 
 

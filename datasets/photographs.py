@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
-from datasets.scene import see
+from datasets.scene import Truth, see
 from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, TEXTURES, Texture, make_texture
-from datasets.truth import Truth
 from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive

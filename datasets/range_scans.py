@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,30 +12,16 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from datasets.dataset import Split
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import READ_ERRORS, check_counts, load_mesh
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_share
 
 LONGEST = 4.0  # median edges: points farther apart are not joined, as across a gap or behind an outline
 SCANNER = np.array([0.0, 0.0, 1.0])  # from the object to the scanner, in a scan's own axes (Stanford's repository)
 LINE = "bmesh FILE tx ty tz qx qy qz qw"
 OCTREE = 9  # depth of the octree of a Poisson reconstruction: cells of a 512th of its box
-
-
-@runtime_checkable
-class Scanned(Protocol):
-    """A dataset of one object whose depths were measured from several sides."""
-
-    def towards_scanner(self, index: int) -> Float[Tensor, "3"]:
-        """The direction from the object to the scanner of scan number `index`."""
-        ...
-
-    def seen(self, index: int) -> Mesh:
-        """The surface that scan number `index` measured, which is open."""
-        ...
 
 
 @dataclass(frozen=True)

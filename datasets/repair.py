@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from datasets.mesh import Mesh
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Truth, sample_surface
 
 WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
 THIN = 2e-6  # of the diagonal: a closed part of less mean thickness encloses nothing

@@ -6,8 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from datasets.mesh import Mesh
-from datasets.scene import View
-from datasets.truth import Truth
+from datasets.scene import Truth, View
 from renderers.camera import Camera
 from renderers.field import autograd_gradients
 from renderers.fields.coloured import Coloured

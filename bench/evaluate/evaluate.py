@@ -15,10 +15,8 @@ from scipy.spatial import cKDTree
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
-from datasets.extract import extract
-from datasets.mesh import Mesh
-from datasets.scene import View, see
-from datasets.truth import Truth, sample_surface
+from datasets.mesh import Mesh, extract
+from datasets.scene import Truth, View, sample_surface, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals

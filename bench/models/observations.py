@@ -14,8 +14,7 @@ from bench.setup.auto import footprint
 from bench.setup.fields import ViewSettings
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import GivenView, Weights
-from datasets.scene import see
-from datasets.truth import Truth
+from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import BadInput

@@ -16,8 +16,7 @@ from bench.evaluate.evaluate import picture_view
 from bench.pictures.run_figures import normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from bench.setup.inputs import RunInputs
-from datasets.scene import View, see
-from datasets.truth import Truth
+from datasets.scene import Truth, View, see
 from renderers.camera import Camera
 from renderers.field import Field
 from renderers.fields.coloured import Coloured

@@ -22,8 +22,7 @@ from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
-from datasets.scene import View, see
-from datasets.truth import Truth
+from datasets.scene import Truth, View, see
 from renderers.camera import Camera
 from renderers.field import Field
 

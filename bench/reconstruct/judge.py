@@ -29,9 +29,8 @@ from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughnes
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
-from datasets.scene import View, see
+from datasets.scene import Truth, View, sample_surface, see
 from datasets.shot import Shot
-from datasets.truth import Truth, sample_surface
 from renderers.camera import sphere_span
 from renderers.fields.coloured import Coloured
 

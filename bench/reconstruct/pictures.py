@@ -24,9 +24,8 @@ from bench.solve.optimise import History
 from bench.solve.solve import failure_of, note_result
 from datasets.mesh import Mesh
 from datasets.photographs import turned
-from datasets.scene import View, see
+from datasets.scene import Truth, View, see
 from datasets.shot import Shot
-from datasets.truth import Truth
 from renderers.camera import Camera
 from renderers.fields.coloured import Coloured
 

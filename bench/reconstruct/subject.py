@@ -11,9 +11,8 @@ from bench.setup.inputs import RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
-from datasets.scene import see
+from datasets.scene import Truth, see
 from datasets.shot import Shot
-from datasets.truth import Truth
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
 

@@ -12,9 +12,8 @@ from bench.evaluate.colours import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import visible
 from datasets.mesh import Mesh
-from datasets.scene import View, see
+from datasets.scene import Truth, View, see
 from datasets.shot import Shot
-from datasets.truth import Truth
 from renderers.camera import Camera
 
 NEIGHBOURS = 16  # points whose plane gives a normal

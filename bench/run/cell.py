@@ -17,9 +17,8 @@ from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior, PriorSettings
 from bench.shape_prior.store import prior_for
 from bench.tasks.task import Checks, TakesField, Task
-from datasets.dataset import Dataset, Split
 from datasets.own_photographs import Photographed
-from datasets.scene import make_scene, scene_name
+from datasets.scene import Dataset, Split, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.rendering import Renderer
 

@@ -14,9 +14,8 @@ from bench.progress import Report
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
 from bench.shape_prior.autodecoder import Prior
-from datasets.dataset import Dataset
 from datasets.own_photographs import Photographed
-from datasets.scene import Scene
+from datasets.scene import Dataset, Scene
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.rendering import Renderer, final_notes

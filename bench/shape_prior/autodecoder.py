@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bench.progress import Report
-from datasets.dataset import Dataset, Split
 from datasets.mesh import Mesh
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Dataset, Split, Truth, sample_surface
 from renderers.checks import check_at_least, check_positive
 from renderers.fields.mlp import Decoder
 

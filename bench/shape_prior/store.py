@@ -25,7 +25,7 @@ from bench.shape_prior.autodecoder import (
     surface_error,
     train,
 )
-from datasets.dataset import Dataset, Split
+from datasets.scene import Dataset, Split
 from renderers.fields.mlp import Decoder
 
 SHIPPED = Path(__file__).resolve().parents[2] / "datasets" / "priors"

@@ -19,11 +19,9 @@ from bench.single_view.images import ImagesOf
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH, GivenView
 from bench.solve.problem import OptimiserSettings
-from datasets.dataset import Dataset, Split
-from datasets.extract import extract
-from datasets.mesh import Mesh
+from datasets.mesh import Mesh, extract
+from datasets.scene import Dataset, Split, Truth, sample_surface
 from datasets.shot import Shot
-from datasets.truth import Truth, sample_surface
 from renderers.checks import check_at_least
 from renderers.fields.grid import Grid
 from renderers.silhouette import SilhouetteLoss

@@ -14,11 +14,10 @@ from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest
 from bench.shape_prior.store import kept
 from datasets.captures.hull import carve
-from datasets.dataset import Dataset, Split, seed_of
 from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography
+from datasets.scene import Dataset, Split, Truth, sample_surface, seed_of
 from datasets.shot import Shot
-from datasets.truth import Truth, sample_surface
 from datasets.views import ViewSampler
 from renderers.camera import Camera, sphere_span
 

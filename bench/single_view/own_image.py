@@ -12,8 +12,7 @@ from bench.evaluate.evaluate import mask_iou
 from bench.single_view.images import as_input
 from datasets.captures.take import read_image
 from datasets.mesh import Mesh
-from datasets.scene import see
-from datasets.truth import Truth
+from datasets.scene import Truth, see
 from renderers.camera import Camera
 from renderers.checks import BadInput
 

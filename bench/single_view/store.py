@@ -23,7 +23,7 @@ from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import filled_share
 from bench.single_view.training import Course, Failed, Lessons, Supervision, TrainingSettings
-from datasets.dataset import Dataset, Split
+from datasets.scene import Dataset, Split
 from renderers.checks import BadInput
 from renderers.rendering import Renderer
 

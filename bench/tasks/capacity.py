@@ -20,7 +20,7 @@ from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.problem import check_field_gradient
 from bench.solve.solve import COSTS
-from datasets.truth import Truth
+from datasets.scene import Truth
 from renderers.checks import check_choice, check_positive, check_share
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss

@@ -14,9 +14,8 @@ from bench.solve.optimise import StartSettings
 from bench.solve.problem import NotReached, OptimiserSettings, check_field_gradient
 from bench.solve.solve import solve_task
 from datasets.photographs import Photography
-from datasets.scene import Scene
+from datasets.scene import Scene, Truth
 from datasets.shot import Shot
-from datasets.truth import Truth
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive

@@ -17,8 +17,7 @@ from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import Starts, StartSettings
 from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.solve.solve import solve
-from datasets.scene import Scene, View, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, View, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive

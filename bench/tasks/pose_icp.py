@@ -13,8 +13,7 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.solve import note_result
 from bench.tasks.pose import SEEN_DEFINITIONS, PoseTask
-from datasets.scene import View
-from datasets.truth import sample_surface
+from datasets.scene import View, sample_surface
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 

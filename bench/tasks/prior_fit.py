@@ -11,8 +11,7 @@ from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_dist
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.problem import OptimiserSettings
 from bench.solve.solve import solve_task
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, autograd_gradients
 from renderers.rendering import Renderer

@@ -27,10 +27,9 @@ from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.problem import check_field_gradient, check_kind
 from bench.solve.solve import COSTS, descend, note_result
-from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
-from datasets.truth import Truth
+from datasets.scene import Split, Truth
 from datasets.views import check_elevation
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.fields.coloured import OccupancyOf

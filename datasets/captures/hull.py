@@ -8,11 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.extract import extract
-from datasets.mesh import Mesh
-from datasets.scene import see
+from datasets.mesh import Mesh, extract
+from datasets.scene import Truth, see
 from datasets.shot import Shot
-from datasets.truth import Truth
 from renderers.checks import BadInput
 from renderers.field import Kind
 from renderers.fields.analytic import Shape

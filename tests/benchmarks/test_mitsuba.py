@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from datasets.dataset import Split
-from datasets.truth import Truth
+from datasets.scene import Split, Truth
 from datasets.views import ViewSampler
 from renderers.camera import Rays
 from renderers.fields.grid import Grid

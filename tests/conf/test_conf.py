@@ -16,7 +16,7 @@ from bench.pictures.style import look
 from bench.run.compose import combinations
 from bench.tables import GROUPS, choice, names, nearest, read_yaml
 from bench.tasks.task import Task
-from datasets.dataset import Dataset
+from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss

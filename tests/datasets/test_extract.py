@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.extract import extract
+from datasets.mesh import extract
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from tests.looped import each

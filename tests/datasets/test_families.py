@@ -10,8 +10,8 @@ import torch
 from bench.config import CONF, load
 from bench.records.files import digest
 from bench.tables import read_rows
-from datasets.dataset import SPLIT_STRIDE, Split, seed_of
 from datasets.families import BUILDERS, HALF_GRID, Family, bounded
+from datasets.scene import SPLIT_STRIDE, Split, seed_of
 from renderers.field import Kind, autograd_gradients
 from tests.looped import each
 

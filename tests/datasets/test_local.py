@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.dataset import Split
 from datasets.local import LocalMeshes
+from datasets.scene import Split
 
 ODD_NAME = "two words ünïcode 50% #1?"
 

@@ -9,7 +9,7 @@ import trimesh
 
 from datasets.mesh import Mesh
 from datasets.meshes import find_meshes, load_mesh, repair
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Truth, sample_surface
 from tests.looped import each
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"

@@ -11,8 +11,8 @@ import trimesh
 from bench.tasks.multiview import sample
 from datasets.mesh import Mesh
 from datasets.photographs import HIGHEST, Photography, around, turned
+from datasets.scene import Truth
 from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
-from datasets.truth import Truth
 from tests.looped import each
 from tests.tiny import camera_of
 

@@ -9,12 +9,10 @@ import pytest
 import torch
 import trimesh
 
-from datasets.dataset import Split
 from datasets.mesh import Mesh
 from datasets.range_scans import RangeScans, smoothed
 from datasets.repair import repair
-from datasets.scene import make_scene
-from datasets.truth import sample_surface
+from datasets.scene import Split, make_scene, sample_surface
 from datasets.views import ViewSampler
 from tests.looped import each
 from tests.made_scans import RADIUS, TURNS, write_scans

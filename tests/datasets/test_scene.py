@@ -7,10 +7,8 @@ import pytest
 import torch
 import trimesh
 
-from datasets.dataset import Split
 from datasets.mesh import Mesh
-from datasets.scene import make_scene, see
-from datasets.truth import Truth
+from datasets.scene import Split, Truth, make_scene, see
 from datasets.views import ViewSampler, look_at
 from renderers.camera import Camera
 

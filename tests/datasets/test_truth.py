@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from datasets.mesh import Mesh
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Truth, sample_surface
 
 
 def from_trimesh(made: trimesh.Trimesh) -> Mesh:

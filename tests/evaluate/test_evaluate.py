@@ -11,8 +11,7 @@ from bench.config import load
 from bench.evaluate.evaluate import DEFINITIONS, evaluate, picture_view, render_view
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
 from tests.tiny import ball_prior, camera_of, run_of

@@ -21,9 +21,8 @@ from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import GivenView
-from datasets.extract import extract
-from datasets.scene import see
-from datasets.truth import Truth
+from datasets.mesh import extract
+from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
 from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric

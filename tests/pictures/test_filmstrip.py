@@ -12,8 +12,7 @@ from PIL import Image
 from bench.config import load
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
 from datasets.mesh import Mesh
-from datasets.scene import Scene, View, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, View, see
 from renderers.fields.analytic import sphere
 from tests.reconstruct.test_losses import ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, run_of

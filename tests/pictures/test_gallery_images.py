@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from bench.config import load
 from bench.pictures.run_figures import ViewPair, _show_depth, save_gallery
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from tests.tiny import ball_prior, camera_of, run_of
 
 CAMERA = camera_of(16)

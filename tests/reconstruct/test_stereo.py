@@ -11,8 +11,8 @@ import torch
 from bench.reconstruct import stereo
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from datasets.extras import install
+from datasets.scene import Truth
 from datasets.shot import Shot
-from datasets.truth import Truth
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each

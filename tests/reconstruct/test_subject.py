@@ -19,8 +19,7 @@ from bench.reconstruct.subject import (
 )
 from datasets.mesh import Mesh
 from datasets.photographs import around
-from datasets.scene import Scene, see
-from datasets.truth import Truth, sample_surface
+from datasets.scene import Scene, Truth, sample_surface, see
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.config import load
 from bench.setup.auto import AutoSettings, epsilon, footprint, resolved, steps
-from datasets.dataset import Split
+from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers import Meter
 from renderers.field import Field

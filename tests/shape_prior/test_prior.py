@@ -11,9 +11,9 @@ import trimesh
 from bench.shape_prior import store as prior_store
 from bench.shape_prior.autodecoder import NetworkSettings, PriorSettings, distance_samples, fit_error, train
 from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe
-from datasets.dataset import Split
 from datasets.families import FAMILIES
 from datasets.mesh import Mesh
+from datasets.scene import Split
 from tests.tiny import cell_from
 
 CPU = torch.device("cpu")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from bench.single_view.store import SHIPPED, overlap
-from datasets.dataset import Split
+from datasets.scene import Split
 from tests.tiny import CPU, cell_from, plain
 
 NETWORKS = sorted(SHIPPED.glob("*.safetensors"))

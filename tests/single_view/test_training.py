@@ -14,8 +14,8 @@ from bench.single_view.images import NEAR, POINTS, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Failed, Lessons, Supervision, TrainingSettings
-from datasets.dataset import Split
 from datasets.mesh import Mesh
+from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.silhouette import CrossEntropy

@@ -77,7 +77,7 @@ def test_it_finds_the_plane_and_counts_its_samples(wall):
 
 
 def test_a_prior_that_can_show_a_shape_is_fitted_to_it(wall):
-    from datasets.extract import extract
+    from datasets.mesh import extract
 
     prior = ball_prior()
     true = prior.decoder.at(prior.codes[0])

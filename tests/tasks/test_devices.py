@@ -16,8 +16,7 @@ from bench.solve.optimise import History, optimise
 from bench.solve.problem import Objective, OptimiserSettings
 from bench.tasks.pose import Pose, PoseProblem
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.fields.analytic import sphere
 from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
 from tests.tiny import CPU, ball_prior, camera_of, run_of, silent

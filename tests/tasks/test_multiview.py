@@ -13,8 +13,7 @@ from bench.solve.optimise import History, optimise
 from bench.solve.problem import NotReached, OptimiserSettings
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each

@@ -16,8 +16,7 @@ from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
 from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.mesh import Mesh
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.fields.analytic import box
 from renderers.silhouette import Own
 from tests.looped import each

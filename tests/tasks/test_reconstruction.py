@@ -21,8 +21,7 @@ from bench.solve.problem import OptimiserSettings, Unsupported
 from bench.tasks.reconstruction import Reconstruction
 from datasets.mesh import Mesh
 from datasets.own_photographs import OwnPhotographs
-from datasets.scene import Scene, see
-from datasets.truth import Truth
+from datasets.scene import Scene, Truth, see
 from renderers.checks import BadInput
 from renderers.silhouette import Own
 from tests.datasets.test_captures import nerf

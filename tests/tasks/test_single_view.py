@@ -17,10 +17,8 @@ from bench.single_view.own_image import best_view, filled_share, read_picture
 from bench.tasks import single_view
 from bench.tasks.single_view import DEFINITIONS
 from bench.train import main
-from datasets.dataset import Split
 from datasets.mesh import Mesh
-from datasets.scene import see
-from datasets.truth import Truth
+from datasets.scene import Split, Truth, see
 from renderers.checks import BadInput
 from tests.looped import each
 from tests.run.driving import Outcome, command, record_of
