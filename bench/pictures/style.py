@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap, to_rgb
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from bench.tables import look_of
@@ -130,12 +130,12 @@ def labelled(*axes: Axes) -> dict[str, Any]:
     return {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
 
 
-def legend_below(figure: Figure | SubFigure, *axes: Axes, columns: int = 4) -> None:
+def legend_below(figure: Figure, *axes: Axes, columns: int = 4) -> None:
     """Draws one legend of some axes below them, in so many columns, or in fewer where it is wider than the figure."""
     legend_of(figure, labelled(*axes), columns=columns)
 
 
-def legend_of(figure: Figure | SubFigure, named: dict[str, Any], *, columns: int = 4, side: str = "center") -> None:
+def legend_of(figure: Figure, named: dict[str, Any], *, columns: int = 4, side: str = "center") -> None:
     """As `legend_below`, of handles by name, at the `side` "left", "center" or "right"."""
     for ncols in range(columns, 0, -1):
         legend = figure.legend(named.values(), named.keys(), loc=f"outside lower {side}", ncols=ncols)

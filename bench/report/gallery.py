@@ -14,7 +14,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from bench.pictures import style
@@ -240,14 +240,13 @@ def first_shapes(runs: Runs, most: int, presets: Sequence[str] = ()) -> Runs:
 
 
 @style.styled
-def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = None, below: float = 0.0) -> Figure:
+def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = None) -> Figure:
     """Draws blocks one above the other.
 
     Args:
         blocks: to draw.
         across: pictures side by side in a cell.
         largest: degrees at the end of the scale of `differences`, which then has a colour bar and a legend.
-        below: inches for charts below the pictures, which are those of the second of two subfigures.
     """
     bar = 0.0 if largest is None else BAR
     lengths = [min(len(name), LETTERS) for block in blocks for name in block.rows]
@@ -259,16 +258,14 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     heads = [0.33 + 0.12 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
     lines = [max(len(block.rows), 1) * inches for block in blocks]
     height = sum(heads) + sum(lines) + (0.1 if largest is None else 0.4)
-    width = style.WIDTH if below else names + columns * across * inches + bar
-    whole = Figure(figsize=(width, height + below), layout="constrained")
-    figure = whole.subfigures(2, 1, height_ratios=(height, below))[0] if below else whole
+    figure = Figure(figsize=(names + columns * across * inches + bar, height), layout="constrained")
     axes = figure.subplots(max(len(blocks), 1), 1, squeeze=False, height_ratios=lines or [1])[:, 0]
-    whole.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.01)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.01)
     for axis, block in zip(axes, blocks, strict=False):
         fill(axis, block, inches, across)
     if largest is not None:
         _explain(figure, axes, largest)
-    return whole
+    return figure
 
 
 def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
@@ -306,7 +303,7 @@ def _show(axis: Axes, picture: np.ndarray, window: Window | None, place: tuple[f
     shown.set_clip_path(Rectangle((x + 0.01, y + 0.01), 0.98, 0.98, transform=axis.transData))
 
 
-def _explain(figure: Figure | SubFigure, axes: Sequence[Axes], largest: float) -> None:
+def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
     """Draws the colour bar and the legend of `differences`."""
     colours = ScalarMappable(Normalize(0, largest), style.error_colours())
     label = "angle between\nnormals (degrees)"

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.report.data.records import SCALE, Record, grouped, row_of, setting
-from bench.report.study import Result, Runs, Selection, format, gallery, medians, style, table
+from bench.report.data.records import SCALE, grouped, row_of, setting
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -54,8 +54,13 @@ ALIKE = {  # rows that are not shown there, since they look as another does
 ARRAYS = ("photograph", "colours", "normals", "hit")
 
 PRESET, AGAIN = "rgb_dist", 3  # the row that `rerendering` shows, where it has a run that ended ok, and its scenes
-SIZES = ("size_0_", "size_1_", "size_2_")  # of images.npz, see `bench.reconstruct.pictures`
-TURNED = {"turned_0_": "turned by 120°", "turned_1_": "turned by 240°"}  # about the vertical axis, likewise
+SIDES = {  # prefixes in images.npz, see `bench.reconstruct.pictures`; turns are about the vertical axis
+    "coarse": "size_0_",
+    "finer": "size_1_",
+    "full size": "size_2_",
+    "turned by 120°": "turned_0_",
+    "turned by 240°": "turned_1_",
+}
 LIGHTS = {  # towards the light; axes to the right, up, towards the camera
     "light from the left": (-0.8, 0.3, 0.5),
     "light from above": (0.0, 0.9, 0.45),
@@ -133,12 +138,12 @@ def rerendering(runs: Runs) -> Result:
     of_scene = grouped([record for record in runs.records if row_of(record) == row], medians.scene_of)
     kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
     shown = replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept))
-    lines = {name: _line(runs, record) for name, record in kept.items()}
-    columns = max((list(pictures) for pictures, _ in lines.values()), key=len)
-    cells = {
-        name: list(pictures.values()) or [gallery.Cell(note=_status(kept[name]) or "no picture")]
-        for name, (pictures, _) in lines.items()
-    }
+    arrays = [prefix + part for prefix in SIDES.values() for part in ("colours", "normals", "hit")]
+    scenes = {name: gallery.Scene(runs, [record], ["photograph", *arrays]) for name, record in kept.items()}
+    paints = {"photograph": lambda found: [found["photograph"]]}
+    paints |= {name: gallery.colours(prefix) for name, prefix in SIDES.items()}
+    paints |= {name: _lit(light) for name, light in LIGHTS.items()}
+    lines = {name: [scene.cell(kept[name], paint) for paint in paints.values()] for name, scene in scenes.items()}
     return Result(
         shown,
         "A reconstructed shape, rendered again.",
@@ -147,43 +152,22 @@ def rerendering(runs: Runs) -> Result:
             "Shapes were learnt from photographs alone; the one shown was held out, sizes and lights are seen by its "
             "camera, and turns are about the vertical axis.",
             f"Lights: the learnt colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
-            *(f"No pictures of {name}: {why}." for name, (_, why) in lines.items() if why),
+            *gallery.missing(scenes.values()),
         ),
         run_columns=PICTURED,
-        figure=gallery.draw([gallery.Block("", columns, cells)]),
+        figure=gallery.draw([gallery.Block("", list(paints), lines)]),
     )
 
 
-def _line(runs: Runs, record: Record) -> tuple[dict[str, gallery.Cell], str]:
-    """The cells of a scene by the names of their columns, and why there are none."""
-    parts = ("colours", "normals", "hit")
-    prefixes = (*SIZES, *TURNED)
-    read = [gallery.arrays(runs.folder(record), ["photograph", *(each + part for part in parts)]) for each in prefixes]
-    if why := next((why for _, why in read if why), ""):
-        return {}, why
-    of = dict(zip(prefixes, (found for found, _ in read), strict=True))
-    last = of[SIZES[-1]]
-    hit = last[f"{SIZES[-1]}hit"]
-    shown = {"photograph": (last["photograph"], hit)}
-    for prefix, found in of.items():
-        name = TURNED.get(prefix, f"{max(found[f'{prefix}hit'].shape)} pixels")
-        shown[name] = _lit(found, prefix), found[f"{prefix}hit"]
-    shown |= {name: (_lit(last, SIZES[-1], light), hit) for name, light in LIGHTS.items()}
-    return {
-        name: gallery.Cell([(picture, style.window([hit]))], _status(record)) for name, (picture, hit) in shown.items()
-    }, ""
+def _lit(light: tuple[float, float, float]) -> gallery.Paint:
+    """Pictures of a shape in its full size under a light."""
 
+    def paint(found: gallery.Arrays) -> list[np.ndarray]:
+        colours, normals, hit = (found[SIDES["full size"] + part] for part in ("colours", "normals", "hit"))
+        cosine = (normals @ light / np.linalg.norm(light)).clip(0)[..., None]
+        return [gallery.coloured(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
 
-def _status(record: Record) -> str:
-    return "" if record["status"] == "ok" else record["status"]
-
-
-def _lit(found: gallery.Arrays, prefix: str, light: tuple[float, float, float] | None = None) -> np.ndarray:
-    """The picture of a shape, as it is or under a light."""
-    colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
-    if light is not None:
-        colours = colours * (AMBIENT + (1 - AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)[..., None])
-    return gallery.coloured(colours, hit)
+    return paint
 
 
 PAGES = {"dvr_table2": make, "dvr_figures": figures, "rerendering": rerendering}

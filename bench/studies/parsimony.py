@@ -1,12 +1,11 @@
 """How much field a scene needs: the smallest sufficient candidate."""
 
-from pathlib import PurePath
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from bench.pictures.size_chart import AXES, FLOPS, KINDS, Candidates
-from bench.report.study import Result, Runs, Selection, chart, format, records, style, table
+from bench.report.study import Result, Runs, Selection, chart, format, medians, records, style, table
 
 PLACE = 160
 READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
@@ -46,23 +45,9 @@ def make(runs: Runs) -> Result:
 
 def scenes(runs: Runs) -> tuple[list[Line], str]:
     """A line per run, the smallest need first, those that did not end ok last; and the size that decides the choice."""
-    lines = [_scene(record, name) for record, name in zip(runs.records, _names(runs.records), strict=True)]
+    lines = [_scene(record, medians.scene_of(record)) for record in runs.records]
     size = next((line["candidates"].measure for line in lines if line["ok"]), "stored")
     return sorted(lines, key=lambda line: (not line["ok"], line.get(f"recommended_{size}") or 0, line["scene"])), size
-
-
-def _names(of: list[records.Record]) -> list[str]:
-    """The scenes' names, a mesh's of its file unless two share it, with row, shape and seed where these differ."""
-    families = [records.family(record) for record in of]
-    stems = {name: PurePath(name).stem for name in families}
-    unique = len(set(stems.values())) == len(stems)
-    parts = [
-        [stems[name] if unique else name for name in families],
-        [records.row_of(record).name for record in of],
-        [f"shape {records.index(record)}" for record in of],
-        [f"seed {record['seed']}" for record in of],
-    ]
-    return list(map(", ".join, zip(*(part for i, part in enumerate(parts) if not i or len({*part}) > 1), strict=True)))
 
 
 def _scene(record: records.Record, name: str) -> Line:

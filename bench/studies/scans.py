@@ -2,11 +2,9 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
+from bench.report.study import Result, Runs, Selection, format, records, statistics, table
 
 PLACE = 48
 READS = (Selection("scans", ("task.depths",), setup=("scenes", "pixels", "machine")),)
@@ -51,7 +49,6 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
-        figure=draw(pairs),
     )
 
 
@@ -81,28 +78,6 @@ def _verdict(lines: list[Line], scans: int) -> str:
         return ""
     ends = [f"*{format.number(ratio)}* ({row})" for ratio, row in (min(ratios), max(ratios))]
     return f"The depth error with measured depths is {' to '.join(ends)} times that with exact ones; n = {scans} scans."
-
-
-@style.styled
-def draw(pairs: dict[str, pd.DataFrame]) -> Figure:
-    """A panel per metric: the error with measured depths over that with exact ones, a point per scan and method."""
-    figure, axes = chart.sheet(2.9, 1, len(METRICS))
-    for axis, (metric, label) in zip(axes[0], METRICS.items(), strict=True):
-        known = pairs[metric][np.isfinite(pairs[metric]).all(axis=1)]
-        if known.empty:
-            chart.say(axis, "no run ended ok")
-            continue
-        ends = [0.8 * known.min(axis=None), 1.25 * known.max(axis=None)]
-        axis.plot(ends, ends, color="#777777", lw=0.8, label="equal")
-        for (row, preset), own in known.groupby(["row", "preset"], sort=False):
-            chart.points(axis, preset, own[EXACT], own[MEASURED], ms=4, alpha=0.8, label=row)
-        axis.set(title=f"{label} × 1000", xlabel="exact depths", xlim=ends, ylim=ends)
-        style.log_axis(axis, "x", ends)
-        style.log_axis(axis, "y", ends)
-        axis.set_box_aspect(1)
-    axes[0, 0].set_ylabel("measured depths")
-    style.legend_below(figure, *axes.flat)
-    return figure
 
 
 PAGES = {"scans": make}

@@ -75,19 +75,19 @@ def page(four):
 
 
 def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
-    assert list(page.table["Scene"]) == ["ball", "box", "car", "torus"]
+    assert list(page.table["Scene"]) == ["ball 0", "box 0", "car 0", "torus 0"]
     assert list(page.table.iloc[3])[1:] == ["crashed"] + ["–"] * (len(parsimony.COLUMNS) - 2)
     assert list(page.table["Why"][:3]) == ["both", "under half a pixel", "under half a pixel"]
-    lost = page.data[page.data["scene"] == "torus"]
+    lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
     assert "1 of 4 runs did not end ok: dist, torus: crashed (why)." in told(page)
-    most = "the most is grid 24 of 13,824 stored numbers, for car."
+    most = "the most is grid 24 of 13,824 stored numbers, for car 0."
     assert page.verdict == f"A single part suffices for *2 of 3* scenes; {most}"
 
 
 def test_a_row_tells_the_need_and_what_it_saves(page):
     table = page.table.set_index("Scene")
-    cells, grid = table.loc["box"], table.loc["car"]
+    cells, grid = table.loc["box 0"], table.loc["car 0"]
     assert cells["Recommended"] == "box"
     assert (cells["Stored numbers"], cells["Free numbers"], cells["Size of the file"]) == ("9", "9", "36 B")
     assert (grid["Stored numbers"], grid["Free numbers"], grid["Size of the file"]) == ("13,824", "3,000", "55.3 kB")
@@ -107,7 +107,7 @@ def test_candidates_stand_as_csv_a_line_each(page):
 
 def test_what_suffices_is_filled_and_the_recommended_is_ringed(page):
     axis = page.figure.axes[0]
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["ball", "box", "car", "torus (crashed)"]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["ball 0", "box 0", "car 0", "torus 0 (crashed)"]
     drawn = [(*(float(x[0]) for x in line.get_data()), line) for line in axis.lines if len(line.get_xdata())]
     rings = [(x, y) for x, y, line in drawn if line.get_markersize() == 10]
     assert rings == [(4, 0), (9, 1), (13_824, 2)]
@@ -131,31 +131,11 @@ def test_pages_say_by_which_size_the_choice_is(page, tmp_path):
     assert "the smallest candidate by stored numbers whose error" in told(page)
 
 
-@pytest.mark.parametrize(
-    ("paths", "names"),
-    [
-        (("a/spot.obj", "a/cow.obj"), ["cow", "spot"]),
-        (("a/spot.obj", "b/spot.obj"), ["a/spot.obj", "b/spot.obj"]),
-    ],
-)
-def test_a_mesh_goes_by_the_name_of_its_file_where_that_is_its_own(tmp_path, paths, names):
-    for path in paths:
-        settings = {**CONFIG, "dataset": {"path": f"/somewhere/{path}"}}
-        climbed(tmp_path, path.replace("/", "-"), {"sphere": 8, "box": 0.5}, needs="box", settings=settings)
-    assert sorted(made(tmp_path).table["Scene"]) == names
-
-
 def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
     names = ["Overhead of field=auto", "Evaluations at pixel precision"]
-    assert page.table.set_index("Scene").loc["box", names].tolist() == ["1.50", "0.250×"]
+    assert page.table.set_index("Scene").loc["box 0", names].tolist() == ["1.50", "0.250×"]
     climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ..., "auto.overhead": ...})
     assert made(tmp_path).table[names].iloc[0].tolist() == ["–", "–"]
-
-
-def test_scenes_that_differ_in_their_shape_have_it_in_their_names(tmp_path):
-    for index in (1, 0):
-        climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", settings={**CONFIG, "index": index})
-    assert list(made(tmp_path).table["Scene"]) == ["car, shape 0", "car, shape 1"]
 
 
 def test_the_report_is_written_even_where_all_runs_failed(tmp_path):

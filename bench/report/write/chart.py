@@ -79,11 +79,6 @@ def shapes(axis: Axes, preset: str, x: Any, found: Sequence[Interval]) -> None:
         points(axis, preset, *np.array(drawn, dtype=float).T, ms=2, alpha=0.5, zorder=1.5, label=None)
 
 
-def say(axis: Axes, text: str, **how: Any) -> None:
-    """Writes a text in the middle of an axis that has nothing to show."""
-    axis.text(0.5, 0.5, text, **{"ha": "center", "va": "center", "transform": axis.transAxes, **how})
-
-
 def reference(draw: Callable[..., Any], value: float, times: float, label: str) -> None:
     """Draws a line at a value and a dotted one at a multiple of it, by an axis's `axhline` or `axvline`."""
     draw(value, color="#777777", lw=0.9, label=label)
