@@ -15,8 +15,7 @@ from bench.pictures.run_figures import Given, draw_run
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.solve.problem import InverseTask, check_field_gradient
-from bench.solve.solve import COSTS, draw, note_costs, note_result
+from bench.solve.solve import COSTS, InverseTask, check_field_gradient, draw, note_costs, note_result
 from datasets.scene import Scene
 from renderers.rendering import Renderer
 

@@ -19,8 +19,8 @@ from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings
 from bench.shape_prior.autodecoder import near_surface_first
 from bench.solve.latent_code import Terms
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import NotReached, OptimiserSettings, Unsupported, check_kind
+from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
+from bench.solve.solve import Unsupported, check_kind
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, fresh
 
@@ -184,7 +184,7 @@ class Fitter:
 
 @dataclass
 class FitProblem:
-    """Fits the parameters of a candidate with a renderer; see `bench.solve.problem.Objective`."""
+    """Fits the parameters of a candidate with a renderer; see `bench.solve.solve.Objective`."""
 
     model: Model
     observations: RayObservations
@@ -219,7 +219,7 @@ class FitProblem:
 
 @dataclass
 class WarmStart:
-    """Fits a model's parameters to points; see `bench.solve.problem.Objective`.
+    """Fits a model's parameters to points; see `bench.solve.solve.Objective`.
 
     A field with a formula is fitted to the observed points, where it should be 0, and to points that are known to lie
     outside, where it should not be negative. Other fields are fitted to the values of a target field.

@@ -20,8 +20,7 @@ from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.fields import PRIOR, parsed
 from bench.setup.inputs import RunContext
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import Objective, OptimiserSettings
+from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_positive, check_share
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy

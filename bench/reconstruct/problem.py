@@ -108,7 +108,7 @@ class ReconstructionProblem:
         return {name: scores[name] for name in self.tracked}
 
     def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run; see `bench.solve.problem.Problem`."""
+        """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
         draw_reconstruction(folder, inputs, self.field(), self.subject, curve, title)
 
     def loss(self, iteration: int) -> Terms:

@@ -21,7 +21,7 @@ from bench.records.record import Record, RunStatus
 from bench.run.cell import Cell, cell_of
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from renderers.checks import BadInput
 
 INTERVAL = 0.05  # least seconds between two messages on progress

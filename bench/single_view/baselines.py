@@ -18,7 +18,7 @@ from bench.shape_prior.store import kept
 from bench.single_view.images import ImagesOf
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH, GivenView
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings
 from datasets.mesh import Mesh, extract
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from datasets.shot import Shot

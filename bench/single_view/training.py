@@ -17,7 +17,7 @@ from bench.reconstruct.losses import Losses
 from bench.shape_prior.store import load_whole, save_whole
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Meter, occupancy_logits
 from renderers.fields.coloured import LOGIT_WIDTH, OccupancyOf

@@ -14,8 +14,7 @@ from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
 from bench.pictures.run_figures import Given, draw_run
 from bench.setup.inputs import RunInputs
 from bench.shape_prior.autodecoder import Prior
-from bench.solve.optimise import Starts, StartSettings
-from bench.solve.problem import NotReached
+from bench.solve.optimise import NotReached, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter, Moved
 
@@ -119,7 +118,7 @@ class CodeProblem:
         return chamfer_only(self.field(), inputs)
 
     def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run; see `bench.solve.problem.Problem`."""
+        """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
         given = Given(inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
         draw_run(folder, inputs, (first, self.field()), given, curve, title)
 

@@ -6,8 +6,8 @@ Several starts share one budget of iterations: successive halving keeps the bett
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf, isnan
-from typing import Any
+from math import cos, inf, isnan, pi
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,13 +15,57 @@ from torch.optim.adam import adam
 
 from bench.machine.environment import MemoryPeak, synchronise
 from bench.records.record import RunStatus
-from bench.solve.problem import Objective, OptimiserSettings
-from renderers.checks import check_at_least
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
 
 DIVERGED = 100.0  # a loss above this many times its first value, or `least_reference`, has diverged
 KEPT = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
 LAST = 3  # a start is scored by its mean loss over the last 3 iterations of a round: views change between them
+SCHEDULES = ("constant", "cosine", "ramped")
+RAMP = 0.1  # share of the iterations over which the rate of "ramped" rises
+
+
+class NotReached(Exception):
+    """An optimisation cannot continue, without an error of the program; the message says why."""
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """Adam, for a fixed number of iterations.
+
+    Args:
+        iterations: their number.
+        learning_rate: of Adam, at the start.
+        schedule: "constant", or "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises
+            from zero over the first tenth, for a start that is nearly right.
+    """
+
+    iterations: int
+    learning_rate: float
+    schedule: str
+
+    def __post_init__(self) -> None:
+        check_at_least("task.optimiser.iterations", self.iterations, 1, "the paper uses 100")
+        check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
+        check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
+
+    def rate(self, iteration: int) -> float:
+        """The learning rate of an iteration, counted from 0."""
+        fall = 1.0 if self.schedule == "constant" else 0.5 * (1 + cos(pi * iteration / self.iterations))
+        rise = min((iteration + 1) / (RAMP * self.iterations), 1.0) if self.schedule == "ramped" else 1.0
+        return self.learning_rate * fall * rise
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """What the optimisation loop minimises. Every evaluation that `loss` makes is counted in `counts`."""
+
+    parameters: list[Tensor]
+    counts: Counts
+
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        """The loss of an iteration, counted from 0, as "total", and its weighted terms."""
+        ...
 
 
 @dataclass

@@ -1,19 +1,27 @@
-"""Solves an inverse problem: evaluates, optimises, evaluates again, and draws."""
+"""An inverse problem, and how it is solved: evaluated, optimised, evaluated again, and drawn."""
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.machine.environment import seconds_at_peak
-from bench.pictures.filmstrip import Filmstrip
+from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
-from bench.setup.inputs import RunContext
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import InverseTask, NotReached, OptimiserSettings, Problem, check_kind
+from bench.setup.inputs import RunContext, RunInputs
+from bench.shape_prior.autodecoder import Prior
+from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
+from datasets.scene import Scene
+from renderers.camera import Camera
 from renderers.field import Counts, Field
+from renderers.rendering import Renderer
 
 COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
@@ -34,6 +42,85 @@ COSTS = {
     "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
     "coarse values, in bfloat16, over the loop's seconds",
 }
+
+
+class Unsupported(Exception):
+    """A renderer lacks what a task needs; the message says what."""
+
+
+@runtime_checkable
+class Problem(Objective, Protocol):
+    """An inverse problem: its unknown, how a state of it is evaluated, and how it is drawn."""
+
+    tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve
+    rays_per_iteration: int
+    observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
+
+    @property
+    def shown(self) -> Shown | None:
+        """What the filmstrip's frames are compared with; None for the scene's shape in its view."""
+        ...
+
+    def objective(self) -> float | None:
+        """The current loss, not counted, where losses of different iterations are not comparable; else None."""
+        ...
+
+    def field(self) -> Field:
+        """The field of the current parameters; its evaluations are not counted."""
+        ...
+
+    def frame(self) -> tuple[Field, Camera | None]:
+        """The filmstrip's frame of the current state: a field, and the camera where it is not the scene's."""
+        ...
+
+    def evaluate(self, inputs: RunInputs) -> Evaluation:
+        """The current state against the truth."""
+        ...
+
+    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+        """The `tracked` metrics of the current state alone."""
+        ...
+
+    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+        """Writes the pictures of the run into its folder.
+
+        Args:
+            inputs: of the run.
+            folder: the run folder.
+            first: the field before the optimisation.
+            curve: lines of curve.jsonl.
+            title: of the summary.
+        """
+        ...
+
+
+@runtime_checkable
+class InverseTask(Protocol):
+    """A task that is an inverse problem of a prior's code; `bench.solve.solve.solve_task` executes it."""
+
+    optimiser: OptimiserSettings
+
+    def problem(self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device) -> Problem:
+        """The inverse problem of a scene.
+
+        Raises:
+            Unsupported: where the renderer has no gradient that the task needs.
+        """
+        ...
+
+
+def check_kind(renderer: Renderer, field: Field) -> None:
+    """Raises Unsupported where a field is not of a kind that the renderer is meant for."""
+    needs = renderer.capabilities.needs
+    if field.kind not in needs:
+        names = " or ".join(need.value for need in needs)
+        raise Unsupported(f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field")
+
+
+def check_field_gradient(renderer: Renderer) -> None:
+    """Raises Unsupported where a renderer has no gradient towards the field's parameters."""
+    if not renderer.capabilities.field_gradient:
+        raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
 
 
 def solve(

@@ -10,7 +10,7 @@ import torch
 
 from bench.machine.limits import LimitReached
 from bench.records.record import RunStatus
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.stress.fit import FITS, judge_fit
 from bench.stress.gradient import judge_gradient
 from bench.stress.rendering import judge_rendering

@@ -14,8 +14,8 @@ from torch import Tensor
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
 from bench.solve.observed_view import GivenView
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import OptimiserSettings, check_field_gradient
+from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.scene import View
 from datasets.stress.observations import DISTURBANCES, Observation
@@ -72,7 +72,7 @@ def judge_fit(
 
 @dataclass
 class SphereProblem:
-    """The problem of finding a sphere's four parameters; see `bench.solve.problem.Objective`."""
+    """The problem of finding a sphere's four parameters; see `bench.solve.solve.Objective`."""
 
     free: Float[Tensor, "4"]
     given: GivenView

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.solve.problem import check_field_gradient
+from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Criteria, Failure, Outcome
 from datasets.stress import Exam
 from renderers.boundary import rendered

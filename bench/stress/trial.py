@@ -8,7 +8,7 @@ import torch
 
 from bench.machine.limits import Limits
 from bench.solve.observed_view import DEPTH_LOSSES
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings
 from renderers.checks import check_at_least, check_choice, check_positive, check_share
 from renderers.silhouette import SilhouetteLoss
 

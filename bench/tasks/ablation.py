@@ -20,8 +20,7 @@ from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.problem import check_field_gradient, check_kind
-from bench.solve.solve import counted
+from bench.solve.solve import check_field_gradient, check_kind, counted
 from datasets.scene import View
 from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays

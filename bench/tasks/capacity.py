@@ -18,8 +18,7 @@ from bench.records.record import RunStatus
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
-from bench.solve.problem import check_field_gradient
-from bench.solve.solve import COSTS
+from bench.solve.solve import COSTS, check_field_gradient
 from datasets.scene import Truth
 from renderers.checks import check_choice, check_positive, check_share
 from renderers.rendering import final_notes

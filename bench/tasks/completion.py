@@ -15,8 +15,8 @@ from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
-from bench.solve.problem import OptimiserSettings, check_field_gradient
-from bench.solve.solve import solve_task
+from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import check_field_gradient, solve_task
 from datasets.scene import Scene
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import check_at_least, check_choice, check_positive

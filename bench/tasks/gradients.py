@@ -19,7 +19,7 @@ from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_fo
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import slopes_at
-from bench.solve.problem import check_field_gradient, check_kind
+from bench.solve.solve import check_field_gradient, check_kind
 from renderers.boundary import check_gradients, rendered
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive

@@ -10,9 +10,8 @@ from torch import Tensor
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
-from bench.solve.optimise import StartSettings
-from bench.solve.problem import NotReached, OptimiserSettings, check_field_gradient
-from bench.solve.solve import solve_task
+from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
+from bench.solve.solve import check_field_gradient, solve_task
 from datasets.photographs import Photography
 from datasets.scene import Scene, Truth
 from datasets.shot import Shot

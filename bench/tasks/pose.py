@@ -14,9 +14,8 @@ from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, ren
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
-from bench.solve.optimise import Starts, StartSettings
-from bench.solve.problem import OptimiserSettings, Unsupported
-from bench.solve.solve import solve
+from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
+from bench.solve.solve import Unsupported, solve
 from datasets.scene import Scene, Truth, View, see
 from renderers.boundary import rendered
 from renderers.camera import Camera

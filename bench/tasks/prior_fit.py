@@ -9,7 +9,7 @@ from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_distances
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import solve_task
 from datasets.scene import Scene, Truth, see
 from renderers.checks import check_at_least, check_positive

@@ -22,8 +22,8 @@ from bench.reconstruct.subject import (
 )
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
-from bench.solve.problem import OptimiserSettings, check_field_gradient, check_kind
-from bench.solve.solve import solve
+from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import check_field_gradient, check_kind, solve
 from datasets.photographs import Photography
 from renderers.checks import check_at_least, check_choice
 

@@ -25,8 +25,7 @@ from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
-from bench.solve.problem import check_field_gradient, check_kind
-from bench.solve.solve import COSTS, descend, note_result
+from bench.solve.solve import COSTS, check_field_gradient, check_kind, descend, note_result
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
 from datasets.scene import Split, Truth

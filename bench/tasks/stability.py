@@ -11,7 +11,7 @@ from bench.pictures.style import PIXEL_NAMES
 from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.stress import fit, gradient, rendering
 from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings

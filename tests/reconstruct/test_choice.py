@@ -12,7 +12,7 @@ from bench.models.model import Evidence, Size
 from bench.models.observations import TILES
 from bench.reconstruct.choice import AutoField, Choice, tiled
 from bench.reconstruct.subject import Subject
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings
 from datasets.shot import Shot
 from renderers import IDR
 from renderers.field import Counts

@@ -23,8 +23,8 @@ from bench.run import cell as cell_module
 from bench.run import execute
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
-from bench.solve.optimise import History
-from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.solve.optimise import History, OptimiserSettings
+from bench.solve.solve import Unsupported
 from datasets.scene import Scene
 from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome

@@ -7,8 +7,7 @@ import torch
 
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
-from bench.solve.optimise import DIVERGED, History, Starts, StartSettings, optimise
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import DIVERGED, History, OptimiserSettings, Starts, StartSettings, optimise
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
 from tests.looped import each

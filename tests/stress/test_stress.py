@@ -11,7 +11,7 @@ from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.solve.optimise import History
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.stress import fit
 from bench.stress.axes import Stress, Sweep
 from bench.stress.fit import FITS, _failure, judge_fit

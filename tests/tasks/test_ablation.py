@@ -17,7 +17,7 @@ from bench.machine.limits import Limits
 from bench.records.files import to_json
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.tasks import ablation
 from bench.tasks.ablation import BASE, DEFINITIONS, SMALLER, WARM_UP, Ablation, Clocked
 from renderers.camera import Camera, Rays

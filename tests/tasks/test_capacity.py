@@ -19,7 +19,7 @@ from bench.run.execute import execute
 from bench.run.process import Job
 from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.tasks.capacity import Capacity, saved
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of

@@ -10,8 +10,8 @@ import torch
 from bench.config import load
 from bench.shape_prior.autodecoder import Prior
 from bench.solve.latent_code import CodePenalty
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import OptimiserSettings, Unsupported, check_kind
+from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.solve.solve import Unsupported, check_kind
 from bench.tasks.completion import Completion
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View

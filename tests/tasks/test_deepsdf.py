@@ -9,8 +9,7 @@ import torch
 from bench.config import load
 from bench.shape_prior.autodecoder import Prior, sample_distances
 from bench.solve.latent_code import CodePenalty
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import OptimiserSettings
+from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.deepsdf import DeepSDF
 from bench.tasks.prior_fit import PriorFit
 from datasets.mesh import Mesh

@@ -12,8 +12,7 @@ from bench.config import CONF, build, load, register
 from bench.reconstruct.subject import Depths, find_subject
 from bench.setup.fields import FieldChoice
 from bench.single_view.training import Lessons
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import Objective, OptimiserSettings
+from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, see

@@ -9,8 +9,7 @@ import trimesh
 
 from bench.config import load
 from bench.solve.latent_code import CodePenalty
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import NotReached, OptimiserSettings
+from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, see

@@ -11,8 +11,8 @@ import trimesh
 
 from bench.config import load
 from bench.records.record import RunStatus
-from bench.solve.optimise import History, optimise
-from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.solve.solve import Unsupported
 from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
 from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.mesh import Mesh

@@ -17,7 +17,8 @@ from bench.reconstruct.subject import Depths
 from bench.reconstruct.symptoms import WEIGHT
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext
-from bench.solve.problem import OptimiserSettings, Unsupported
+from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import Unsupported
 from bench.tasks.reconstruction import Reconstruction
 from datasets.mesh import Mesh
 from datasets.own_photographs import OwnPhotographs

@@ -11,7 +11,7 @@ import torch
 from bench.config import load
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
-from bench.solve.problem import Unsupported
+from bench.solve.solve import Unsupported
 from bench.stress.search import SearchSettings
 from bench.tasks.stability import Stability
 from renderers import IDR
