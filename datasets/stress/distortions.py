@@ -1,12 +1,11 @@
 """Distortions of a cube's distance, as by a network, quantisation or an error. All still claim to be distances.
 
-A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. Some move the
-surface: they give the moved one, solved in float64, so that a renderer is judged by the surface of the field that it
-was given.
+A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. It gives the field
+and the truth: the cube, or where the surface is moved, the moved one, solved in float64, so that a renderer is judged
+by the surface of the field that it was given.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,31 +20,19 @@ RIPPLES = 15.0  # radians per scene unit
 WAVES = 32  # random cosines that make a perturbation
 THINNEST = 5e-4  # scene units: parts of a perturbed cube that are thinner along a ray may be missed by the truth
 
-
-@dataclass(frozen=True)
-class Distorted:
-    """A distorted field, and its own surface; None where that is still the cube's."""
-
-    field: Field
-    surface: Truth | None = None
+Distortion = Callable[[Solid, float, np.random.Generator], tuple[Field, Truth]]
 
 
-Distortion = Callable[[Solid, float, np.random.Generator], Distorted]
+def _revalued(change: Callable[[Tensor, Tensor, float], Tensor]) -> Distortion:
+    """A cube with other values and the same surface; `change` takes its distances, the points and the severity."""
+
+    def distortion(cube: Solid, severity: float, draw: np.random.Generator) -> tuple[Field, Truth]:
+        return Shape(lambda points: change(cube.field(points), points, severity)), cube
+
+    return distortion
 
 
-def scaled(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
-    """A cube whose distance is multiplied by a factor."""
-    return Distorted(Shape(lambda points: severity * cube.field(points)))
-
-
-def ripples(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
-    """A cube whose distance is multiplied by 1 + a sin(15 x) sin(15 y) sin(15 z): same surface, wrong steps."""
-    return Distorted(
-        Shape(lambda points: cube.field(points) * (1 + severity * torch.sin(RIPPLES * points).prod(dim=-1)))
-    )
-
-
-def perturbed(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+def perturbed(cube: Solid, severity: float, draw: np.random.Generator) -> tuple[Field, Truth]:
     """A cube with a smooth random field of a standard deviation, in scene units, added: a network's error.
 
     The frequencies and phases are numbers of float32, so that the field is the same function in float64. A ray can
@@ -60,10 +47,10 @@ def perturbed(cube: Solid, severity: float, draw: np.random.Generator) -> Distor
         return cube.field(points) + height * waves.sum(-1)
 
     steepest = 1 + height * float(frequencies.norm(dim=0).sum())
-    return Distorted(Shape(value), ReferenceTruth(Shape(value), steepest, THINNEST))
+    return Shape(value), ReferenceTruth(Shape(value), steepest, THINNEST)
 
 
-def coarse_floats(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+def coarse_floats(cube: Solid, severity: float, draw: np.random.Generator) -> tuple[Field, Truth]:
     """A cube with points and values rounded to `severity` bits of mantissa: float32 has 24, bfloat16 has 8.
 
     A point belongs to it where its coordinates, rounded, are at most `CUBE`, a power of two. Such a coordinate is above
@@ -77,10 +64,10 @@ def coarse_floats(cube: Solid, severity: float, draw: np.random.Generator) -> Di
         return numbers + (torch.ldexp(torch.round(mantissa * scale) / scale, exponent) - numbers).detach()
 
     larger = box((CUBE + 0.5 * 2.0**-bits,) * 3)
-    return Distorted(Shape(lambda points: rounded(cube.field(rounded(points)))), larger)
+    return Shape(lambda points: rounded(cube.field(rounded(points)))), larger
 
 
-def quantised(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
+def quantised(cube: Solid, severity: float, draw: np.random.Generator) -> tuple[Field, Truth]:
     """A cube whose distance is a multiple of a step, in scene units: 8 bits over -1 to 1 have a step of 0.0078.
 
     It is 0 in a layer about the cube's surface. The truth is where a ray enters this layer, half a step outside.
@@ -91,20 +78,15 @@ def quantised(cube: Solid, severity: float, draw: np.random.Generator) -> Distor
         return exact + (severity * torch.round(exact / severity) - exact).detach()
 
     layer = Shape(lambda points: cube.field(points) - severity / 2)
-    return Distorted(Shape(value), ReferenceTruth(layer, lipschitz=1.0, thinnest=THINNEST))
-
-
-def truncated(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
-    """A cube whose distance is cut off at a magnitude, in scene units, as DeepSDF's is at 0.1."""
-    return Distorted(Shape(lambda points: cube.field(points).clamp(-severity, severity)))
-
-
-def saturated(cube: Solid, severity: float, draw: np.random.Generator) -> Distorted:
-    """A cube as tanh(distance / width), a width in scene units: steep at the surface, 1 away from it."""
-    return Distorted(Shape(lambda points: torch.tanh(cube.field(points) / severity)))
+    return Shape(value), ReferenceTruth(layer, lipschitz=1.0, thinnest=THINNEST)
 
 
 DISTORTIONS: dict[str, Distortion] = {
-    distortion.__name__: distortion
-    for distortion in (scaled, ripples, perturbed, coarse_floats, quantised, truncated, saturated)
+    "scaled": _revalued(lambda distance, points, factor: factor * distance),
+    "ripples": _revalued(lambda distance, points, a: distance * (1 + a * torch.sin(RIPPLES * points).prod(dim=-1))),
+    "truncated": _revalued(lambda distance, points, most: distance.clamp(-most, most)),  # as DeepSDF's is at 0.1
+    "saturated": _revalued(lambda distance, points, width: torch.tanh(distance / width)),
+    "perturbed": perturbed,
+    "coarse_floats": coarse_floats,
+    "quantised": quantised,
 }

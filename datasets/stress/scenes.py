@@ -186,8 +186,8 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
     def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
         cube = box((CUBE,) * 3)
         camera = _cube(draw, resolution).camera
-        made = distortion(cube, severity, draw)
-        return Exam(made.field, camera, made.surface or cube)
+        field, surface = distortion(cube, severity, draw)
+        return Exam(field, camera, surface)
 
     return scene
 

@@ -5,7 +5,6 @@ A solid gives the spans of a ray that lie within it; union and difference are th
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,16 +27,6 @@ class FirstHit:
     distance: Float[Tensor, " n"]
     hit: Bool[Tensor, " n"]
     inside: Bool[Tensor, " n"]  # the ray begins inside the solid, so that it has no first hit
-
-
-@runtime_checkable
-class Truth(Protocol):
-    """A field whose first hits are known."""
-
-    @property
-    def field(self) -> Field: ...
-
-    def trace(self, rays: Rays) -> FirstHit: ...
 
 
 @dataclass(frozen=True)
@@ -190,3 +179,6 @@ class ReferenceTruth:
         """The first hits of flat rays [n]; without gradient."""
         found = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
         return FirstHit(found.distance, found.hit, found.status == Status.STARTED_INSIDE)
+
+
+Truth = Solid | ReferenceTruth  # a field whose first hits are known
