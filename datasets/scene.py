@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 from zlib import crc32
 
 import numpy as np
@@ -58,6 +58,17 @@ class Hits:
     distance: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
     hit: Bool[np.ndarray, " n"]
+
+
+class Surface(NamedTuple):
+    """Points sampled on a surface, each with its normal, of which only the direction counts."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+
+    def some(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
+        """The samples that are kept."""
+        return Surface(self.points[kept], self.normals[kept])
 
 
 class Truth:
@@ -129,7 +140,7 @@ class Truth:
         return self.signed_distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
 
 
-def sample_surface(mesh: Mesh, count: int, seed: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def sample_surface(mesh: Mesh, count: int, seed: int) -> Surface:
     """Draws points evenly by area, and the unit normals of their faces."""
     if count < 0:
         raise ValueError(f"count: must be 0 or more, found {count}; ask for a positive number of points")
@@ -140,7 +151,7 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> tuple[Float[np.ndarray,
     chosen = generator.choice(len(areas), size=count, p=areas / areas.sum())
     root, along = np.sqrt(generator.random(count)), generator.random(count)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)  # even over the triangle
-    return np.einsum("nk,nkd->nd", weights, corners[chosen]), crosses[chosen] / areas[chosen, None]
+    return Surface(np.einsum("nk,nkd->nd", weights, corners[chosen]), crosses[chosen] / areas[chosen, None])
 
 
 @dataclass(frozen=True)

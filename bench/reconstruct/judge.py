@@ -16,7 +16,6 @@ from bench.evaluate.evaluate import (
     OWN,
     WORST_SURFACE,
     Evaluation,
-    Surface,
     mask_iou,
     render_view,
     surface_metrics,
@@ -92,14 +91,14 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     threshold, count = inputs.evaluation.fscore_threshold, inputs.evaluation.points
     true = sample_surface(subject.truth, count, inputs.seed)
     found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
-    whole = surface_metrics(None if found is None else Surface(*found), Surface(*true), threshold=threshold)
-    visible = subject.seen(subject.truth, true[0])
+    whole = surface_metrics(found, true, threshold=threshold)
+    visible = subject.seen(subject.truth, true.points)
     part = judged = None
     if mesh is not None and found is not None:
-        there = subject.seen(mesh, found[0])
-        part, judged = Surface(found[0][there], found[1][there]), (Surface(*found), there)
-    seen = surface_metrics(part, Surface(true[0][visible], true[1][visible]), threshold=threshold)
-    rough = roughness_scores(judged, (Surface(*true), visible))
+        there = subject.seen(mesh, found.points)
+        part, judged = found.some(there), (found, there)
+    seen = surface_metrics(part, true.some(visible), threshold=threshold)
+    rough = roughness_scores(judged, (true, visible))
     return whole | {SEEN + name: value for name, value in seen.items()} | rough
 
 

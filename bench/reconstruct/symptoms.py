@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from bench.evaluate.evaluate import OWN, Surface
+from bench.evaluate.evaluate import OWN
 from bench.setup.inputs import RunInputs
-from datasets.scene import View
+from datasets.scene import Surface, View
 from renderers.boundary import rendered
 from renderers.field import Field
 
@@ -40,7 +40,7 @@ def roughness_scores(
     """
     scores = {}
     for name, seen in zip(ROUGHNESS, (True, False), strict=True):
-        here, there = (None if one is None else roughness(_part(one[0], one[1] == seen)) for one in (found, true))
+        here, there = (None if one is None else roughness(one[0].some(one[1] == seen)) for one in (found, true))
         if here is None:
             scores[name] = 0.0 if there is None and found is not None else np.inf
         else:
@@ -84,7 +84,3 @@ def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict
         shares.append((both[opaque, 0] / both[opaque, 1]).cpu())
     known = torch.cat(shares) if shares else torch.zeros(0)
     return {name: float(known.mean()) for name in WEIGHT} if len(known) else {}
-
-
-def _part(surface: Surface, kept: Bool[np.ndarray, " n"]) -> Surface:
-    return Surface(surface.points[kept], surface.normals[kept])

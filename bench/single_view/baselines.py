@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import Surface, surface_metrics
+from bench.evaluate.evaluate import surface_metrics
 from bench.progress import Report
 from bench.records.files import digest
 from bench.setup.inputs import RunInputs
@@ -54,9 +54,9 @@ def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf
 
 def best_shape(mesh: Mesh, dataset: Dataset, count: int) -> int:
     """The training shape with the least Chamfer-L1 from a true one: what no retrieval can do better than."""
-    true = Surface(*sample_surface(mesh, COMPARED, 0))
+    true = sample_surface(mesh, COMPARED, 0)
     others = (dataset.mesh(Split.TRAIN, index) for index in range(count))
-    scores = [surface_metrics(Surface(*sample_surface(m, COMPARED, 1)), true, threshold=1.0) for m in others]
+    scores = [surface_metrics(sample_surface(m, COMPARED, 1), true, threshold=1.0) for m in others]
     return int(np.argmin([score["chamfer_l1"] for score in scores]))
 
 
