@@ -15,7 +15,7 @@ def main() -> int:
     def train(run: Identity) -> None:
         from bench.progress import run_progress
         from bench.run.cell import cell_of
-        from bench.shape_prior.store import find, make_prior
+        from bench.shape_prior import find, make_prior
 
         cell = cell_of(run.config)
         dataset, settings = cell.dataset, cell.prior

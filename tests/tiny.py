@@ -13,7 +13,7 @@ from bench.records.record import Record
 from bench.run.cell import Cell, cell_of
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext, RunInputs
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from datasets.views import ViewSampler

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from bench.progress import notice
 from bench.records.files import digest
-from bench.shape_prior.autodecoder import Prior
-from bench.shape_prior.store import kept
+from bench.shape_prior import Prior, kept
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals, steepest
 from renderers.reference import trace

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bench.models.model import FLOAT, Candidate, Model, Seen
 from bench.setup.fields import FREE, parsed
-from bench.shape_prior.autodecoder import initialise_to_sphere
+from bench.shape_prior import initialise_to_sphere
 from renderers.camera import rigid
 from renderers.checks import BadInput
 from renderers.field import Flops, Kind

@@ -17,7 +17,7 @@ from bench.models.observations import RayObservations, generator
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings
-from bench.shape_prior.autodecoder import near_surface_first
+from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from bench.solve.solve import Unsupported, check_kind

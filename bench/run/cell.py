@@ -14,8 +14,7 @@ from bench.progress import Report
 from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunInputs
-from bench.shape_prior.autodecoder import Prior, PriorSettings
-from bench.shape_prior.store import prior_for
+from bench.shape_prior import Prior, PriorSettings, prior_for
 from bench.tasks.task import Checks, TakesField, Task
 from datasets.own_photographs import Photographed
 from datasets.scene import Dataset, Split, make_scene, scene_name
@@ -27,7 +26,7 @@ ALL_THREADS = torch.get_num_threads()  # that PyTorch takes by itself
 TARGETS = {  # classes of nodes without a _target_
     "view": "datasets.views.ViewSampler",
     "auto": "bench.setup.auto.AutoSettings",
-    "prior": "bench.shape_prior.autodecoder.PriorSettings",
+    "prior": "bench.shape_prior.PriorSettings",
     "models": "bench.setup.fields.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }

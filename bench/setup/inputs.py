@@ -13,7 +13,7 @@ from bench.config import EvaluationSettings
 from bench.progress import Report
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from datasets.own_photographs import Photographed
 from datasets.scene import Dataset, Scene
 from datasets.views import ViewSampler

@@ -14,7 +14,7 @@ from bench.evaluate.evaluate import surface_metrics
 from bench.progress import Report
 from bench.records.files import digest
 from bench.setup.inputs import RunInputs
-from bench.shape_prior.store import kept
+from bench.shape_prior import kept
 from bench.single_view.images import ImagesOf
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH, GivenView

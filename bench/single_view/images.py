@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
 from bench.records.files import digest
-from bench.shape_prior.store import kept
+from bench.shape_prior import kept
 from datasets.captures.hull import carve
 from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography

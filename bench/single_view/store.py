@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from bench.machine.environment import describe
 from bench.progress import Report
 from bench.records.files import digest, file_lock, to_json, write_text
-from bench.shape_prior.store import save_whole
+from bench.shape_prior import save_whole
 from bench.single_view.images import VERSION as IMAGES
 from bench.single_view.images import ImagesOf, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork

@@ -14,7 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from bench.progress import Report, notice
 from bench.reconstruct.losses import Losses
-from bench.shape_prior.store import load_whole, save_whole
+from bench.shape_prior import load_whole, save_whole
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.solve.optimise import OptimiserSettings

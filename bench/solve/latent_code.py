@@ -13,7 +13,7 @@ from torch import Tensor
 from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
 from bench.pictures.run_figures import Given, draw_run
 from bench.setup.inputs import RunInputs
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.optimise import NotReached, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter, Moved

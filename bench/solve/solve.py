@@ -16,7 +16,7 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.files import curve_file
 from bench.records.record import Record, RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.scene import Scene
 from renderers.camera import Camera

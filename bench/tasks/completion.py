@@ -12,7 +12,7 @@ from bench.models.observations import Holdout, RayObservations, hold_out, tiles,
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.optimise import OptimiserSettings

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from bench.setup.inputs import RunContext
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import solve_task

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.setup.inputs import RunContext
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, solve_task

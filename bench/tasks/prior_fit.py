@@ -7,7 +7,7 @@ import torch
 from bench.evaluate.evaluate import picture_view, surface_metrics, true_surface
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
-from bench.shape_prior.autodecoder import Prior, near_surface_first, sample_distances
+from bench.shape_prior import Prior, near_surface_first, sample_distances
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import solve_task
@@ -35,7 +35,7 @@ class PriorFit:
     Args:
         distances: number of signed distances of the shape.
         batch: number of them that an iteration draws.
-        surface_width: see `bench.shape_prior.autodecoder.PriorSettings`.
+        surface_width: see `bench.shape_prior.PriorSettings`.
         code: penalty on the code.
         optimiser: iterations and learning rates.
     """

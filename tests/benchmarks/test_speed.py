@@ -10,7 +10,7 @@ import torch
 
 from bench.config import load
 from bench.machine.environment import MemoryPeak, gemm_peak
-from bench.shape_prior.autodecoder import initialise_to_sphere
+from bench.shape_prior import initialise_to_sphere
 from datasets.views import ViewSampler
 from renderers.field import Counts, Meter
 from renderers.fields.mlp import Decoder

@@ -40,7 +40,7 @@ SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweep
 COMPARING = {"table1": 22, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 12, "speed_accuracy": 30}  # renderers
 COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
-TARGETS = {"prior": "bench.shape_prior.autodecoder.PriorSettings"}  # nodes whose class the code knows
+TARGETS = {"prior": "bench.shape_prior.PriorSettings"}  # nodes whose class the code knows
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))
 

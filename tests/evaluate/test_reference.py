@@ -7,7 +7,7 @@ import torch
 
 from bench.evaluate import reference as reference_store
 from bench.evaluate.reference import in_float64, make_reference, reference_for
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from renderers.field import Kind
 from renderers.fields.analytic import Shape
 from tests.tiny import ball_prior, camera_of

@@ -202,7 +202,7 @@ def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
 
 def test_the_gradient_of_a_network_is_that_of_its_field(wide):
     """A network near a ball's distance: with coarse values and without, hits and their gradient towards the code."""
-    from bench.shape_prior.autodecoder import initialise_to_sphere
+    from bench.shape_prior import initialise_to_sphere
 
     initialise_to_sphere(wide, radius=0.5)
     found = []

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from bench import shape_prior as priors
 from bench.prior import main as prior_main
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
 from bench.run import run as run_module
 from bench.run.plan import Estimates, Remaining
-from bench.shape_prior import store as priors
 from bench.single_view import store as networks
 from bench.train import main as train_main
 from tests.run.driving import command

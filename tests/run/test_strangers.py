@@ -27,7 +27,7 @@ class Renderer:
 class Other: ...
 def call(*_, **__): ...
 """
-PARTS = {"prior": "bench.shape_prior.autodecoder.PriorSettings", "view": "datasets.views.ViewSampler"}
+PARTS = {"prior": "bench.shape_prior.PriorSettings", "view": "datasets.views.ViewSampler"}
 
 
 @pytest.fixture

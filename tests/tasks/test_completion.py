@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import Unsupported, check_kind

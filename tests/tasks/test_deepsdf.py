@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.shape_prior.autodecoder import Prior, sample_distances
+from bench.shape_prior import Prior, sample_distances
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.deepsdf import DeepSDF

@@ -11,7 +11,7 @@ from bench.config import load
 from bench.evaluate.reference import Reference, in_float64
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
-from bench.shape_prior.autodecoder import Prior
+from bench.shape_prior import Prior
 from bench.solve.solve import Unsupported
 from bench.tasks.gradients import BANDS, DEFINITIONS, NEAR, Gradients, Subject, _bands, _draw, _outline
 from renderers.camera import Camera, Rays

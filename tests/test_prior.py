@@ -8,9 +8,20 @@ import pytest
 import torch
 import trimesh
 
-from bench.shape_prior import store as prior_store
-from bench.shape_prior.autodecoder import NetworkSettings, PriorSettings, distance_samples, fit_error, train
-from bench.shape_prior.store import SHIPPED, find, make_prior, prior_for, prior_key, probe
+from bench import shape_prior as prior_store
+from bench.shape_prior import (
+    SHIPPED,
+    NetworkSettings,
+    PriorSettings,
+    distance_samples,
+    find,
+    fit_error,
+    make_prior,
+    prior_for,
+    prior_key,
+    probe,
+    train,
+)
 from datasets.families import FAMILIES
 from datasets.mesh import Mesh
 from datasets.scene import Split
