@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
@@ -13,26 +12,13 @@ DEEPEST = 20  # levels of a configuration
 SKIPPED = NEUTRAL_KEYS | {"label", "packages"}
 
 
-@dataclass(frozen=True)
-class Differences:
-    """What tells runs apart.
-
-    Args:
-        keys: the keys in which the runs differ, without those that follow from keys before them.
-        names: of each run, its values of these keys; of runs that differ in nothing, the name of their row.
-    """
-
-    keys: tuple[str, ...]
-    names: tuple[str, ...]
-
-
 def differences(
     records: Sequence[dict[str, Any]],
     *,
     apart: Callable[[dict[str, Any]], Hashable] | None = None,
     asked: Sequence[dict[str, str]] = (),
-) -> Differences:
-    """What tells runs apart, from their records, those of failed and of planned runs included.
+) -> list[str]:
+    """The name of each run: its values of the keys in which runs differ; where there are none, the name of its row.
 
     A key that divides the runs no further than those before it is left out: of `scale=smoke,desk` all sizes follow. A
     name has a key only where runs that would else have the same name differ in it.
@@ -43,14 +29,14 @@ def differences(
         asked: of each run, the keys and values that its sweep asked for, which come before other settings.
     """
     classes = _classes([apart(record) if apart else None for record in records])
-    told = told_apart(_parts(records, asked), classes=classes, names=[""] * len(records))
-    default = [row_name(record["config"], record["renderer"]) for record in records]
-    return Differences(told.keys, tuple(name or other for name, other in zip(told.names, default, strict=True)))
+    names = told_apart(_parts(records, asked), classes=classes, names=[""] * len(records))
+    rows = [row_name(record["config"], record["renderer"]) for record in records]
+    return [name or row for name, row in zip(names, rows, strict=True)]
 
 
 def told_apart(
     parts: Iterable[tuple[str, Sequence[str | None]]], *, classes: list[int], names: list[str], most: int | None = None
-) -> Differences:
+) -> list[str]:
     """Names with what tells runs apart behind them.
 
     Args:
@@ -69,7 +55,7 @@ def told_apart(
         classes = refined
         keys.append(key)
         names = _extended(names, _heading(key, keys), values)
-    return Differences(tuple(keys), tuple(names))
+    return names
 
 
 def in_order(settings: Sequence[dict[str, str]], first: Sequence[str] = ()) -> Iterator[tuple[str, list[str | None]]]:

@@ -13,8 +13,9 @@ from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, star
 
 RESULTS = "results/local"  # the results folder unless another is given, as conf/config.yaml has it
 PLAN = "plan.json"
-FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks")  # of a results folder
-TEXTS = ("id", "task", "renderer", "dataset", "method")  # of a planned cell
+PAGE = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
+FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks", *PAGE)  # of a results folder, and in these
+WRITTEN = ("*", "paper/*", "sweeps/*/*", "page/*", "page/data/*")  # where a results folder is written to
 
 
 @dataclass(frozen=True)
@@ -70,14 +71,14 @@ class Plan:
         return record if record.get("ended") and record.get("asked", "") >= self.asked else None
 
 
-def read_plans(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """All plans of a results folder as plain data, and an error message for each that cannot be read."""
-    found = [read_plan(path, results_dir) for path in sorted((results_dir / "sweeps").glob(f"*/{PLAN}"))]
+def read_plans(results_dir: Path) -> tuple[list[Plan], list[str]]:
+    """All plans of a results folder, and an error message for each that cannot be read."""
+    found = [_read_plan(path, results_dir) for path in sorted((results_dir / "sweeps").glob(f"*/{PLAN}"))]
     return [plan for plan, _ in found if plan is not None], [problem for _, problem in found if problem]
 
 
-def read_plan(path: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:
-    """The plan of a file as plain data, or None and why it cannot be read."""
+def _read_plan(path: Path, results_dir: Path) -> tuple[Plan | None, str]:
+    """The plan of a file, or None and why it cannot be read."""
     try:
         if leads_out(path, results_dir):
             raise ValueError("it is a link out of the results folder")
@@ -88,14 +89,12 @@ def read_plan(path: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str
             raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
         datetime.fromisoformat(plan["asked"])
         names = [item.name for item in fields(PlannedCell)]
-        cells = [{"method": ""} | {name: cell[name] for name in names if name in cell} for cell in plan["cells"]]
-        if any(len(cell) < len(names) for cell in cells):
-            raise ValueError(f"each cell must have {', '.join(names)}")
-        if not all(_sound(cell) for cell in cells):
+        cells = [PlannedCell(**{name: cell[name] for name in names if name in cell}) for cell in plan["cells"]]
+        if not all(map(_is_sound, cells)):
             raise ValueError("each cell's id must be the name of a folder, and its config an object")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         return None, f"sweeps/{path.parent.name}/{PLAN}: {error!r}"
-    return {"name": plan["name"], "asked": plan["asked"], "cells": cells}, ""
+    return Plan(plan["name"], results_dir, cells, plan["asked"]), ""
 
 
 def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -112,7 +111,7 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     records, problems = [record for record, _ in found if record is not None], [said for _, said in found if said]
     known = {record["folder"] for record in records}
     plans, unread = read_plans(results_dir)
-    missing = {cell["id"]: not_run(cell, plan) for plan in plans for cell in plan["cells"] if cell["id"] not in known}
+    missing = {cell.id: not_run(cell, plan) for plan in plans for cell in plan.cells if cell.id not in known}
     records.extend(missing.values())
     records.sort(key=started, reverse=True)
     return records, problems + unread
@@ -159,18 +158,16 @@ def check_links(results_dir: Path) -> None:
     Raises:
         ValueError: where one of its folders, a file of it or one of its tables is a link that leads out.
     """
-    tables = [path for pattern in ("*", "paper/*", "sweeps/*/*") for path in results_dir.glob(pattern)]
-    entries = [*tables, *(results_dir / name for name in FOLDERS)]
-    for path in entries:
+    for path in (found for pattern in WRITTEN for found in results_dir.glob(pattern)):
         if path.is_symlink() and (path.name in FOLDERS or not path.is_dir()) and leads_out(path, results_dir):
             raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
 
 
-def _sound(cell: dict[str, Any]) -> bool:
+def _is_sound(cell: PlannedCell) -> bool:
     """Whether the fields of a planned cell have their types, and its id leads to no other folder."""
-    texts = all(isinstance(cell[name], str) for name in TEXTS)
-    listed = isinstance(cell["overrides"], list) and all(isinstance(one, str) for one in cell["overrides"])
-    return texts and listed and is_plain_name(cell["id"]) and isinstance(cell["config"], dict)
+    listed = isinstance(cell.overrides, list) and isinstance(cell.config, dict)
+    texts = (cell.task, cell.renderer, cell.dataset, cell.method, *cell.overrides) if listed else (None,)
+    return all(isinstance(text, str) for text in texts) and is_plain_name(cell.id)
 
 
 def curve_lines(folder: Path) -> list[dict[str, Any]] | None:
@@ -190,9 +187,8 @@ def _line(text: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def not_run(cell: dict[str, Any], plan: dict[str, Any]) -> dict[str, Any]:
+def not_run(cell: PlannedCell, plan: Plan) -> dict[str, Any]:
     """A record in place of a planned cell's run that does not exist."""
-    given = {name: cell[name] for name in (*TEXTS, "seed", "config", "overrides")}
-    reason = f"planned by sweep {plan['name']}; the same command runs it"
-    record = Record(**given, started=plan["asked"], asked=plan["asked"], status=NOT_RUN, reason=reason)
-    return asdict(record) | {"folder": cell["id"]}
+    reason = f"planned by sweep {plan.name}; the same command runs it"
+    record = Record(**vars(cell), started=plan.asked, asked=plan.asked, status=NOT_RUN, reason=reason)
+    return asdict(record) | {"folder": cell.id}

@@ -116,7 +116,7 @@ class Compared:
         """
         of_run = {record["folder"]: (row.preset, row.name) for row, of in self.runs.rows().items() for record in of}
         plans, _ = read_plans(self.runs.results_dir)
-        found = [[of_run[cell["id"]] for cell in plan["cells"] if cell["id"] in of_run] for plan in plans]
+        found = [[of_run[cell.id] for cell in plan.cells if cell.id in of_run] for plan in plans]
         ordered = [row for rows in sorted(found, key=len, reverse=True) for row in rows]
         return list(dict.fromkeys([*ordered, *self.rows]))
 

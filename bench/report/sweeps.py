@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,34 +52,34 @@ def write_sweep(plan: Plan) -> Path | None:
     """Writes the table of a sweep that has ended, if no study shows it; gives the path of its readable form."""
     if plan.cells[0].config.get("experiment") in _studied():
         return None
-    plain, known = asdict(plan), {}
-    for cell in plain["cells"]:
-        record, _ = read_run(plan.results_dir / "runs" / cell["id"], plan.results_dir)
-        known[cell["id"]] = record or not_run(cell, plain)
-    _write(of_plan(plain, known, plan.results_dir), plan.folder)
+    known = {}
+    for cell in plan.cells:
+        record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
+        known[cell.id] = record or not_run(cell, plan)
+    _write(of_plan(plan, known), plan.folder)
     return plan.folder / f"{TABLE}.md"
 
 
 def read_sweeps(known: list[Record], results_dir: Path) -> list[Sweep]:
     """The sweeps of a results folder without a study."""
     by_folder, studied = {record["folder"]: record for record in known}, _studied()
-    plans = [plan for plan in read_plans(results_dir)[0] if any(cell["id"] in by_folder for cell in plan["cells"])]
-    sweeps = [of_plan(plan, by_folder, results_dir) for plan in plans]
+    plans = [plan for plan in read_plans(results_dir)[0] if any(cell.id in by_folder for cell in plan.cells)]
+    sweeps = [of_plan(plan, by_folder) for plan in plans]
     return [sweep for sweep in sweeps if sweep.runs.selection.experiment not in studied]
 
 
-def of_plan(plan: dict[str, Any], known: dict[str, Record], results_dir: Path) -> Sweep:
+def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
     """The sweep of a plan, some of whose runs are known; cells that differ in nothing that counts have one run."""
-    cells = {cell["id"]: cell for cell in plan["cells"] if cell["id"] in known}
+    cells = {cell.id: cell for cell in plan.cells if cell.id in known}
     runs = [known[name] for name in cells]
-    asked = [_asked(cell["overrides"]) for cell in cells.values()]
+    asked = [_asked(cell.overrides) for cell in cells.values()]
     keys = dict.fromkeys(key for one in asked for key in one)
     swept = {key: list(dict.fromkeys(one[key] for one in asked if key in one)) for key in keys}
     swept = {key: values for key, values in swept.items() if len(values) > 1}
-    found = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
-    named = [run | {"row": name} for run, name in zip(runs, found.names, strict=True)]
-    selection = Selection(plan["cells"][0]["config"].get("experiment") or "", setup=("scenes", "pixels", "machine"))
-    return Sweep(plan["name"], swept, Runs(selection, results_dir, named))
+    names = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
+    named = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
+    selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
+    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, named))
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:

@@ -113,7 +113,11 @@ def test_a_link_within_the_results_folder_is_followed(theirs):
 
 
 @pytest.mark.parametrize(
-    "name", ["runs", "paper", "sweeps", "earlier", ".locks", "index.html", "paper/table1.csv", "sweeps/p/table.csv"]
+    "name",
+    [
+        *("runs", "paper", "sweeps", "earlier", ".locks", "page", "page/data/run"),
+        *("index.html", "paper/table1.csv", "sweeps/p/table.csv"),
+    ],
 )
 def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
     outside = tmp_path / "mine"

@@ -66,7 +66,7 @@ def names(records: list[Record]) -> list[str]:
         different = [settings[same[0]] for same in alike]
         rows = [found[places[0]]] * len(alike)
         told = told_apart(in_order(different, TOLD_FIRST), classes=[0] * len(alike), names=rows, most=MOST_TOLD)
-        for same, name in zip(alike, told.names, strict=True):
+        for same, name in zip(alike, told, strict=True):
             for place in same:
                 found[place] = name
     return found

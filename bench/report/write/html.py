@@ -26,7 +26,6 @@ SCRIPTS = (  # in the order in which they need each other
 )
 START = "app.js"  # after the data
 LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
-DATA = tuple(f"data/{kind}" for kind in ("list", "run", "mesh", "paper"))
 MOST_MESHES = 500  # of the newest runs; `bench.report meshes=all` makes all
 # Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
 POLICY = (
@@ -48,10 +47,9 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
         meshes: of how many runs, the newest first, the mesh is made ready for the page; None for all.
 
     Raises:
-        ValueError: if `results_dir` is not a folder.
+        ValueError: if `results_dir` is not a folder, or one that the page is written to is a link out of it.
     """
     check_results(results_dir)
-    _refuse_links(results_dir)
     with file_lock(results_dir, FOLDER):  # of two sweeps that end, the last one's page has the runs of both
         records, problems = read_records(results_dir)
         data, page = results_dir / FOLDER / "data", results_dir / "index.html"
@@ -109,13 +107,6 @@ def _is_newer(path: Path, source: Path, key: str) -> bool:
         return isinstance(data, dict) and "bdata" in data["x"] and text == to_script("mesh", key, data)
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False
-
-
-def _refuse_links(results_dir: Path) -> None:
-    """Raises ValueError where a folder that the page is written to is a link, which may lead anywhere."""
-    for name in (FOLDER, *(f"{FOLDER}/{inner}" for inner in ("base", "parts", "views", "data", *DATA))):
-        if (results_dir / name).is_symlink():
-            raise ValueError(f"{results_dir / name} is a link, and the page is not written through it: remove it")
 
 
 def shell() -> str:
