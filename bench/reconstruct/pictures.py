@@ -145,7 +145,7 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
     shots = spread(subject.held_out, MOST_HELD_OUT)
     tall = shots[0].camera.height / shots[0].camera.width
-    figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 1.2), layout="constrained")
+    figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 1.2), layout="compressed")
     axes = figure.subplots(len(shots), 4, squeeze=False)
     for row, shot in zip(axes, shots, strict=True):
         view, image = seen(_larger(shot.camera, inputs.evaluation.picture))
@@ -158,15 +158,9 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
             bare(axis)
     for axis, name in zip(axes[0], ("held-out photograph", "rendering", "difference", "normals"), strict=True):
         axis.set_title(name)
-    figure.colorbar(
-        shown,
-        ax=axes[:, 2],
-        location="bottom",
-        shrink=0.9,
-        pad=0.02,
-        label="mean absolute, of colours from 0 to 1",
-        extend="max",
-    )
+    below = axes[-1, 2].inset_axes((0.05, -0.1, 0.9, 0.05))
+    scale = figure.colorbar(shown, cax=below, orientation="horizontal", extend="max")
+    scale.set_label("mean error of colours, 0 to 1")
     figure.suptitle(title)
     return figure
 
