@@ -5,8 +5,6 @@ Every part has a pose; sizes are logarithms.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -86,171 +84,101 @@ PARTS = {  # all but a sphere begin with their pose, see `_placed`, and the loga
 }
 
 
-@dataclass(frozen=True)
-class OnePart:
-    """A part of `PARTS` that begins in the smallest box about the observed points."""
+def one_part(name: str) -> Candidate:
+    """A part of `PARTS` that begins in the smallest box about the observed points, a sphere about their middle."""
+    part = PARTS[name]
 
-    name: str
-    follows: ClassVar[bool] = False
-    tries: ClassVar[int] = 1
-
-    @property
-    def stored(self) -> int:
-        return PARTS[self.name].size
-
-    @property
-    def flops(self) -> int:
-        """An estimate: a power counts as 20."""
-        return PARTS[self.name].flops
-
-    def starts(self, seen: Seen) -> list[Model]:
-        """A sphere about the points' middle, or the part in their oriented box."""
-        part = PARTS[self.name]
+    def starts(seen: Seen) -> list[Model]:
         around = _subsampled(seen.points)
-        if self.name == "sphere":
+        if name == "sphere":
             middle = (around.amax(0) + around.amin(0)) / 2
             radius = torch.linalg.vector_norm(around - middle, dim=-1).mean()
             parameters = torch.cat([middle, radius.log()[None]])
         else:
             parameters = torch.cat([_fitting_box(around), torch.tensor(part.extra)])
-        return [_model(self.name, parameters, lambda tensors: part.shape(tensors[0]), self.flops, seen)]
+        return [_model(name, parameters, part.shape, part.flops, seen)]
+
+    return Candidate(name, part.size, part.flops, starts)
 
 
-@dataclass(frozen=True)
-class UnionOf:
+def union_of(name: str, count: int) -> Candidate:
     """A union of rounded boxes.
 
     Some starts have one part about each of `count` clusters of the observed points. One start keeps the parts of a
-    smaller union, and adds parts about clusters of the points that this union is furthest from.
+    smaller union, if there is one, and adds parts about clusters of the points that this union is furthest from.
     """
+    flops = count * PARTS["rounded_box"].flops
 
-    name: str
-    count: int
-    follows: ClassVar[bool] = False
-    tries: ClassVar[int] = CLUSTERINGS + 1
-
-    @property
-    def stored(self) -> int:
-        return self.count * PARTS["rounded_box"].size
-
-    @property
-    def flops(self) -> int:
-        return self.count * PARTS["rounded_box"].flops
-
-    def starts(self, seen: Seen) -> list[Model]:
-        """One start for each clustering, and one from the previous union, if there is one."""
+    def starts(seen: Seen) -> list[Model]:
         old = [] if seen.previous is None else _parts_of(seen.previous)
-        kept = old if len(old) < self.count else []
+        kept = old if len(old) < count else []
         points = _subsampled(seen.points)
-        choices = [_cluster_boxes(points, self.count, seen.seed + start) for start in range(CLUSTERINGS)]
+        choices = [_cluster_boxes(points, count, seen.seed + start) for start in range(CLUSTERINGS)]
         if kept:
             error = seen.previous_values(points).abs()
             missed = points[error >= error.quantile(MISSED_QUANTILE)]
-            choices.append([*kept, *_cluster_boxes(missed, self.count - len(kept), seen.seed)])
-        return [
-            _model(self.name, torch.stack(parts), lambda parameters: union(parameters[0]), self.flops, seen)
-            for parts in choices
-        ]
+            choices.append([*kept, *_cluster_boxes(missed, count - len(kept), seen.seed)])
+        return [_model(name, torch.stack(parts), union, flops, seen) for parts in choices]
+
+    return Candidate(name, count * PARTS["rounded_box"].size, flops, starts, tries=CLUSTERINGS + 1)
 
 
-@dataclass(frozen=True)
-class Network:
-    """Fully connected ReLU layers from a point to a distance (see `renderers.fields.mlp.Decoder`, without a code)."""
+def network(name: str, layers: int, width: int) -> Candidate:
+    """Fully connected ReLU layers from a point to a distance (see `renderers.fields.mlp.Decoder`, without a code).
 
-    name: str
-    layers: int
-    width: int
-    follows: ClassVar[bool] = True
-    tries: ClassVar[int] = 1
+    It is initialised near the distance of a sphere; the warm start then fits it to the previous field.
+    """
+    skip = layers // 2 if layers >= DEEP else 0
 
-    @cached_property
-    def stored(self) -> int:
-        return sum(parameter.numel() for parameter in self._decoder(0).parameters())
+    def decoder() -> Decoder:
+        return Decoder(layers=layers, width=width, code_length=0, skip=skip, narrow=True)
 
-    @cached_property
-    def flops(self) -> int:
-        return self._bound(list(self._decoder(0).parameters())).flops.value
-
-    def starts(self, seen: Seen) -> list[Model]:
-        """Initialised near the distance of a sphere; the warm start then fits it to the previous field."""
-        decoder = self._decoder(seen.seed)
-        initialise_to_sphere(decoder, START_RADIUS)
-        parameters = [parameter.detach().to(seen.device).requires_grad_() for parameter in decoder.parameters()]
-        return [Model(self.name, parameters, self._bound, min(MAX_RATE, RATE_OF_WIDTH / self.width), metric=False)]
-
-    def _decoder(self, seed: int) -> Decoder:
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            return Decoder(layers=self.layers, width=self.width, code_length=0, skip=self._skip, narrow=True)
-
-    @property
-    def _skip(self) -> int:
-        return self.layers // 2 if self.layers >= DEEP else 0
-
-    def _bound(self, free: list[Tensor]) -> BoundDecoder:
+    def bound(free: list[Tensor]) -> BoundDecoder:
         pairs = list(zip(free[::2], free[1::2], strict=True))
-        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], self._skip)
+        return BoundDecoder(tuple(pairs[:-1]), pairs[-1], skip)
+
+    def starts(seen: Seen) -> list[Model]:
+        with torch.random.fork_rng():
+            torch.manual_seed(seen.seed)
+            begun = decoder()
+        initialise_to_sphere(begun, START_RADIUS)
+        parameters = [parameter.detach().to(seen.device).requires_grad_() for parameter in begun.parameters()]
+        return [Model(name, parameters, bound, min(MAX_RATE, RATE_OF_WIDTH / width), metric=False)]
+
+    with torch.device("meta"):  # sizes alone
+        parameters = list(decoder().parameters())
+    stored = sum(parameter.numel() for parameter in parameters)
+    return Candidate(name, stored, bound(parameters).flops.value, starts, follows=True)
 
 
-@dataclass(frozen=True)
-class NarrowBand:
+def narrow_band(name: str, resolution: int) -> Candidate:
     """A grid of distances: those near the surface are fitted, the others keep the values of the previous field."""
-
-    name: str
-    resolution: int
-    follows: ClassVar[bool] = True
-    tries: ClassVar[int] = 1
-
-    @property
-    def stored(self) -> int:
-        """All samples: those that are not fitted are evaluated as well."""
-        return self.resolution**3
-
-    @property
-    def flops(self) -> int:
-        return FLOPS.value
+    stored = resolution**3  # all samples: those that are not fitted are evaluated as well
 
     @torch.no_grad()
-    def starts(self, seen: Seen) -> list[Model]:
+    def starts(seen: Seen) -> list[Model]:
         """The previous field's values; fitted are those near its surface or near the observed points."""
-        axis = torch.linspace(-REACH, REACH, self.resolution, device=seen.device)
+        axis = torch.linspace(-REACH, REACH, resolution, device=seen.device)
         corners = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         values = seen.previous_values(corners.view(-1, 3)).to(seen.device)
-        cell = 2 * REACH / (self.resolution - 1)
+        cell = 2 * REACH / (resolution - 1)
         near = values.abs() < BAND * cell
-        near[self._near_points(seen.points.to(seen.device), cell)] = True
+        near[_near_points(seen.points.to(seen.device), cell, resolution)] = True
         band = near.nonzero().squeeze(-1)
 
         def grid(free: list[Tensor]) -> Grid:
-            kept = values.index_put((band,), free[0])
-            return Grid(kept.view(self.resolution, self.resolution, self.resolution), REACH)
+            return Grid(values.index_put((band,), free[0]).view(resolution, resolution, resolution), REACH)
 
         free = values[band].clone().requires_grad_()
-        sparse = self._sparse_bytes(len(free), seen)
-        held = len(values) - len(free)
-        return [Model(self.name, [free], grid, GRID_RATE, metric=False, held=held, sparse_bytes=sparse)]
+        # The fitted samples, a bit per sample that tells which they are, and the field whose values the others are.
+        sparse = FLOAT * len(free) + -(-stored // 8) + seen.previous.size.bytes
+        return [Model(name, [free], grid, GRID_RATE, metric=False, held=stored - len(free), sparse_bytes=sparse)]
 
-    def _sparse_bytes(self, fitted: int, seen: Seen) -> int:
-        """Of a file with the fitted samples, a bit per sample that tells which they are, and the previous field.
-
-        The other samples are values of that field, so that the same grid can be computed from it.
-        """
-        assert seen.previous is not None
-        return FLOAT * fitted + -(-self.stored // 8) + seen.previous.size.bytes
-
-    def _near_points(self, points: Float[Tensor, "n 3"], cell: float) -> Int[Tensor, " m"]:
-        """Indices of the samples within `BAND` cells of a point, along each axis."""
-        reach = int(BAND)
-        steps = torch.arange(1 - reach, reach + 1, device=points.device)
-        offsets = torch.cartesian_prod(steps, steps, steps)
-        low = ((points + REACH) / cell).floor().long()
-        corners = (low[:, None] + offsets).clamp(0, self.resolution - 1).reshape(-1, 3)
-        place = (corners[:, 0] * self.resolution + corners[:, 1]) * self.resolution + corners[:, 2]
-        return place.unique()
+    return Candidate(name, stored, FLOPS.value, starts, follows=True)
 
 
-SIZED: dict[str, Callable[..., Candidate]] = {"union": UnionOf, "network": Network, "grid": NarrowBand}
-PAPERS = Network("network_8x512", 8, 512)  # that of DeepSDF and DIST, without a code
+SIZED: dict[str, Callable[..., Candidate]] = {"union": union_of, "network": network, "grid": narrow_band}
+PAPERS = "network_8x512"  # that of DeepSDF and DIST, without a code
 
 
 def candidate(name: str) -> Candidate:
@@ -263,7 +191,7 @@ def candidate(name: str) -> Candidate:
     kind, sizes = parsed(name)
     if sizes and kind not in SIZED:
         raise BadInput(f"field={name} is learnt from images alone: set task=reconstruction, or another field")
-    return SIZED[kind](name, *sizes) if sizes else OnePart(name)
+    return SIZED[kind](name, *sizes) if sizes else one_part(name)
 
 
 def by_size(names: tuple[str, ...], measure: str) -> list[Candidate]:
@@ -277,15 +205,11 @@ def by_size(names: tuple[str, ...], measure: str) -> list[Candidate]:
     return listed if measure == FREE else sorted(listed, key=lambda one: one.stored)
 
 
-def _model(name: str, parameters: Tensor, shape: Callable[[list[Tensor]], Shape], flops: int, seen: Seen) -> Model:
-    free = parameters.float().to(seen.device).requires_grad_()
-    return Model(
-        name,
-        [free],
-        lambda parameters: replace(shape(parameters), flops=Flops(flops, 2 * flops)),
-        LEARNING_RATE,
-        metric=True,
-    )
+def _model(name: str, parameters: Tensor, shape: Callable[[Tensor], Shape], flops: int, seen: Seen) -> Model:
+    def field(free: list[Tensor]) -> Shape:
+        return replace(shape(free[0]), flops=Flops(flops, 2 * flops))
+
+    return Model(name, [parameters.float().to(seen.device).requires_grad_()], field, LEARNING_RATE, metric=True)
 
 
 def _placed(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
@@ -308,16 +232,12 @@ def _fitting_box(points: Float[Tensor, "n 3"]) -> Float[Tensor, "9"]:
     """Pose and logarithmic half sizes of the smallest box about the points."""
     import trimesh  # here, since it takes a second and most runs do not need it
 
-    to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + _jitter(len(points)))
+    jitter = 1e-4 * np.random.default_rng(0).standard_normal(points.shape)  # points on a plane have a box with a volume
+    to_box, extents = trimesh.bounds.oriented_bounds(points.numpy() + jitter)
     place = np.linalg.inv(to_box)
     angle, axis, _ = trimesh.transformations.rotation_from_matrix(place)
     sizes = np.log(np.maximum(extents / 2, MIN_HALF_SIZE))
     return torch.from_numpy(np.concatenate([place[:3, 3], angle * np.array(axis), sizes])).float()
-
-
-def _jitter(count: int) -> Float[np.ndarray, "n 3"]:
-    """A little noise, so that points on a plane have a box with a volume."""
-    return 1e-4 * np.random.default_rng(0).standard_normal((count, 3))
 
 
 def _cluster_boxes(points: Float[Tensor, "n 3"], count: int, seed: int) -> list[Float[Tensor, "10"]]:
@@ -340,3 +260,14 @@ def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) ->
 def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:
     """The parts of a union; none of another model."""
     return list(model.parameters[0].detach().cpu()) if model.candidate.startswith("union_") else []
+
+
+def _near_points(points: Float[Tensor, "n 3"], cell: float, resolution: int) -> Int[Tensor, " m"]:
+    """Indices of a grid's samples within `BAND` cells of a point, along each axis."""
+    reach = int(BAND)
+    steps = torch.arange(1 - reach, reach + 1, device=points.device)
+    offsets = torch.cartesian_prod(steps, steps, steps)
+    low = ((points + REACH) / cell).floor().long()
+    corners = (low[:, None] + offsets).clamp(0, resolution - 1).reshape(-1, 3)
+    place = (corners[:, 0] * resolution + corners[:, 1]) * resolution + corners[:, 2]
+    return place.unique()

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.models.candidates import OnePart
+from bench.models.candidates import one_part
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence, Model, Seen
 from bench.models.observations import RayObservations, generator
@@ -87,7 +87,7 @@ class Fitter:
         """A candidate's model after its warm start; with `evaluate`, its held-out error is computed as well."""
         clock, sphere, points = time.perf_counter(), None, self.observations.points
         if previous is None and candidate.follows:
-            sphere = self.begin(OnePart("sphere"), None, evaluate=False)
+            sphere = self.begin(one_part("sphere"), None, evaluate=False)
             previous = sphere.model
         started = time.perf_counter()
         seen = Seen(points.cpu(), previous, self.seed, self.device)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -109,19 +108,25 @@ class Seen:
         return Meter(self.previous.frozen(), self.counts)(points.to(self.device)).cpu()
 
 
-@runtime_checkable
-class Candidate(Protocol):
-    """A kind of field, of a certain size."""
+@dataclass(frozen=True)
+class Candidate:
+    """A kind of field, of a certain size.
+
+    Args:
+        name: of it.
+        stored: numbers, see `Size`, which are known before its start; the free ones of a grid are not.
+        flops: floating-point operations per value; an estimate for parts, where a power counts as 20.
+        starts: gives models to start from; the one with the least loss after a short warm start is fitted.
+        tries: the largest number of starts.
+        follows: whether it begins with the previous field, not with the observed points.
+    """
 
     name: str
-    stored: int  # numbers, see `Size`, which are known before its start; the free ones of a grid are not
-    flops: int  # floating-point operations per value
-    tries: int  # the largest number of starts
-    follows: bool  # whether it begins with the previous field, not with the observed points
-
-    def starts(self, seen: Seen) -> list[Model]:
-        """Models to start from; the one with the least loss after a short warm start is fitted."""
-        ...
+    stored: int
+    flops: int
+    starts: Callable[[Seen], list[Model]]
+    tries: int = 1
+    follows: bool = False
 
 
 @dataclass

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
-from bench.models.candidates import PAPERS, by_size
+from bench.models.candidates import PAPERS, by_size, candidate
 from bench.models.field import SIZES
 from bench.models.fit import Fitter
 from bench.models.growth import Growth, grow
@@ -187,13 +187,11 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
 
 def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     """Costs of the papers' network over the chosen candidate's; its time only where it was fitted in this run."""
-    fitted = next(
-        (candidate for candidate in evidence if candidate.candidate == PAPERS.name and candidate.error is not None),
-        None,
-    )
-    size = Size(PAPERS.stored, PAPERS.stored)
+    fitted = next((one for one in evidence if one.candidate == PAPERS and one.error is not None), None)
+    papers = candidate(PAPERS)
+    size = Size(papers.stored, papers.stored)
     ratios = {measure: size.by(measure) / chosen.size.by(measure) for measure in SIZE_WORDS}
-    ratios["flops_per_query"] = PAPERS.flops / chosen.flops_per_query
+    ratios["flops_per_query"] = papers.flops / chosen.flops_per_query
     if fitted is not None:
         ratios["seconds"] = fitted.seconds / max(chosen.seconds, TINY)
     return {f"saved_{key}": ratio for key, ratio in ratios.items()}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.evaluate.evaluate import Evaluation
-from bench.models.candidates import PAPERS, candidate
+from bench.models.candidates import candidate
 from bench.models.field import failure_of
 from bench.models.growth import grow
 from bench.models.held_out import HeldOutError
@@ -31,7 +31,7 @@ TINY = (
     "models.views.held_out=3", "models.views.rays=64", "prior.shapes=1",
 )  # fmt: skip
 
-
+PAPERS = candidate("network_8x512")
 BETTER = ("task.optimiser.iterations=20", "models.candidates=[sphere,box,union_2]", "models.fit.warm_iterations=120")
 
 
