@@ -37,7 +37,7 @@ OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may alwa
 PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
 RESERVED = ("_target_", PACKAGE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
 ROLES = {  # what the class of a node of the top level must be
-    "task": "bench.tasks.task.Task",
+    "task": "bench.setup.inputs.Task",
     "renderer": "renderers.rendering.Renderer",
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",

@@ -14,19 +14,19 @@ def main() -> int:
 
     def train(run: Identity) -> None:
         from bench.progress import run_progress
-        from bench.run.cell import cell_of
+        from bench.setup.inputs import cell_of
         from bench.shape_prior import find, make_prior
 
         cell = cell_of(run.config)
-        dataset, settings = cell.dataset, cell.prior
-        path = find(dataset, settings, cell.cache)
+        dataset, settings, folder = cell.inputs.dataset, cell.prior, cell.inputs.cache
+        path = find(dataset, settings, folder)
         if run.config["plan"]:
             what = f"prior of {dataset.name}: shapes {settings.shapes}, steps {settings.steps}"
             print(f"{what}  {'to be trained' if path is None else f'there already: {path}'}")
             return
         if path is None:
             with run_progress("prior") as progress:
-                path = make_prior(dataset, settings, cell.cache, cell.device, progress)
+                path = make_prior(dataset, settings, folder, cell.inputs.device, progress)
         print(path)
 
     return command_line(train, runs=False)

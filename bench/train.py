@@ -14,7 +14,7 @@ def main() -> int:
 
     def train(run: Identity) -> None:
         from bench.progress import run_progress
-        from bench.run.cell import cell_of
+        from bench.setup.inputs import cell_of
         from bench.tasks.single_view import OneImage, told
 
         cell = cell_of(run.config)
@@ -24,11 +24,12 @@ def main() -> int:
                 "dataset=car; python -m bench.prior trains a prior"
             )
         with run_progress("single_view") as progress:
-            inputs = cell.start(progress)
+            cell.start()
+            inputs = cell.inputs
             recipe = cell.task.recipe(inputs, run.config)
             if run.config["plan"]:
-                found = recipe.find(cell.cache)
-                begun = (cell.cache / f"{recipe.stem}.state").exists()
+                found = recipe.find(inputs.cache)
+                begun = (inputs.cache / f"{recipe.stem}.state").exists()
                 todo = "was stopped, and goes on where it was" if begun else "to be trained"
                 what = f"network of {recipe.dataset.name}: shapes {recipe.shapes}, images of each {recipe.views}"
                 steps = f"steps {recipe.training.steps}"

@@ -158,7 +158,7 @@ WRONG = (
     ("bench.__main__", "import bench.studies.completion"),
     ("bench.report.write.html", "from ...studies.completion import make"),
     ("bench.studies.completion", "from .table1 import make"),
-    ("bench.studies.completion", "from bench.tasks.task import Task"),
+    ("bench.studies.completion", "from bench.setup.inputs import Task"),
 )
 RIGHT = (
     ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),

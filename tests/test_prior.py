@@ -185,7 +185,7 @@ def shipped_records() -> list[dict]:
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_the_shipped_prior_is_that_of_the_default_configuration(family, compose_config, tmp_path, monkeypatch):
     desk, smoke = (cell_from(compose_config(f"dataset={family}", f"scale={scale}")) for scale in ("desk", "smoke"))
-    dataset, settings = desk.dataset, desk.prior
+    dataset, settings = desk.inputs.dataset, desk.prior
     assert settings == smoke.prior
     (record,) = (record for record in shipped_records() if record["dataset"]["name"] == family)
     assert record["key"] == prior_key(dataset, settings)

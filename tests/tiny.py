@@ -10,9 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import EvaluationSettings
 from bench.records.record import Record
-from bench.run.cell import Cell, cell_of
 from bench.setup.fields import FieldChoice
-from bench.setup.inputs import RunContext, RunInputs
+from bench.setup.inputs import Cell, RunContext, RunInputs, cell_of
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View

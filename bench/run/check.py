@@ -1,6 +1,6 @@
 """Checks configurations before anything runs: an invalid value is reported at once, with its cell.
 
-A configuration is built by the code that its run builds it with, `bench.run.cell.cell_of`.
+A configuration is built by the code that its run builds it with, `bench.setup.inputs.cell_of`.
 """
 
 import io
@@ -90,7 +90,7 @@ def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> s
         config: resolved, as plain data.
         built: what cells of a sweep share; see `cell_of`.
     """
-    from bench.run.cell import cell_of  # it imports torch
+    from bench.setup.inputs import cell_of  # it imports torch
 
     try:
         with redirect_stdout(io.StringIO()):  # of classes of the user's

@@ -18,9 +18,8 @@ from bench.machine import environment
 from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
-from bench.run.cell import Cell, cell_of
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import Cell, RunContext, cell_of
 from bench.solve.solve import Unsupported
 from renderers.checks import BadInput
 
@@ -66,8 +65,9 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     log = _open_log(folder)
     contention = Contention()
     try:
-        cell = _built(record)
-        inputs = cell.start(progress)
+        cell = _built(record, progress)
+        cell.start()
+        inputs = cell.inputs
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         checkpoint(record)
@@ -94,10 +94,10 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         _close_log(log)
 
 
-def _built(record: Record) -> Cell:
+def _built(record: Record, progress: Report) -> Cell:
     """The cell of a record's configuration; raises BadInput for anything invalid in it."""
     try:
-        return cell_of(record.config)
+        return cell_of(record.config, progress=progress)
     except (ValueError, OSError) as error:
         raise BadInput(reason_of(error)) from error
 

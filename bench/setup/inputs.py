@@ -1,4 +1,7 @@
-"""What a task works with: its inputs, and the run under way."""
+"""What a run is made of: its task, what the task works with, and the run under way.
+
+`cell_of` is the one place where a configuration becomes objects: for the check of a sweep, and for each run.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -6,19 +9,33 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import EvaluationSettings
+from bench.config import EvaluationSettings, build_once
+from bench.machine.environment import pick_device, using_threads
 from bench.progress import Report
 from bench.records.record import Record
+from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
-from bench.shape_prior import Prior
+from bench.shape_prior import Prior, PriorSettings, prior_for
 from datasets.own_photographs import Photographed
-from datasets.scene import Dataset, Scene
+from datasets.scene import Dataset, Scene, Split, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.rendering import Renderer, final_notes
+
+WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
+ALL_THREADS = torch.get_num_threads()  # that PyTorch takes by itself
+TARGETS = {  # classes of nodes without a _target_
+    "view": "datasets.views.ViewSampler",
+    "auto": "bench.setup.auto.AutoSettings",
+    "prior": "bench.shape_prior.PriorSettings",
+    "models": "bench.setup.fields.ModelSettings",
+    "evaluation": "bench.config.EvaluationSettings",
+}
+Noted = tuple[Renderer, list[str]]  # a renderer, and notes on its settings with the value `auto`
 
 
 @dataclass(frozen=True)
@@ -37,7 +54,7 @@ class RunInputs:
     field: FieldChoice  # what an unknown shape is made of
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
-    make_pixel_precise: Callable[[], tuple[Renderer, list[str]]] | None = None
+    make_pixel_precise: Callable[[], Noted] | None = None
     photographed: Photographed | None = None  # the dataset, where it has photographs and no true shape
     trained: int | None = None  # number of the scene's shape in the prior's training; None where it was not in it
 
@@ -47,7 +64,7 @@ class RunInputs:
         return self.make_scene()
 
     @cached_property
-    def pixel_precise(self) -> tuple[Renderer, list[str]]:
+    def pixel_precise(self) -> Noted:
         """The renderer at pixel precision, with no more steps than that takes, and notes on these settings."""
         return (self.renderer, []) if self.make_pixel_precise is None else self.make_pixel_precise()
 
@@ -95,3 +112,136 @@ class RunContext:
         yield
         seconds = self.record.seconds
         seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
+
+
+@runtime_checkable
+class Task(Protocol):
+    """A benchmark problem for a renderer and a scene. It names no renderer."""
+
+    def execute(self, run: RunContext) -> None:
+        """Executes the task, and fills the run's record and folder.
+
+        Raises:
+            Unsupported: where the renderer cannot do what the task or its field needs.
+        """
+        ...
+
+
+@runtime_checkable
+class TakesField(Protocol):
+    """A task that works with any field, as set by `field=`, in place of a prior's code."""
+
+    takes_field: ClassVar[bool]
+
+
+@runtime_checkable
+class Checks(Protocol):
+    """A task that not all inputs will do for, which is told before anything slow, and by `plan=true`."""
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput for inputs that the task cannot use."""
+        ...
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A task and what it works with, built and checked; nothing slow was done.
+
+    Args:
+        prior: how the prior is trained, where it has to be.
+        threads: of the CPU; None leaves it to `threads_for`.
+    """
+
+    task: Task
+    inputs: RunInputs
+    prior: PriorSettings
+    threads: int | None
+
+    def start(self) -> None:
+        """Gives this process the run's threads and seed."""
+        torch.set_num_threads(self.threads or threads_for(self.prior.network.width))
+        torch.manual_seed(self.inputs.seed)
+
+
+def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
+    """Builds everything that a configuration names, and checks all of it before the first slow step.
+
+    Args:
+        config: of a run, resolved, as plain data; `bench.config.check_top_level` has checked it.
+        built: objects and errors by the text of their nodes, which cells of a sweep share while they are checked.
+        progress: receives that of a training of the prior.
+
+    Raises:
+        ValueError, OSError: for anything invalid in it.
+    """
+    packages, built = list(config["packages"]), {} if built is None else built
+
+    def parts(*names: str, **nodes: Any) -> list[Any]:
+        return build_once({name: config[name] for name in names} | nodes, packages, TARGETS, built)
+
+    def renderer(requested: Node) -> Noted:
+        """A renderer from its node, with a number for each `auto`, and notes on these."""
+        node, notes = resolved(requested, view, auto)
+        (made,) = parts(renderer=node)
+        if not isinstance(made, Renderer):
+            name = type(made).__name__
+            raise ValueError(
+                f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
+            )
+        return made, notes
+
+    view, auto = parts("view", "auto")
+    made, notes = renderer(config["renderer"])
+    task, dataset, evaluation, prior, models = parts("task", "dataset", "evaluation", "prior", "models")
+    split, index, threads = Split(config["split"]), config["index"], config["threads"]
+    device, cache = pick_device(config["device"]), Path(config["priors_dir"])
+    photographed = dataset if isinstance(dataset, Photographed) else None
+
+    def make_prior() -> Prior:
+        with using_threads(threads or ALL_THREADS):  # training pays with more of them
+            return prior_for(dataset, prior, cache, device, progress)
+
+    inputs = RunInputs(
+        renderer=made,
+        views=view,
+        scene_name=dataset.name if photographed else scene_name(dataset, split, index),
+        make_scene=lambda: make_scene(dataset, view, split=split, index=index),
+        make_prior=make_prior,
+        evaluation=evaluation,
+        seed=config["seed"],
+        device=device,
+        cache=cache,
+        field=FieldChoice(config["field"], models),
+        dataset=dataset,
+        notes=tuple(notes),
+        make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
+        photographed=photographed,
+        trained=index if split == Split.TRAIN and index < prior.shapes else None,
+    )
+    _check(task, inputs, index)
+    return Cell(task, inputs, prior, threads)
+
+
+def _check(task: Task, inputs: RunInputs, index: int) -> None:
+    """Raises ValueError where parts do not fit together."""
+    name = type(task).__name__
+    if not isinstance(task, Task):
+        raise ValueError(f"task {name} lacks execute: see bench/setup/inputs.py")
+    if inputs.photographed is not None and index:
+        raise ValueError(f"photographs show one object, with index=0, not {index}: give another dataset.path")
+    if not inputs.field.of_prior and not isinstance(task, TakesField):
+        raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
+    if isinstance(task, Checks):
+        task.check(inputs)
+
+
+def threads_for(width: int) -> int:
+    """How many threads of the CPU a run takes that names none: one for a narrow network, else all that PyTorch takes.
+
+    A rendering evaluates a narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and
+    4 layers of 128, the loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
+
+    Args:
+        width: neurons per layer.
+    """
+    return 1 if width < WIDE else ALL_THREADS

@@ -14,8 +14,8 @@ from bench.config import CONF, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import combinations
+from bench.setup.inputs import Task
 from bench.tables import GROUPS, choice, names, nearest, read_yaml
-from bench.tasks.task import Task
 from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer

@@ -19,9 +19,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, register
 from bench.records import folder as run_folder
-from bench.run import cell
 from bench.run.check import identified, refusal
 from bench.run.command import _explain, options_first
+from bench.setup import inputs
 from tests.looped import each
 from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, wait_for
 
@@ -41,7 +41,7 @@ def no_prior(monkeypatch):
     def slow(*_):
         raise AssertionError("the slow steps began")
 
-    monkeypatch.setattr(cell, "prior_for", slow)
+    monkeypatch.setattr(inputs, "prior_for", slow)
 
 
 def assert_one_line(err: str, *words: str) -> None:

@@ -7,8 +7,8 @@ import torch
 
 from bench import config as config_module
 from bench.machine.environment import using_threads
-from bench.run.cell import ALL_THREADS, cell_of, threads_for
-from tests.tiny import cell_from, plain, silent
+from bench.setup.inputs import ALL_THREADS, cell_of, threads_for
+from tests.tiny import cell_from, plain
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +59,7 @@ def test_the_threads_that_are_asked_for_are_taken_by_the_run_and_not_by_its_chec
     torch.set_num_threads(1)
     cell = cell_from(compose_config("scale=smoke", "threads=2"))
     assert torch.get_num_threads() == 1
-    cell.start(silent)
+    cell.start()
     assert torch.get_num_threads() == 2
-    cell_from(compose_config("scale=smoke")).start(silent)
+    cell_from(compose_config("scale=smoke")).start()
     assert torch.get_num_threads() == 1

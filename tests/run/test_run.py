@@ -19,8 +19,8 @@ from bench.config import EvaluationSettings
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import Record, RunStatus
 from bench.report.write.html import write_index
-from bench.run import cell as cell_module
 from bench.run import execute
+from bench.setup import inputs as inputs_module
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
 from bench.solve.optimise import History, OptimiserSettings
@@ -29,7 +29,7 @@ from datasets.scene import Scene
 from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome
 from tests.solve.test_optimise import POINTS, Toy
-from tests.tiny import ball_prior, cell_from, silent
+from tests.tiny import ball_prior, cell_from
 
 TINY = (
     "scale=smoke", "task.optimiser.iterations=6", "view.resolution=16", "task.points=20",
@@ -209,7 +209,7 @@ def test_the_same_command_run_again_gives_the_same_numbers_and_sets_the_first_as
 def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, error, status, code):
     meanwhile = []
 
-    def fail(config):
+    def fail(config, progress):
         meanwhile.extend(json.loads(path.read_text()) for path in (tmp_path / "r").glob("runs/*/record.json"))
         raise error
 
@@ -329,14 +329,16 @@ def test_a_run_that_looks_on_the_way_ends_as_one_that_does_not(bench):
 def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(compose_config, monkeypatch):
     """DVR draws points: a prior that is trained first uses up random numbers of its own."""
     prior, drawn = ball_prior(), []
-    monkeypatch.setattr(cell_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
+    monkeypatch.setattr(inputs_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
     for used in (0, 1000):
-        monkeypatch.setattr(cell_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
-        stage = cell_from(compose_config("threads=1", "seed=3")).start(silent)
+        monkeypatch.setattr(inputs_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
+        cell = cell_from(compose_config("threads=1", "seed=3"))
+        cell.start()
+        stage = cell.inputs
         assert stage.prior is stage.prior is prior  # made once
         drawn.append(torch.rand(4).tolist())
     assert drawn[0] == drawn[1]
-    cell_from(compose_config("threads=1", "seed=4")).start(silent)
+    cell_from(compose_config("threads=1", "seed=4")).start()
     assert torch.rand(4).tolist() != drawn[0]
 
 

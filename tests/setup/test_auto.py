@@ -76,7 +76,7 @@ def test_auto_without_an_equation_is_an_error():
 
 def test_a_run_has_the_resolved_number_and_a_note(compose_config):
     config = compose_config("renderer.epsilon=auto", "renderer.steps=auto", "view.resolution=128", "dataset=sphere")
-    inputs = cell_from(config).inputs()
+    inputs = cell_from(config).inputs
     assert inputs.renderer.epsilon == pytest.approx(7e-4)
     assert inputs.notes[0].startswith("renderer.epsilon=auto is 0.0007, for 128 pixels")
 

@@ -22,8 +22,8 @@ def test_it_is_that_of_the_default_configuration_and_knows_unseen_shapes(path, c
     family = path.stem.split("-")[1]
     config = compose_config("+method=single_view", f"dataset={family}", f"results_dir={tmp_path}")
     cell = cell_from(config)
-    recipe = cell.task.recipe(cell.inputs(), plain(config))
-    assert recipe.find(cell.cache) == path
+    recipe = cell.task.recipe(cell.inputs, plain(config))
+    assert recipe.find(cell.inputs.cache) == path
     assert path.stat().st_size < 3_500_000
     model, record = recipe.load(path)
     assert record["status"] == "ok" and record["key"] == recipe.key and record["filled"] > 0.2
