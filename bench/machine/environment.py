@@ -153,42 +153,45 @@ class MemoryPeak:
         return _reset_high_water()
 
 
-class Contention:
-    """Measures, from its creation on, how long this process's threads ran, and how long they were ready but waited.
+def scheduled() -> tuple[int, int] | None:
+    """Nanoseconds that this process's living threads ran, and that they waited; None where that is unknown."""
+    ran = waited = 0
+    try:
+        for task in Path("/proc/self/task").iterdir():
+            with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has just ended
+                numbers = (task / "schedstat").read_text().split()
+                ran, waited = ran + int(numbers[0]), waited + int(numbers[1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return ran, waited
 
-    Linux counts both for each thread; elsewhere the load average is used instead.
+
+def waited_share(before: tuple[int, int] | None) -> float | None:
+    """The time that this process's threads were ready but waited for a processor, over the time they ran or waited.
+
+    It is counted from `before`, an earlier `scheduled`; None if unknown.
     """
+    now = scheduled()
+    if before is None or now is None:
+        return None
+    ran, waited = now[0] - before[0], now[1] - before[1]
+    return waited / (ran + waited) if ran > 0 and waited >= 0 else None  # a thread that ended takes its counts along
 
-    def __init__(self) -> None:
-        self.before = _scheduled()
 
-    def measured(self) -> dict[str, Any]:
-        """`waited_share`: time spent waiting for a processor over time spent running or waiting; None if unknown."""
-        now = _scheduled()
-        if self.before is None or now is None:
-            return {"waited_share": None}
-        ran, waited = now[0] - self.before[0], now[1] - self.before[1]
-        if ran <= 0 or waited < 0:  # threads have ended meanwhile, and their counts with them
-            return {"waited_share": None}
-        return {"waited_share": waited / (ran + waited)}
-
-    @staticmethod
-    def warnings(record: Record) -> list[str]:
-        """Reasons not to trust the record's times, one line each."""
-        lines = []
-        share, load = record.environment.get("waited_share"), record.environment.get("load_at_start")
-        if share is not None and share > WAITED:
-            lines.append(
-                f"loaded machine: threads waited {share:.0%} of their time for a processor; times are too long"
-            )
-        elif share is None and load is not None and load > (os.cpu_count() or 1):
-            lines.append(f"loaded machine: load {load:.1f} at the start; times may be too long")
-        if record.gemm_fraction is not None and record.gemm_fraction > IMPOSSIBLE:
-            lines.append(
-                f"missing synchronisation: {record.gemm_fraction:.1f} times the machine's matrix product rate is more "
-                f"than it can do; the clock did not wait for the device"
-            )
-        return lines
+def doubts(record: Record) -> list[str]:
+    """Reasons not to trust the record's times, one line each."""
+    lines = []
+    share, load = record.environment.get("waited_share"), record.environment.get("load_at_start")
+    if share is not None and share > WAITED:
+        lines.append(f"loaded machine: threads waited {share:.0%} of their time for a processor; times are too long")
+    elif share is None and load is not None and load > (os.cpu_count() or 1):
+        lines.append(f"loaded machine: load {load:.1f} at the start; times may be too long")
+    if record.gemm_fraction is not None and record.gemm_fraction > IMPOSSIBLE:
+        lines.append(
+            f"missing synchronisation: {record.gemm_fraction:.1f} times the machine's matrix product rate is more "
+            f"than it can do; the clock did not wait for the device"
+        )
+    return lines
 
 
 def _give_back_free_memory() -> None:
@@ -230,16 +233,3 @@ def _git(*arguments: str) -> str:
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
-
-
-def _scheduled() -> tuple[int, int] | None:
-    """Nanoseconds that this process's living threads ran, and that they waited."""
-    ran = waited = 0
-    try:
-        for task in Path("/proc/self/task").iterdir():
-            with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has just ended
-                numbers = (task / "schedstat").read_text().split()
-                ran, waited = ran + int(numbers[0]), waited + int(numbers[1])
-    except (OSError, ValueError, IndexError):
-        return None
-    return ran, waited

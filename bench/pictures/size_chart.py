@@ -42,44 +42,36 @@ class CandidateResult:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The results of all candidates of a run, in the order of their fits."""
+    """The results of all candidates of a run, in the order of their fits.
+
+    Args:
+        results: of all of them.
+        chosen: the recommended one; None where there is none.
+        best: the one with the least error; likewise.
+        measure: the measure of size by which the choice is made.
+        footprint: half a pixel, in scene units; None where it is not known.
+    """
 
     results: list[CandidateResult]
-    metrics: dict[str, Any]
+    chosen: CandidateResult | None
+    best: CandidateResult | None
+    measure: str
+    footprint: float | None
 
     @staticmethod
     def of(metrics: dict[str, Any]) -> "Candidates":
         """The candidates of a record's metrics."""
         fits = [name.removesuffix(".stored") for name in metrics if name.endswith(".stored")]
         names = [name for name in fits if name not in ("auto", "frugal")]  # further fits of candidates
-        numbers = {
-            name: {k[len(name) + 1 :]: v for k, v in metrics.items() if k.startswith(f"{name}.")} for name in names
+        found = {
+            name: CandidateResult(
+                name, {key.removeprefix(f"{name}."): x for key, x in metrics.items() if key.startswith(f"{name}.")}
+            )
+            for name in names
         }
-        return Candidates([CandidateResult(name, numbers[name]) for name in names], metrics)
-
-    @property
-    def measure(self) -> str:
-        """The measure of size by which the choice is made."""
-        return self.metrics.get("recommended_by", "stored")
-
-    @property
-    def footprint(self) -> float:
-        """Half a pixel, in scene units."""
-        return self.metrics["footprint"]
-
-    def result(self, name: str) -> CandidateResult | None:
-        """The result of the candidate of that name; None where there is none."""
-        return next((result for result in self.results if result.name == name), None)
-
-    @property
-    def chosen(self) -> CandidateResult | None:
-        """The recommended candidate."""
-        return self.result(self.metrics.get("recommended_field", ""))
-
-    @property
-    def best(self) -> CandidateResult | None:
-        """The candidate with the least error."""
-        return self.result(self.metrics.get("best_field", ""))
+        chosen, best = (found.get(metrics.get(f"{which}_field", "")) for which in ("recommended", "best"))
+        measure, footprint = metrics.get("recommended_by", "stored"), metrics.get("footprint")
+        return Candidates(list(found.values()), chosen, best, measure, footprint)
 
 
 def panels(axes: np.ndarray, candidates: Candidates) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 import torch
 
 from bench.machine import environment
-from bench.machine.environment import Contention
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
@@ -63,7 +62,7 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     """
     folder, record = job.folder, job.record
     log = _open_log(folder)
-    contention = Contention()
+    before = environment.scheduled()
     try:
         cell = _built(record, progress)
         cell.start()
@@ -88,8 +87,8 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         record.reason = reason_of(error, folder)
         log.error(traceback.format_exc())
     finally:
-        record.environment |= contention.measured()
-        record.notes += contention.warnings(record)
+        record.environment["waited_share"] = environment.waited_share(before)
+        record.notes += environment.doubts(record)
         log.info("%s %s", record.status, record.reason)
         _close_log(log)
 

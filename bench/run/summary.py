@@ -85,7 +85,7 @@ def _candidates(record: Record) -> Table:
     from bench.pictures.size_chart import Candidates  # only here: it loads matplotlib, which most commands do not need
 
     candidates = Candidates.of(record.metrics)
-    half_pixel = number(1000 * candidates.footprint)
+    half_pixel = number(candidates.footprint, 1000)
     title = f"{record.title}; errors x1000, half a pixel is {half_pixel}"
     table = Table(box=box.SIMPLE_HEAD, title=escape(title))
     for heading in ("", "field", "stored", "free", "FLOPs", "error", "s.e.", "fit"):  # at most 80 columns wide

@@ -8,11 +8,10 @@ import time
 import pytest
 
 from bench.machine import environment
-from bench.machine.environment import Contention
 from bench.records.record import Record
 from tests.looped import each
 
-HAS_COUNTS = environment._scheduled() is not None
+HAS_COUNTS = environment.scheduled() is not None
 
 
 def record(**changed) -> Record:
@@ -36,7 +35,7 @@ def record(**changed) -> Record:
     ],
 )
 def test_it_warns_where_there_is_a_reason(changed, words):
-    lines = Contention.warnings(record(**changed))
+    lines = environment.doubts(record(**changed))
     assert [line.startswith(word) for line, word in zip(lines, words, strict=True)] == [True] * len(words)
 
 
@@ -47,8 +46,8 @@ def test_a_busy_machine_is_seen():
     os.sched_setaffinity(0, core)
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]  # on the same core
     try:
-        measured, latest = Contention(), time.monotonic() + 120
-        while not (share := measured.measured()["waited_share"] or 0.0) > 0.3 and time.monotonic() < latest:
+        started, latest = environment.scheduled(), time.monotonic() + 120
+        while not (share := environment.waited_share(started) or 0.0) > 0.3 and time.monotonic() < latest:
             sum(range(10**6))
         assert 0.3 < share < 1
     finally:
@@ -59,7 +58,6 @@ def test_a_busy_machine_is_seen():
 
 
 def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
-    monkeypatch.setattr(environment, "_scheduled", lambda: (1000, 10))
-    measured = Contention()
-    monkeypatch.setattr(environment, "_scheduled", lambda: (500, 20))
-    assert measured.measured() == {"waited_share": None}
+    monkeypatch.setattr(environment, "scheduled", lambda: (500, 20))
+    assert environment.waited_share((1000, 10)) is None
+    assert environment.waited_share((400, 15)) == 5 / 105

@@ -19,9 +19,11 @@ from bench.report.data.statistics import Interval
 from bench.report.write import caption
 from bench.report.write.table import Column, to_data, to_table
 
-# Special characters of LaTeX, and characters that its standard fonts lack.
+# Special characters of LaTeX, and characters that its standard fonts lack; a row that starts with a bracket would be
+# read as the argument of the line break before it.
 _LATEX = {
     "\\": r"\textbackslash{}",
+    "[": "{[}",
     **{character: "\\" + character for character in "&%$#_{}"},
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
@@ -209,26 +211,21 @@ def markdown(shown: Shown, name: str) -> str:
 
 
 def latex(shown: Shown, name: str) -> str:
-    """A LaTeX table environment with the notes below the table; it needs only the package booktabs."""
+    """A LaTeX table environment, without the notes, no wider than the text; it needs booktabs and graphicx."""
+    aligned = "".join("l" if of_words else "r" for of_words in _of_words(shown))
+    head, *rows = (rf"{' & '.join(map(_tex, row))} \\" for row in (shown.columns, *shown.rows))
     lines = [
         r"\begin{table*}",
         r"\centering",
         rf"\caption{{{_tex(shown.title)} {_tex(shown.caption)}}}",
         rf"\label{{tab:{name}}}",
-        r"\scriptsize",
-        r"\setlength{\tabcolsep}{2pt}",
-        rf"\begin{{tabular}}{{@{{}}{''.join('l' if of_words else 'r' for of_words in _of_words(shown))}@{{}}}}",
-        r"\toprule",
-        *_latex_rows(list(zip(*map(_two_lines, shown.columns), strict=True))),
-        r"\midrule",
-        *_latex_rows(shown.rows),
-        r"\bottomrule",
-        r"\end{tabular}",
+        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{{aligned}}}",
+        *(r"\toprule", head, r"\midrule", *rows, r"\bottomrule"),
+        r"\end{tabular}}",
+        r"\end{table*}",
     ]
-    if shown.notes:
-        lines += [r"\par\smallskip", r"\begin{flushleft}"]
-        lines += [rf"{_tex(note)}\par" for note in shown.notes] + [r"\end{flushleft}"]
-    return "\n".join([*lines, r"\end{table*}"]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def _of_words(shown: Shown) -> list[bool]:
@@ -237,22 +234,6 @@ def _of_words(shown: Shown) -> list[bool]:
     return [
         place == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
         for place, text in enumerate(texts)
-    ]
-
-
-def _two_lines(heading: str) -> tuple[str, str]:
-    """A heading in two lines: a long one is split at the space closest to its middle, a short one is the second."""
-    spaces = [place for place, character in enumerate(heading) if character == " "]
-    if len(heading) < 9 or not spaces:
-        return "", heading
-    middle = min(spaces, key=lambda place: abs(place - len(heading) / 2))
-    return heading[:middle], heading[middle + 1 :]
-
-
-def _latex_rows(rows) -> list[str]:
-    # A bracket that starts a row would be read as the argument of the line break before it.
-    return [
-        " & ".join("{" + t + "}" if (t := _tex(cell)).startswith("[") else t for cell in row) + r" \\" for row in rows
     ]
 
 
