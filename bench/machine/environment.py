@@ -195,7 +195,6 @@ def doubts(record: Record) -> list[str]:
 
 
 def _give_back_free_memory() -> None:
-    """Returns freed memory to the system, so that later allocations raise the resident set."""
     with suppress(OSError, AttributeError):  # glibc only
         ctypes.CDLL(None).malloc_trim(0)
 

@@ -108,7 +108,6 @@ class Filmstrip:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
     def _truth(self) -> Shown:
-        """What frames are compared with, at their size."""
         if self.true is None:
             return Shown(see(Truth(self.inputs.scene.mesh), self._fine(self.inputs.scene.view.camera)))
         return self.true.enlarged(self._fine(self.true.view.camera))
@@ -159,7 +158,6 @@ def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
 
 
 def _animate(path: Path, frames: list[Shown], truth: Shown) -> None:
-    """Writes an animation: the cells of each frame side by side."""
     pictures = [np.concatenate(list(frame.cells(truth).values()), axis=1) for frame in frames]
     images = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in pictures]
     lasting = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_SECONDS)]

@@ -56,13 +56,19 @@ def digest(data: Any) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file atomically: under a temporary name in the same folder, flushed to the disk, then renamed."""
+    """Writes a file atomically, flushed to the disk."""
+    write_bytes(path, text.encode("utf-8"), flushed=True)
+
+
+def write_bytes(path: Path, content: bytes, *, flushed: bool = False) -> None:
+    """Writes a file atomically: under a temporary name in the same folder, then renamed; a link is replaced."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with scratch.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        with scratch.open("wb") as file:
+            file.write(content)
+            if flushed:
+                file.flush()
+                os.fsync(file.fileno())
         scratch.replace(path)
     except BaseException:
         scratch.unlink(missing_ok=True)

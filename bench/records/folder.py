@@ -237,7 +237,6 @@ def _content(path: Path) -> str:
 
 
 def _values(node: Any, name: str) -> list[str]:
-    """All strings under a key of that name, at any depth."""
     if not isinstance(node, dict):
         return []
     found = [node[name]] if isinstance(node.get(name), str) else []

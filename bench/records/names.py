@@ -91,7 +91,6 @@ def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[s
 def _parts(
     records: Sequence[dict[str, Any]], asked: Sequence[dict[str, str]]
 ) -> Iterator[tuple[str, list[str | None]]]:
-    """Keys with the value of each run as text, None where it has none, in the order in which they make names."""
     yield "row", [renderer_name(record["config"], record["renderer"]) for record in records]
     yield "silhouette", [(record["config"].get("silhouette") or {}).get("_label_") for record in records]
     for key in CHOICES:

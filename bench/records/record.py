@@ -185,13 +185,11 @@ def _check(record: dict[str, Any]) -> None:
 
 @cache
 def _fields() -> dict[str, tuple[type, ...]]:
-    """The classes that each field allows."""
     hints = get_type_hints(Record)
     return {item.name: _classes(hints[item.name]) for item in fields(Record)}
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """The classes that a type hint of a field allows."""
     if isinstance(hint, UnionType):
         return tuple(cls for part in get_args(hint) for cls in _classes(part))
     return (get_origin(hint) or hint,)

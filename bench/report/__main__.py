@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from bench.records.read import RESULTS, read_records
-from bench.report.data.frame import write_frame
+from bench.report.data.frame import to_frame
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, write_index
 from bench.report.write.paper import write_paper, write_readme
@@ -37,7 +37,8 @@ def _report(given: dict[str, str]) -> int:
     if ship := given.get("ship"):
         print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
         return 0
-    table = write_frame(records, results_dir)
+    table = results_dir / "runs.csv"
+    to_frame(records).to_csv(table, index=False)
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
     for path in (table, *papers, *write_sweeps(records, results_dir)):

@@ -58,8 +58,7 @@ def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
     """The gap between two rows on the same shapes, by the geometric means of their errors; None without a shape."""
     if not len(first):
         return None
-    better = statistics.lower(*map(statistics.shape_medians, (first, second)))
-    return Gap(geometric_ratio(first, second), better, len(first))
+    return Gap(geometric_ratio(first, second), statistics.better(first, second), len(first))
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,6 @@ def draw_runs(runs: Runs, panels: Mapping[str, pd.Series], *, log: bool = True) 
 
 
 def _points(axis: Axes, place: int, preset: str, values: np.ndarray) -> None:
-    """Draws the values of a row, one above the other."""
     where, known = _spread(place, len(values)), np.isfinite(values)
     chart.points(axis, preset, values[known], where[known], ms=3.5, alpha=0.8)
     lost = where[~known]

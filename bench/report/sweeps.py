@@ -164,7 +164,6 @@ def table_of(sweep: Sweep) -> Result:
 
 
 def _columns(names: list[str], headings: dict[str, Metric], *, several: bool) -> list[Column]:
-    """The columns: readers see the metrics with headings, and the ratio where there are several rows."""
     first = next(iter(headings.values()), Metric("")).label.split(" (")[0]
     ratio = Metric(f"{first} over the first row's" if several else "")
     return [
@@ -194,7 +193,6 @@ def _ends(key: str, of: str) -> list[Column]:
 
 
 def _listed(sweep: Sweep) -> str:
-    """The keys that were swept over, with their values or the number of these."""
     told = [
         f"{key} ({', '.join(values) if len(values) <= MOST_VALUES else f'{len(values)} values'})"
         for key, values in sweep.swept.items()
@@ -215,7 +213,6 @@ def _apart(record: Record) -> RunKey:
 
 
 def _studied() -> set[str]:
-    """The names of the experiments that studies read."""
     return {selection.experiment for study in studies() for selection in study.reads}
 
 

@@ -164,7 +164,6 @@ def _cell(record: Record, keys: list[RunKey]) -> dict[str, Any]:
 
 
 def _tuning(own: pd.DataFrame, records: list[Record], keys: list[RunKey]) -> Tuning:
-    """The draws of one method, of which `records` are all runs that ended."""
     first = own[own.split == VALIDATION].groupby("draw").record.first()
     method, config = own.method.iloc[0].removeprefix(SPACE), first.iloc[0]["config"]
     logs = {split: part.pivot(index="draw", columns="run", values="error") for split, part in own.groupby("split")}

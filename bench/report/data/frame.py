@@ -71,13 +71,6 @@ def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame({name: _series(values, _type(name, values)) for name, values in columns.items()})
 
 
-def write_frame(records: Iterable[dict[str, Any]], results_dir: Path) -> Path:
-    """Writes `runs.csv` of a results folder, and gives its path."""
-    table = results_dir / "runs.csv"
-    to_frame(records).to_csv(table, index=False)
-    return table
-
-
 def _row(record: dict[str, Any]) -> dict[str, Any]:
     """The values of a run by column; a metric that has the name of another column gets `metric_` in front."""
     row = {name: record.get(name) for name in COLUMNS}

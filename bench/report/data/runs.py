@@ -126,7 +126,6 @@ class Runs:
         ]
 
     def _conditions(self, record: Record) -> list[tuple[str, Any]]:
-        """The condition of a run, by the names of the settings."""
         found = {
             key.rpartition(".")[2]: setting(record["config"], *key.split(".")) for key in self.selection.conditions
         }
@@ -222,7 +221,6 @@ def renderer_settings(record: Record) -> dict[str, str]:
 
 
 def _part(record: Record, key: str, selection: Selection) -> Any:
-    """A part of a run's configuration without the selection's conditions."""
     found = setting(record["config"], *key.split("."))
     if not isinstance(found, dict):
         return found

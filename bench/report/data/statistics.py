@@ -85,14 +85,9 @@ def geometric_mean(values: Values) -> float | np.ndarray:
     return stats.gmean(_checked(values), axis=-1)
 
 
-def shape_medians(groups: Groups) -> np.ndarray:
-    """The median of each shape's runs."""
-    return np.array([median(flat([group])) for group in groups])
-
-
-def lower(first: Values, second: Values) -> float:
-    """How many of the first's values are lower than the second's at the same place; equal ones are half."""
-    a, b = _checked(first), _checked(second)
+def better(first: Groups, second: Groups) -> float:
+    """On how many shapes the median of the first's runs is lower than that of the second's; equal ones are half."""
+    a, b = (np.array([median(flat([group])) for group in groups]) for groups in (first, second))
     return float(((a < b) + 0.5 * (a == b)).sum())
 
 

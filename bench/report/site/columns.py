@@ -124,7 +124,6 @@ TEXTS = {
 
 
 def _metrics(records: list[Record]) -> dict[str, Any]:
-    """The metrics that some run has: before and after, in scene units, with their names and factors."""
     found = {}
     for key, metric in METRICS.items():
         after, before = (

@@ -73,7 +73,6 @@ def curve(folder: Folder) -> dict[str, Any] | None:
 
 
 def _kept(lines: list[dict[str, Any]]) -> list[int]:
-    """The places of the lines that a thinned curve keeps."""
     step = max(1, -(-len(lines) // MOST_POINTS))
     every = {0, len(lines) - 1, *range(0, len(lines), step)}
     checkpoints = [place for place, line in enumerate(lines) if number(line.get("chamfer_l2")) is not None]
@@ -82,7 +81,6 @@ def _kept(lines: list[dict[str, Any]]) -> list[int]:
 
 
 def _metrics(record: Record) -> list[list[Any]]:
-    """Name, before, after and definition of each metric."""
     names = dict.fromkeys([*record["metrics"], *record["metrics_start"]])
     return [
         [
@@ -101,7 +99,6 @@ def _value(value: Any) -> int | float | str | None:
 
 
 def _costs(record: Record) -> dict[str, Any]:
-    """Seconds by phase, evaluations, operations and memory."""
     seconds, evaluations = record["seconds"], record["evaluations"]
     total = number(seconds.get("total"))
     phases = [[label, number(seconds.get(key)), key in ("forward", "backward")] for key, label in PHASES.items()]

@@ -3,7 +3,7 @@
 import json
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from bench.records import metrics
 from bench.records.read import RESULTS
@@ -96,12 +96,12 @@ def asked(record: Record) -> str:
     config = record["config"]
     said = TASKS.get(record["task"], f"task={record['task']}")
     resolution, points = setting(config, "view", "resolution"), setting(config, "task", "points")
-    iterations, scale = _known(iterations_of, record), setting(config, "scale", "name")
+    iterations, scale = iterations_of(record), setting(config, "scale", "name")
     parts = [
         f"{record.get('scene') or record['dataset']}",
         f"{points} depth points" if points is not None else "",
         f"{resolution} × {resolution} pixels" if isinstance(resolution, int) else "",
-        f"{iterations} iterations" if iterations is not None else "",
+        f"{iterations} iterations" if isinstance(iterations, int) else "",
         f"seed {record['seed']}" if record["seed"] is not None else "",
         f"scale={scale}" if scale else "",
     ]
@@ -141,10 +141,4 @@ def _quoted(text: str) -> str:
 
 
 def _overrides(record: Record) -> list[str]:
-    """What the command line set, or what a sweep has planned."""
     return [text for text in map(str, record.get("overrides") or []) if text.partition("=")[0] not in LEFT_OUT]
-
-
-def _known(of: Any, record: Record) -> Any:
-    value = of(record)
-    return value if isinstance(value, int) else None

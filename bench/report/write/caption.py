@@ -75,14 +75,12 @@ def warnings(runs: Runs) -> list[str]:
 
 
 def _sample(runs: Runs) -> str:
-    """The numbers of runs, shapes, views where these are several, and seeds."""
     shapes, views, seeds = _levels(runs)
     parts = [plural(shapes, "shape"), *([plural(views, "view")] if views > 1 else []), plural(seeds, "seed")]
     return f"{plural(len(runs.records), 'run')} ({', '.join(parts)})"
 
 
 def _levels(runs: Runs) -> tuple[int, int, int]:
-    """The numbers of shapes, of views of a shape, and of seeds."""
     records = runs.records
     shapes = {(solid(record), record["config"].get("split")) for record in records}
     return len(shapes), *(len({part(record) for record in records}) for part in (view, itemgetter("seed")))
@@ -110,7 +108,6 @@ def _setup(runs: Runs) -> str:
 
 
 def _outcome(runs: Runs) -> str:
-    """The number of runs that did not end ok: each with its reason or, where they are many, counted by status."""
     failed = [record for record in runs.named() if record["status"] != "ok"]
     total = len(runs.records)
     if not failed:
@@ -125,19 +122,16 @@ def _outcome(runs: Runs) -> str:
 
 
 def _omitted(runs: Runs) -> str:
-    """The number of runs of this experiment that are not shown, and the reason; empty where all are shown."""
     reason = "of this experiment at another scale or on another scene, or replaced by newer ones"
     return f"Not shown: {plural(runs.left_out, 'run')} {reason}." if runs.left_out else ""
 
 
 def _mixed(runs: Runs) -> str:
-    """A warning where runs differ in settings that rows should share; empty where they do not."""
     found = runs.mixed()
     return f"Runs differ in {_listed(found)}: rows with other values do not compare." if found else ""
 
 
 def _compared(runs: Runs) -> str:
-    """A warning where the rows' times were measured on different machines or with different numbers of threads."""
     machines = runs.machines()
     if len(machines) < 2:
         return ""

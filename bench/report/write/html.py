@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import file_lock, plain, write_text
+from bench.records.files import file_lock, plain, write_bytes, write_text
 from bench.records.read import check_results, read_records
 from bench.report.site.columns import columns
 from bench.report.site.detail import detail
@@ -68,7 +68,6 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
 
 
 def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> None:
-    """Writes the scripts of a kind by their keys, and removes those of what is gone."""
     keys = []
     for key, content in contents:
         write_script(data, kind, key, content)
@@ -87,7 +86,6 @@ def _write_meshes(folders: list[Folder], data: Path, most: int | None) -> None:
 
 
 def _mesh(source: Path) -> dict[str, Any]:
-    """The mesh as the page takes it, or why it cannot be shown."""
     from bench.report.site.meshes import mesh_data  # only here: runs without meshes need no trimesh
 
     try:
@@ -163,13 +161,7 @@ def write_script(data: Path, kind: str, key: str, content: Any) -> None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Writes a file, unless it has that content already."""
-    try:
-        if not path.is_symlink() and path.read_bytes() == content:  # what a link leads to may change
-            return
-    except OSError:
-        pass
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_bytes(content)
-    scratch.replace(path)
+    """Writes a file, unless it has that content already; what a link leads to may change."""
+    if path.is_symlink() or not path.is_file() or path.read_bytes() != content:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, content)
