@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import style
@@ -19,7 +18,6 @@ from bench.report.data.records import RunKey, by_shape
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
 from bench.report.write import chart
-from bench.report.write.chart import panel_data, series
 from bench.report.write.result import Result
 from bench.report.write.table import Column, estimate, text
 
@@ -261,10 +259,11 @@ class Compared:
         Args:
             title: as a sentence.
             question: that its verdict answers.
-            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
-                heading of the ratios.
+            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; `ratio`, the
+                heading of the ratios; and `filled`, see `front`.
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
+        panels = self.front(changed.pop("filled", None))
         whole = [(line["row"], line["ratio"]) for line in self.pooled if not line["lacking"]]
         sure = excluding_one(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
@@ -278,8 +277,8 @@ class Compared:
             "lines": self.lines,
         } | changed
         if "figure" not in parts:
-            parts["figure"] = self.draw_front()
-        return Result(self.runs, title, question=question, chart=self.chart(), **parts)
+            parts["figure"] = chart.draw(panels, 3.2, sharey=True, legend=3)
+        return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
     def shapes(self) -> str:
         """The number of shapes per cell, as a note."""
@@ -302,72 +301,47 @@ class Compared:
         quickest = f"the quickest row has {other} {told[1]}; n = {format.plural(n, 'shape')}."
         return f"The least geometric mean of {least_of} is *{least}* {told[0]}; {quickest}"
 
-    @style.styled
-    def draw_front(self, filled: Callable[[str], bool] | None = None) -> Figure:
-        """Draws the mean error of each row over each cost, over all families.
+    def front(self, filled: Callable[[str], bool] | None = None) -> list[chart.Panel]:
+        """Panels of the mean error of each row over each cost, over all families.
 
         Args:
             filled: whether the points of a preset are filled; by default those are that no row beats at less cost.
         """
-        figure, (axes,) = chart.sheet(3.2, 1, len(COSTS), sharey=True)
-        for axis, (cost, label) in zip(axes, COSTS.items(), strict=True):
-            known = [line for line in self.pooled if line[cost] is not None]
-            rows, errors = [(line["preset"], line["row"]) for line in known], [line["error"] for line in known]
-            on = [filled(line["preset"]) if filled else line[f"front_{cost}"] for line in known]
-            chart.front(axis, rows, [line[cost] for line in known], errors, on)
-            style.log_axis(axis, "x", [line[cost] for line in known])
-            axis.set_xlabel(label)
-        axes[0].set_ylabel(self.label)
-        style.log_axis(axes[0], "y", [v for line in self.pooled for v in (line["error"].low, line["error"].value)])
-        style.legend_below(figure, axes[0], columns=3)
-        return figure
+        panels = []
+        for cost, label in COSTS.items():
+            points = [
+                chart.series(
+                    *(line["row"], line["preset"], [line[cost]], [line["error"]]),
+                    **{"size": 9, "hollow": not (filled(line["preset"]) if filled else line[f"front_{cost}"])},
+                )
+                for line in self.pooled
+                if line[cost] is not None
+            ]
+            panels.append(chart.panel_data("", label, self.label, points))
+        return panels
 
-    @style.styled
     def draw_conditions(self, rows: Sequence[tuple[str, str]], marks: dict[str, float], mark: str = "") -> Figure:
         """Draws a panel per family: the median of each of the rows over the conditions.
 
         Args:
+            rows: to draw.
             marks: a value of each family, drawn as a line; none for others.
             mark: what that value is.
         """
-        columns = min(len(self.families), 4)
-        lines = -(-len(self.families) // columns)
-        figure, axes = chart.sheet(2.4 * lines + 0.7, lines, columns, sharey=True)
-        for axis, name in zip(axes.flat, self.families, strict=False):
-            self._conditions(axis, name, rows)
-            if name in marks:
-                chart.reference(axis.axhline, marks[name], 1.5, mark)
-        for axis in axes.flat[len(self.families) :]:
-            axis.axis("off")
-        for axis in axes[:, 0]:
-            axis.set_ylabel(self.label)
-        style.log_axis(axes[0, 0], "y", self.cells.error)
-        style.legend_below(figure, *axes.flat)
-        return figure
-
-    def _conditions(self, axis: Axes, family: str, rows: Sequence[tuple[str, str]]) -> None:
-        for row in rows:
-            medians = [self.median(family, row, at) for at in self.conditions]
-            if any(value is not None for value in medians):
-                chart.line(axis, row[0], range(len(medians)), style.finite(medians), label=row[1])
-        axis.set_xticks(range(len(self.conditions)), self.conditions)
-        axis.set_title(family)
-
-    def chart(self) -> dict[str, Any]:
-        """The error over each cost for the page."""
-        known = [line for line in self.pooled if math.isfinite(line["error"].value)]
-        panels = []
-        for cost, label in COSTS.items():
-            points = [
-                series(
-                    *(line["row"], line["preset"], [line[cost]], [line["error"].value]),
-                    **{"low": [line["error"].low], "high": [line["error"].high], "size": 9},
-                )
-                for line in known
-                if line[cost] is not None
+        places, panels = range(len(self.conditions)), []
+        for name in self.families:
+            found = {row: [self.median(name, row, at) for at in self.conditions] for row in rows}
+            lines = [
+                chart.curve(row, preset, places, style.finite(medians))
+                for (preset, row), medians in found.items()
+                if any(median is not None for median in medians)
             ]
-            panels.append(panel_data("error over cost", label, self.label.partition(" (")[0], points))
-        return {"panels": panels}
+            if name in marks:
+                lines.append(chart.level(mark, places, marks[name]))
+                lines.append(chart.level("1.5 times that", places, 1.5 * marks[name], dash=":"))
+            panels.append(chart.panel_data(name, "", self.label, lines, self.conditions))
+        height = -(-len(panels) // 4)
+        return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 
 
 def excluding_one(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from bench.pictures import style
 from bench.report.data.records import ONE_WAY, SCALE, Record, by_shape, error, family, grouped, row_of, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.write import chart
@@ -64,7 +63,6 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric:
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
 
 
-@style.styled
 def draw(
     lines: Sequence[dict[str, Any]],
     conditions: Sequence[Condition],
@@ -76,21 +74,11 @@ def draw(
 
     `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
     """
-    of_family = grouped(lines, lambda line: line["family"])
-    figure, axes = chart.sheet(2.1 * len(of_family) + 0.5, len(of_family), len(conditions), sharey="row")
-    for panels, (name, own) in zip(axes, of_family.items(), strict=True):
-        ends = [end for line in own for end in (line["error"].value, line["error"].high, *line["error"].points)]
-        known = style.finite(ends)
-        edge = 2 * np.nanmax([*known, 0.5]) if np.isfinite(known).any() else 2.0
-        for place, (axis, one) in enumerate(zip(panels, conditions, strict=True)):
-            of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["preset"], line["method"]))
-            for (preset, row), found in of_row.items():
-                errors = [line["error"].below(edge) for line in found]
-                chart.estimates(axis, preset, [line["at"] for line in found], errors, label=row)
-            if success is not None:
-                axis.axhline(success, color="#777777", lw=0.9, label="success: below")
-            axis.set(xlabel=one.label, title=name)
-        style.log_axis(panels[0], "y", known)
-        panels[0].set_ylabel(label)
-    style.legend_below(figure, *axes.flat, columns=3)
-    return figure
+    of_family, panels = grouped(lines, lambda line: line["family"]), []
+    for (name, own), (place, one) in product(of_family.items(), enumerate(conditions)):
+        of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["method"], line["preset"]))
+        drawn = [chart.curve(*row, [x["at"] for x in of], [x["error"] for x in of]) for row, of in of_row.items()]
+        if success is not None:
+            drawn.append(chart.level("success: below", [x["at"] for x in own if x["place"] == place], success))
+        panels.append(chart.panel_data(name, one.label, label, drawn))
+    return chart.draw(panels, 2.1 * len(of_family) + 0.5, len(of_family), legend=3, sharey="row")

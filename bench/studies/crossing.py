@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, compare, format, records, style, table
+from bench.report.study import Result, Runs, Selection, chart, compare, format, records, table
 
 PLACE = 32
 READS = (Selection("crossing", ("task.points",)),)
@@ -99,25 +98,19 @@ def make(runs: Runs) -> Result:
     )
 
 
-@style.styled
 def draw(settings: Crossed) -> Figure:
     """Draws a panel per family: the geometric mean of each renderer's errors by loss."""
-    found, losses, renderers = settings.found, settings.losses, settings.renderers
-    figure, (axes,) = chart.sheet(2.8, 1, len(found.families), sharey=True)
-    for axis, family in zip(axes, found.families, strict=True):
+    losses, renderers, panels = settings.losses, settings.renderers, []
+    for family in settings.found.families:
+        drawn = []
         for place, renderer in enumerate(renderers):
             at = {x: row for x, loss in enumerate(losses) if (row := settings.rows.get((renderer, loss)))}
-            x = np.array([*at]) + 0.8 * ((place + 0.5) / len(renderers) - 0.5)
-            errors = [found.error(family, row) for row in at.values()]
-            chart.estimates(axis, renderer, x, errors, bars=True, ls="none", label=settings.labels[renderer])
-        axis.set_xticks(range(len(losses)), [settings.labels[loss].removesuffix(" mask loss") for loss in losses])
-        axis.set(title=family, xlabel="loss of the mask")
-        axis.grid(False, axis="x")
-    axes[0].set_ylabel(compare.LABEL)
-    means = [line["error"] for line in found.lines]
-    style.log_axis(axes[0], "y", [end for mean in means for end in (mean.value, mean.low, *mean.points)])
-    style.legend_below(figure, axes[0])
-    return figure
+            beside = [x + 0.8 * ((place + 0.5) / len(renderers) - 0.5) for x in at]
+            errors = [settings.found.error(family, row) for row in at.values()]
+            drawn.append(chart.series(settings.labels[renderer], renderer, beside, errors))
+        names = [settings.labels[loss].removesuffix(" mask loss") for loss in losses]
+        panels.append(chart.panel_data(family, "loss of the mask", compare.LABEL, drawn, names))
+    return chart.draw(panels, 2.8, sharey=True)
 
 
 def make_gaps(runs: Runs) -> Result:

@@ -1,6 +1,7 @@
 """Fig. 5 of DIST: loss and Chamfer distance over iterations and time, and their rank correlation."""
 
 import math
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from bench.report.study import Result, Runs, Selection, chart, curves, format, s
 PLACE = 220
 READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
 QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", SCALE)}
+ALONG = {"iteration": "iteration", "seconds": "time (seconds)"}
 COLUMNS = (
     *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.whole)),
     *(
@@ -98,22 +100,16 @@ def _loss(runs: Runs) -> str:
     return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else own}."
 
 
-@style.styled
 def draw(medians: dict[Row, Medians]) -> Figure:
     """Draws loss above and Chamfer below, over iterations and seconds, a line per row."""
-    figure, axes = chart.sheet(4.6, 2, 2, sharey="row")
-    for line, (name, (label, scale)) in zip(axes, QUANTITIES.items(), strict=True):
-        for axis, along in zip(line, ("iteration", "seconds"), strict=True):
-            for row, own in medians.items():
-                shown, every = own[name], max(len(own[name]) // 6, 1)
-                y = [scale * value for value in style.finite(shown["median"])]
-                chart.line(axis, row.preset, style.finite(shown[along]), y, markevery=every, ms=3.5, label=row.name)
-            axis.set(xlabel="time (seconds)" if along == "seconds" else "iteration", ylabel=label)
-            style.log_axis(axis, "y", pd.concat([scale * own[name]["median"] for own in medians.values()]))
-        if style.needs_log(own[name]["seconds"].max() for own in medians.values()):
-            style.log_axis(line[1], "x", pd.concat([own[name]["seconds"] for own in medians.values()]))
-    style.legend_below(figure, axes[0, 0])
-    return figure
+    panels = []
+    for (name, (label, scale)), (along, words) in product(QUANTITIES.items(), ALONG.items()):
+        lines = [
+            chart.curve(row.name, row.preset, style.finite(own[name][along]), style.finite(scale * own[name]["median"]))
+            for row, own in medians.items()
+        ]
+        panels.append(chart.panel_data("", words, label, lines))
+    return chart.draw(panels, 4.6, 2)
 
 
 def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:

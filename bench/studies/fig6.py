@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, table
 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
@@ -18,7 +17,7 @@ NOTES = (
     "The initial camera is also shifted by {shift:g}; all methods have the same views and starts.",
     "An interval counts the views of one shape as one trial; a run that did not end ok is a failure.",
     "Times include the trials of all starts; iterative closest points run every start to its end.",
-    "Times and evaluations are those of the loop, over runs that ended ok; markers of one angle stand side by side.",
+    "Times and evaluations are those of the loop, over runs that ended ok.",
 )
 RUNS = (
     *(
@@ -56,7 +55,7 @@ def make(runs: Runs) -> Result:
         columns=columns,
         lines=[_line(row, own) for (row, _), own in rows.items()],
         run_columns=RUNS,
-        figure=draw(rows, angles),
+        figure=draw(rows),
     )
 
 
@@ -96,17 +95,13 @@ def _verdict(far: pd.DataFrame, angle: float) -> str:
     return f"From {angle:g} degrees {most} finds *{said[most]}* cameras, {least} {said[least]}; n = {shapes}."
 
 
-@style.styled
-def draw(rows: dict[tuple[str, str], pd.DataFrame], angles: list[float]) -> Figure:
+def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:
     """Draws success over the initial angle."""
-    figure, ((axis,),) = chart.sheet(2.8)
-    for place, ((row, preset), found) in enumerate(rows.items()):
+    lines = []
+    for (row, preset), found in rows.items():
         rates = {angle: _rate(own).times(100) for angle, own in found.groupby("degrees")}
-        beside = np.array(list(rates)) + 0.5 * (place - len(rows) / 2)  # so that bars do not overlap
-        chart.estimates(axis, preset, beside, list(rates.values()), bars=True, label=row)
-    axis.set(xlabel="initial error in rotation (degrees)", ylabel="poses found (%)", ylim=(-3, 103), xticks=angles)
-    style.legend_below(figure, axis)
-    return figure
+        lines.append(chart.curve(row, preset, rates, rates.values()))
+    return chart.draw([chart.panel_data("", "initial error in rotation (degrees)", "poses found (%)", lines)], 2.8)
 
 
 PAGES = {"fig6": make}

@@ -159,24 +159,20 @@ def draw(data: pd.DataFrame) -> Figure:
     return figure
 
 
-@style.styled
 def draw_visibility(data: pd.DataFrame) -> Figure:
     """Draws cosine and scale over the blur, a line per renderer; those without a blur are a range."""
-    figure, (axes,) = chart.sheet(2.8, 1, 2)
-    sharp = data[data["blur"].isna() & data["image_cosine"].notna()]
-    for axis, name in zip(axes, OF_IMAGE, strict=True):
-        if len(sharp):
+    sharp, blurs, panels = data[data["blur"].isna() & data["image_cosine"].notna()], data["blur"].dropna(), []
+    for name in OF_IMAGE if len(blurs) else ():
+        lines = [
+            chart.curve(row, preset, own["blur"], style.finite(own[name]))
+            for (row, preset), own in data[data["blur"].notna()].groupby(["name", "preset"], sort=False)
+        ]
+        for end in ("min", "max") if len(sharp) else ():
             label = f"without a blur ({sharp['name'].nunique()} renderers)"
-            axis.axhspan(sharp[name].min(), sharp[name].max(), color="#bbbbbb", alpha=0.6, label=label)
-        for (row, preset), own in data.groupby(["name", "preset"], sort=False):
-            if own["blur"].notna().any():
-                chart.line(axis, preset, style.finite(own["blur"]), style.finite(own[name]), label=row)
-        axis.axhline(1.0, color="#555555", lw=0.8, ls=":", label="exact")
-        ends = min(0, data[name].min()), 1.1 * max(1, data[name].max())
-        axis.set(xlabel="blur (scene units)", ylabel=VISIBLE[name].lower(), ylim=ends)
-        style.log_axis(axis, "x", data["blur"])
-    style.legend_below(figure, axes[0])
-    return figure
+            lines.append(chart.level(label, blurs, getattr(sharp[name], end)()))
+        lines.append(chart.level("exact", blurs, 1.0, dash=":"))
+        panels.append(chart.panel_data("", "blur (scene units)", VISIBLE[name].lower(), lines))
+    return chart.draw(panels, 2.8)
 
 
 def _cosine(value: float | None) -> str:

@@ -4,19 +4,17 @@ import math
 from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 
 from bench.report.data.records import SCALE, Record, base_renderer, family, index, median_of_known
-from bench.report.study import Result, Runs, Selection, chart, curves, format, statistics, style, table
+from bench.report.study import Result, Runs, Selection, chart, curves, format, statistics, table
 
 PLACE = 90
 READS = (Selection("speed_completion"),)
 TARGET = 1e-3  # Chamfer distance (squared scene units); the time to reach it is measured
-MAIN = {"dvr": "dvr_early_stop"}  # presets that stand for a renderer whose own preset is not among the settings
 ALONG = {"seconds": "time (seconds)", "value_evaluations": "field values"}
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
-    "The figure has a line per run of each renderer's main setting, as far as the run came.",
+    "The figure has a line per run of each renderer's first setting, as far as the run came.",
     f"The table has all settings, how many of their runs reached {SCALE * TARGET:g} × 10⁻³, and the median time to it "
     "over all runs, infinite for a run that did not end ok or ended above it.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
@@ -37,6 +35,7 @@ def make(runs: Runs) -> Result:
         for line in lines
         for record, history in zip(line["records"], line["histories"], strict=True)
     ]
+    panels = [_panel(lines, along) for along in ALONG]
     return Result(
         runs,
         "Error over time and over field values.",
@@ -46,11 +45,8 @@ def make(runs: Runs) -> Result:
         remarks=NOTES,
         data=pd.concat(data)[[*(column.key for column in own), *curves.HISTORY]],
         table=table.to_table(COLUMNS, lines),
-        figure=draw(lines),
-        chart={
-            "panels": [_panel(lines, along) for along in ALONG],
-            "note": "A line is a run, which a click opens.",
-        },
+        figure=chart.draw(panels, 2.9, legend=5, sharey=True),
+        chart={"panels": panels, "note": "A line is a run, which a click opens."},
     )
 
 
@@ -82,26 +78,6 @@ def _verdict(lines: list[Line]) -> str:
     return said if never < len(lines) else ""
 
 
-@style.styled
-def draw(lines: list[Line]) -> Figure:
-    """Draws the error of each run of each renderer's main setting over seconds and over field values."""
-    presets = {line["preset"] for line in lines}
-    mains = [{line["renderer"], MAIN.get(line["renderer"], line["renderer"])} for line in lines]
-    lines = [line for line, main in zip(lines, mains, strict=True) if line["preset"] in main or not main & presets]
-    figure, (axes,) = chart.sheet(2.9, 1, 2, sharey=True)
-    histories = [(line, history) for line in lines for history in line["histories"]]
-    for axis, (along, label) in zip(axes, ALONG.items(), strict=True):
-        for line, history in histories:
-            look = {"marker": "", "lw": 0.8, "alpha": 0.7, "label": line["setting"]}
-            chart.line(axis, line["renderer"], history[along], history["error"], **look)
-        style.log_axis(axis, "x", [x for _, history in histories for x in history[along]])
-        axis.set_xlabel(label)
-    style.log_axis(axes[0], "y", [error for _, history in histories for error in history["error"]])
-    axes[0].set_ylabel(ERROR)
-    style.legend_below(figure, axes[0], columns=5)
-    return figure
-
-
 def _panel(lines: list[Line], along: str) -> dict[str, Any]:
     """A line per run over seconds or field values; of the first setting of each renderer at first."""
     first = {line["renderer"]: line["setting"] for line in reversed(lines)}
@@ -114,9 +90,8 @@ def _panel(lines: list[Line], along: str) -> dict[str, Any]:
                 f"{format.seconds(s)}, error × 1000 {format.number(e)}" for s, e in one[["seconds", "error"]].values
             ]
             look = {"text": [[scene, cost] for cost in costs], "link": [f"#/run/{record['folder']}"] * len(one)}
-            look |= {"dash": "-", "size": 4}
-            look |= {} if first[line["renderer"]] == line["setting"] else {"off": True}
-            drawn.append(chart.series(line["setting"], record["renderer"], one[along], one["error"], **look))
+            look |= {"size": 4} | ({} if first[line["renderer"]] == line["setting"] else {"off": True})
+            drawn.append(chart.curve(line["setting"], record["renderer"], one[along], one["error"], **look))
     return chart.panel_data("", ALONG[along], ERROR, drawn, height=420)
 
 

@@ -2,13 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.report.data.runs import together
@@ -19,7 +17,6 @@ PLACE = 80
 READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("view",)))
 SEED = 0  # of the bootstrap
 QUANTITIES = ("seconds", "error", "evaluations")  # of a run
-NEAR = 7  # points of a front that are nearer to each other, in points of type, have their numbers together
 LEAST = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
     "Left: final error of a completion over the seconds of its loop; right: depth error of one rendering (95th "
@@ -58,6 +55,7 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
     panels = {trial: points(runs, trial) for trial, runs in found.items() if runs is not None}
     lines = [line for panel in panels.values() for line in panel]
     own = dict.fromkeys(key for line in lines for key in line if key.startswith("renderer."))
+    drawn = [_panel(trial, panel) for trial, panel in panels.items()]
     return Result(
         together(completion, rendering),
         "Error over time.",
@@ -69,8 +67,8 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
         remarks=(*NOTES, undefined(line["on_front"] for line in lines)),
         columns=[*COLUMNS, *map(table.Column, own), table.text("resolution")],
         lines=lines,
-        figure=draw(panels),
-        chart={"panels": [_panel(trial, panel) for trial, panel in panels.items()], "note": POINT},
+        figure=draw(drawn, [*map(_front, panels.values())]),
+        chart={"panels": drawn, "note": POINT},
     )
 
 
@@ -148,41 +146,17 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
 
 
 @style.styled
-def draw(panels: dict[Trial, list[Line]]) -> Figure:
+def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
     """Draws a panel per trial; the settings on the front have numbers, which lead to their names below."""
-    figure, (axes,) = chart.sheet(4.4, 1, len(panels))
-    for axis, (trial, panel) in zip(axes, panels.items(), strict=True):
-        front, known = _front(panel), _finite(panel)
-        for line in known:
-            how = {"mfc": "none"} if line["dominated"] else {}
-            chart.points(axis, line["renderer"], line["seconds"], line["error"], ms=5, label=line["renderer"], **how)
-        how = {"where": "post", "color": "#999999", "lw": 0.8, "zorder": 0}
-        axis.step([line["seconds"] for line in front], [line["error"] for line in front], **how)
-        for letter, key in (("x", "seconds"), ("y", "error")):
-            style.log_axis(axis, letter, [line[key] for line in known])
-        axis.margins(x=0.08, y=0.1)
-        axis.set(xlabel="time (seconds)", ylabel=trial.heading, title=trial.title)
+    figure = chart.draw(panels, 4.4, legend=5)
+    for axis, front in zip(figure.axes, fronts, strict=True):
+        for number, line in enumerate(front, 1):
+            how = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 6}
+            axis.annotate(str(number), (line["seconds"], line["error"]), (-2, -3), **how)
         names = [axis.plot([], [], ls="none", label=f"{i} {_name(line)}")[0] for i, line in enumerate(front, 1)]
         below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2}
         axis.legend(handles=names, **below, handlelength=0, handletextpad=0, fontsize=6)
-    drawn = {name: handle for axis in axes for name, handle in style.labelled(axis).items() if name[0].isalpha()}
-    style.legend_of(figure, drawn, columns=5)
-    for axis, panel in zip(axes, panels.values(), strict=True):
-        _number(axis, [(line["seconds"], line["error"]) for line in _front(panel)])
     return figure
-
-
-def _number(axis: Axes, front: list[tuple[float, float]]) -> None:
-    """Numbers the points of a front, each below and left of its point, where no point can be; near ones together."""
-    if not front:
-        return
-    axis.figure.draw_without_rendering()  # places the axes
-    places = axis.transData.transform(front) * 72 / axis.figure.dpi  # in points of type
-    far = [0, *(i for i in range(1, len(places)) if np.abs(places[i] - places[i - 1]).max() > NEAR), len(places)]
-    for first, last in pairwise(far):
-        told = f"{first + 1}" if last == first + 1 else f"{first + 1}–{last}"
-        how = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 6}
-        axis.annotate(told, front[first], (-2, -3), **how)
 
 
 def _name(line: Line) -> str:
@@ -199,7 +173,7 @@ def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
         look = {"text": [*map(_hover, own)], "link": [_runs_of(p["setting"]) for p in own], "size": 11}
         look |= {"hollow": True} if dominated else {}
         drawn.append(chart.series(renderer, renderer, *([p[key] for p in own] for key in at), **look))
-    line = {"colour": "#888888", "symbol": "", "dash": "-", "step": True, "quiet": True}
+    line = {"colour": chart.GREY, "symbol": "", "dash": "-", "step": True, "quiet": True}
     drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in at), **line))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)
 

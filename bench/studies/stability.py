@@ -93,6 +93,12 @@ def make_cost(runs: Runs) -> Result:
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
     lines["behind"] = lines.groupby(["cost", "rank"]).cumcount()  # of points at one place
+    points = [
+        chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
+        for line in lines.dropna(subset=["cost", "rank"]).itertuples()
+    ]
+    panel = chart.panel_data("", *COST_AXES, points, height=420)
+    panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(
         runs,
         "Robustness over cost.",
@@ -103,8 +109,8 @@ def make_cost(runs: Runs) -> Result:
         remarks=COST_NOTES,
         columns=COSTS,
         lines=lines.to_dict("records"),
-        figure=draw_cost(lines),
-        chart=_chart_cost(lines),
+        figure=chart.draw([panel], 3.6),
+        chart={"panels": [panel]},
     )
 
 
@@ -291,28 +297,6 @@ def _verdict_cost(lines: pd.DataFrame, axes: int) -> str:
         f"{best['row']} has the best mean rank, *{number(best['rank'])}* of {len(known)}, for {number(best['cost'])} "
         f"field values per ray; {'no renderer is cheaper' if best['row'] == cheap['row'] else rest} (n = {axes} axes)."
     )
-
-
-@style.styled
-def draw_cost(lines: pd.DataFrame) -> Figure:
-    """Draws the mean rank over the field values per ray; later ones of equal points are smaller: none is hidden."""
-    figure, ((axes,),) = chart.sheet(max(3.2, 0.17 * len(lines)))
-    for line in lines.itertuples():
-        chart.points(axes, line.preset, line.cost, line.rank, label=line.row, ms=7 / (1 + 0.4 * line.behind))
-    style.log_axis(axes, "x", lines["cost"])
-    axes.set(xlabel=COST_AXES[0], ylabel=COST_AXES[1], ylim=(max(1.0, lines["rank"].max()) + 0.5, 0.5))
-    figure.legend(loc="outside right upper")
-    return figure
-
-
-def _chart_cost(lines: pd.DataFrame) -> dict[str, Any]:
-    points = [
-        chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
-        for line in lines.dropna(subset=["cost", "rank"]).itertuples()
-    ]
-    panel = chart.panel_data("", *COST_AXES, points, height=420)
-    panel["y"]["reversed"] = True
-    return {"panels": [panel]}
 
 
 def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:

@@ -36,7 +36,7 @@ def make(runs: Runs) -> Result:
         remarks=NOTES,
         lines=lines,
         run_columns=RUNS,
-        figure=found.draw_front(filled=lambda preset: preset.startswith(FOLDER)),
+        filled=lambda preset: preset.startswith(FOLDER),
     )
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, chart, compare, format, statistics, style, table
+from bench.report.study import Result, Runs, chart, compare, format, statistics, table
 from bench.report.tuning import TUNING, Tuning, left_out, tunings, unfinished
 
 PLACE = 36
@@ -50,7 +50,7 @@ def make(runs: Runs) -> Result:
         ],
         lines=lines,
         run_columns=RUNS,
-        figure=draw(lines, budgets),
+        figure=draw(lines),
     )
 
 
@@ -84,21 +84,12 @@ def _verdict(methods: list[Tuning], lines: list[Line]) -> str:
     return f"The best of {draws} draws has {' to '.join(ends)} times the error of one draw; n = {n} test shapes."
 
 
-@style.styled
-def draw(lines: list[Line], budgets: list[int]) -> Figure:
-    """Draws a line per method, the expected test error over the number of draws, and its interval at the last one."""
-    figure, ((axis,),) = chart.sheet(3.2, width=4.6)
-    for line in lines:
-        preset, curve = line["preset"], line["curve"]
-        chart.line(axis, preset, [*curve], [one.value for one in curve.values()], label=line["method"])
-        chart.estimates(axis, preset, [max(curve)], [curve[max(curve)]], bars=True, label=None)
-    axis.set(xlabel="number of drawn settings, the best of which is taken", ylabel="Chamfer × 1000 (scene units²)")
-    found = [one for line in lines for one in line["curve"].values()]
-    style.log_axis(axis, "y", [end for one in found for end in (one.low, one.value, one.high, *one.points)])
-    axis.set_xscale("log", base=2)
-    axis.set_xticks(budgets, [str(k) for k in budgets])
-    style.legend_below(figure, axis, columns=2)
-    return figure
+def draw(lines: list[Line]) -> Figure:
+    """Draws a line per method: the expected test error over the number of draws, with its interval."""
+    drawn = [chart.curve(line["method"], line["preset"], line["curve"], line["curve"].values()) for line in lines]
+    label = "number of drawn settings, the best of which is taken"
+    panel = chart.panel_data("", label, compare.LABEL, drawn)
+    return chart.draw([panel], 3.2, legend=2, width=4.6)
 
 
 PAGES = {"tuning": make}

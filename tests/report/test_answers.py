@@ -6,7 +6,6 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.write.caption import SMOKE
-from bench.report.write.chart import panel_data, series
 from bench.report.write.paper import write_paper
 from bench.report.write.result import Shown, read_shown
 from tests.report.test_report_paper import costs, write_run
@@ -34,12 +33,6 @@ def test_every_shipped_page_has_a_question_and_a_verdict_with_a_number(name):
     marked = shown.verdict.split("*")[1::2]
     assert marked and all(any(c.isdigit() for c in part) for part in marked) and shown.verdict.count("*") % 2 == 0
     assert "nan" not in shown.verdict and len(shown.verdict) < 400
-
-
-def test_an_axis_is_logarithmic_where_its_values_are_positive_and_spread():
-    made = panel_data("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
-    assert made["x"] == {"title": "x", "log": True} and made["y"] == {"title": "y", "log": False}
-    assert made["series"][0]["colour"] == "#0072b2"
 
 
 def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):

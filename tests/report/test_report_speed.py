@@ -9,7 +9,6 @@ import pytest
 from bench.records.read import read_records
 from bench.report.data.curves import history_of
 from bench.report.data.runs import choose
-from bench.report.write import chart
 from bench.studies import speed_curves, speed_front
 from tests.report.test_report_paper import told, write_run
 
@@ -84,20 +83,11 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
 
 def test_dominated_points_are_hollow_and_the_front_is_numbered(three):
     axis = made(three).figure.axes[0]
-    drawn = {(round(line.get_xdata()[0], 3), round(line.get_ydata()[0], 3)): line for line in axis.lines
-             if len(line.get_xdata()) == 1}  # fmt: skip
-    assert set(drawn) == {(1.0, 7.0), (3.0, 0.6), (4.0, 8.0)}  # the infinite one is in the table alone
-    assert drawn[4.0, 8.0].get_markerfacecolor() == "none"
-    assert drawn[3.0, 0.6].get_markerfacecolor() != "none"
+    drawn = {line.get_markerfacecolor() == "none": line for line in axis.lines if line.get_label() == "dist"}
+    solid, hollow = ([*zip(*drawn[each].get_data(), strict=True)] for each in (False, True))
+    assert solid == [(1.0, 7.0), (3.0, 0.6)] and hollow == [(4.0, 8.0)]  # the infinite one is in the table alone
     assert {text.get_text(): text.xy for text in axis.texts} == {"1": (1.0, 7.0), "2": pytest.approx((3.0, 0.6))}
     assert [text.get_text()[:6] for text in axis.get_legend().get_texts()] == ["1 fast", "2 good"]
-
-
-def test_points_of_a_front_that_are_near_have_their_numbers_together():
-    _, ((axis,),) = chart.sheet(3.4)
-    axis.set(xlim=(0, 1), ylim=(0, 1))
-    speed_front._number(axis, [(0.1, 0.9), (0.5, 0.5), (0.501, 0.499), (0.502, 0.498), (0.9, 0.1)])
-    assert [text.get_text() for text in axis.texts] == ["1", "2–4", "5"]
 
 
 def test_one_draw_has_no_probability(tmp_path):

@@ -142,7 +142,9 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
         broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
     broke(tmp_path, "alpha", "DIST", 0.9)
     broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
-    rows = made(tmp_path, "stability_cost").data.set_index("row")
+    page = made(tmp_path, "stability_cost")
+    assert page.chart["panels"][0]["y"]["reversed"] and page.figure.axes[0].yaxis_inverted()
+    rows = page.data.set_index("row")
     columns = ["axes", "at_once", "never", "cost"]
     assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
     assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]

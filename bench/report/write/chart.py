@@ -1,7 +1,7 @@
-"""Pieces that the figures share: a sheet with axes, a grid of panels, the line of a row."""
+"""Charts as data: panels of series, drawn here as a figure, and by the page so that they answer the mouse."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,60 @@ from matplotlib.figure import Figure
 
 from bench.pictures import style
 from bench.report.data.statistics import Interval
+
+GREY = "#777777"  # of lines that belong to no row
+Series = dict[str, Any]
+Panel = dict[str, Any]
+
+
+def series(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
+    """Points with the colour and marker that their preset has in every figure; of estimates with their intervals.
+
+    Args:
+        name: of the legend.
+        preset: of the row.
+        x: the positions.
+        y: the values, or estimates: where one has no interval, the points of its shapes are drawn, small.
+        more: what the page reads as well, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
+    """
+    look, places, found = style.look(preset), list(x), list(y)
+    values = [one.value if isinstance(one, Interval) else one for one in found]
+    made = {"name": name, "x": _rounded(places), "y": _rounded(values), "colour": look.colour, "symbol": look.marker}
+    estimates = [one for one in found if isinstance(one, Interval)]
+    if any(one.known for one in estimates):
+        ends = [(one.low, one.high) if one.known else (one.value, one.value) for one in estimates]
+        made |= dict(zip(("low", "high"), map(_rounded, zip(*ends, strict=True)), strict=True))
+    alone = [(at, p) for at, one in zip(places, estimates, strict=False) if not one.known for p in one.points]
+    return made | ({"shapes": [_rounded(pair) for pair in alone]} if alone else {}) | more
+
+
+def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
+    """As `series`, joined by a line."""
+    return series(name, preset, x, y, **{"dash": style.look(preset).line} | more)
+
+
+def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
+    """A grey line at a value, between the ends of positions."""
+    ends = [min(places := list(x)), max(places)]
+    return {"name": name, "x": ends, "y": [value, value], "colour": GREY, "symbol": "", "dash": "-", **more}
+
+
+def panel_data(title: str, x: str, y: str, series: list[Series], ticks: Sequence[str] = (), **more: Any) -> Panel:
+    """A panel of a chart; an axis is logarithmic where its values are positive and span a factor above 3.
+
+    Args:
+        title: its title.
+        x, y: what its axes carry, with the unit.
+        series: what is drawn.
+        ticks: the names of the positions 0, 1, ... along x.
+        more: what the page reads as well.
+    """
+    axes = {}
+    for letter, name in (("x", x), ("y", y)):
+        values = [v for each in series for v in each[letter] if math.isfinite(v)]
+        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
+        axes[letter] = {"title": name, "log": log}
+    return {"title": title, **axes, "series": series} | ({"ticks": list(ticks)} if ticks else {}) | more
 
 
 def sheet(
@@ -20,87 +74,69 @@ def sheet(
     return figure, figure.subplots(lines, columns, squeeze=False, **how)
 
 
-def line(axis: Axes, preset: str, x: Any, y: Any, *, band: Any = None, **how: Any) -> None:
-    """Draws the line of a row in the look of its preset, and a band between two ends around it.
+@style.styled
+def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int = 4, **how: Any) -> Figure:
+    """Draws panels as a figure of that height in inches, so many lines of them, with one legend below.
 
     Args:
-        axis: where it is drawn.
-        preset: the row's preset.
-        x, y: positions and values.
-        band: the lower and the upper ends of the band; None for no band.
-        how: settings of the line that replace those of the look.
+        panels: to draw.
+        height: of the figure.
+        lines: of panels.
+        legend: the columns of the legend; 0 for none.
+        how: the width of the figure and what its axes share, see `sheet`.
     """
-    look = style.look(preset)
-    axis.plot(x, y, **{"color": look.colour, "marker": look.marker, "ls": look.line, **how})
-    if band is not None:
-        axis.fill_between(x, *band, color=look.colour, alpha=0.15, lw=0)
+    figure, axes = sheet(height, lines, -(-max(len(panels), 1) // lines), **how)
+    for axis, panel in zip(axes.flat, panels, strict=False):
+        _panel(axis, panel)
+    for axis in axes.flat[len(panels) :]:
+        axis.axis("off")
+    for axis in axes[:, 1:].flat if "sharey" in how else ():
+        axis.set_ylabel("")
+    if legend:
+        style.legend_below(figure, *axes.flat, columns=legend)
+    return figure
+
+
+def _panel(axis: Axes, panel: Panel) -> None:
+    shown = [each for each in panel["series"] if not each.get("off")]
+    values = [v for each in shown for v in (*each["y"], *each.get("high", ())) if math.isfinite(v)]
+    for each in shown:
+        _series(axis, each, edge=2 * max(values, default=1.0))
+    for letter in "xy":
+        if panel[letter]["log"]:
+            style.log_axis(axis, letter, [v for each in shown for v in (*each[letter], *each.get("low", ()))])
+    if "ticks" in panel:
+        axis.set_xticks(range(len(panel["ticks"])), panel["ticks"])
+    if panel["y"].get("reversed"):
+        axis.invert_yaxis()
+    axis.set(title=panel["title"], xlabel=panel["x"]["title"], ylabel=panel["y"]["title"])
+
+
+def _series(axis: Axes, each: Series, edge: float) -> None:
+    """Draws a series; what is infinite at the edge, intervals as a band around a line, else as bars."""
+    x, y, line = each["x"], np.minimum(each["y"], edge), "dash" in each
+    how: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
+    how |= {"markevery": max(len(x) // 6, 1)} if line else {}
+    how |= {"drawstyle": "steps-post"} if each.get("step") else {}
+    how |= {"mfc": "none"} if each.get("hollow") else {}
+    how |= {"ms": 0.55 * each["size"]} if "size" in each else {}
+    axis.plot(x, y, label=None if each.get("quiet") else each["name"], **how)
+    if "low" in each:
+        ends = [np.minimum(each[end], edge) for end in ("low", "high")]
+        if line:
+            axis.fill_between(x, *ends, color=each["colour"], alpha=0.15, lw=0)
+        else:
+            axis.vlines(x, *ends, color=each["colour"], lw=0.7)
+    if "shapes" in each:
+        at, found = np.minimum(each["shapes"], [math.inf, edge]).T
+        axis.plot(at, found, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
 
 
 def points(axis: Axes, preset: str, x: Any, y: Any, **how: Any) -> None:
     """Draws the points of a row with the marker and colour of its preset."""
-    line(axis, preset, x, y, ls="none", **how)
-
-
-def estimates(axis: Axes, preset: str, x: Any, found: Sequence[Interval], *, bars: bool = False, **how: Any) -> None:
-    """Draws estimates of a row with their intervals; where one has none, the points of its shapes, small.
-
-    Args:
-        axis: where they are drawn.
-        preset: the row's preset.
-        x: positions.
-        found: the estimates.
-        bars: whether the intervals are bars, not a band.
-        how: settings of the line that replace those of the look.
-    """
-    value, low, high = (np.array([getattr(one, end) for one in found]) for end in ("value", "low", "high"))
-    if bars:
-        look = style.look(preset)
-        how = {"color": look.colour, "marker": look.marker, "ls": look.line, "elinewidth": 0.7, **how}
-        axis.errorbar(x, value, np.maximum([value - low, high - value], 0), **how)
-    else:
-        line(axis, preset, x, value, band=(low, high), **how)
-    shapes(axis, preset, x, found)
-
-
-def front(
-    axis: Axes, rows: Sequence[tuple[str, str]], costs: Any, errors: Sequence[Interval], on: Sequence[Any]
-) -> None:
-    """Draws the error of each row, a preset and its name, over its cost; those on the front are filled."""
-    edge = 2 * max((error.value for error in errors), default=1.0)
-    for (preset, name), cost, error, filled in zip(rows, costs, errors, on, strict=True):
-        how = {"ls": "none", "ms": 5, "label": name} | ({} if filled else {"mfc": "none"})
-        estimates(axis, preset, [cost], [error.below(edge)], bars=True, **how)
-
-
-def shapes(axis: Axes, preset: str, x: Any, found: Sequence[Interval]) -> None:
-    """Draws the points of the shapes of estimates that have no interval, in the colour of their row."""
-    drawn = [(at, point) for at, one in zip(x, found, strict=True) if not one.known for point in one.points]
-    if drawn:
-        points(axis, preset, *np.array(drawn, dtype=float).T, ms=2, alpha=0.5, zorder=1.5, label=None)
-
-
-def reference(draw: Callable[..., Any], value: float, times: float, label: str) -> None:
-    """Draws a line at a value and a dotted one at a multiple of it, by an axis's `axhline` or `axvline`."""
-    draw(value, color="#777777", lw=0.9, label=label)
-    draw(times * value, color="#777777", lw=0.9, ls=":", label=f"{times:g} times that")
-
-
-def panel_data(title: str, x: str, y: str, series: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    """A panel of the page's chart; an axis is logarithmic where its values are positive and span a factor above 3."""
-    axes = {}
-    for letter, name in (("x", x), ("y", y)):
-        values = [v for each in series for v in each[letter] if isinstance(v, int | float) and math.isfinite(v)]
-        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
-        axes[letter] = {"title": name, "log": log}
-    return {"title": title, **axes, "series": series, **more}
-
-
-def series(name: str, preset: str, x: Any, y: Any, **more: Any) -> dict[str, Any]:
-    """A series of the page's chart with the colour and marker that its preset has in every figure."""
     look = style.look(preset)
-    found = {"name": name, "x": _rounded(x), "y": _rounded(y), "colour": look.colour, "symbol": look.marker}
-    return found | more
+    axis.plot(x, y, **{"color": look.colour, "marker": look.marker, "ls": "none", **how})
 
 
-def _rounded(values: Any) -> list[float]:
-    return [float(f"{value:.5g}") for value in np.asarray(values, float)]
+def _rounded(values: Iterable[float]) -> list[float]:
+    return [float(f"{value:.5g}") for value in values]

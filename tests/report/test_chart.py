@@ -1,0 +1,66 @@
+"""A chart is drawn as a figure from the data that the page gets."""
+
+import math
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PolyCollection
+
+from bench.pictures import style
+from bench.report.data.statistics import Interval
+from bench.report.write.chart import curve, draw, level, panel_data, series
+
+KNOWN = [Interval(2.0, 1.0, 4.0), Interval(20.0, 10.0, math.inf)]
+FEW = [Interval(2.0, math.nan, math.nan, (1.0, 3.0))]
+
+
+def axis_of(*drawn, **panel):
+    (axis,) = draw([panel_data("title", "x", "y", list(drawn), **panel)], 2.0).axes
+    return axis
+
+
+def test_a_row_has_its_preset_s_look_in_the_figure_and_on_the_page():
+    made = curve("DIST", "dist", [1, 2], [0, 5])
+    (line,) = axis_of(made).lines
+    assert made["colour"] == line.get_color() == style.look("dist").colour == "#0072b2"
+    assert made["symbol"] == line.get_marker() and made["dash"] == line.get_linestyle() == "-"
+    assert line.get_label() == "DIST" and list(line.get_ydata()) == [0, 5]
+
+
+def test_an_axis_is_logarithmic_where_its_values_are_positive_and_spread():
+    panel = panel_data("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
+    assert panel["x"] == {"title": "x", "log": True} and panel["y"] == {"title": "y", "log": False}
+    (axis,) = draw([panel], 2.0).axes
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "linear")
+
+
+def test_intervals_are_a_band_around_a_line_and_bars_of_points():
+    line, points = (axis_of(kind("a", "dist", [1, 2], KNOWN)) for kind in (curve, series))
+    (band,), (bars,) = line.collections, points.collections
+    assert isinstance(band, PolyCollection) and isinstance(bars, LineCollection)
+    assert [segment[:, 1].tolist() for segment in bars.get_segments()] == [[1, 4], [10, 40]]  # ∞ is at the edge
+    assert band.get_paths()[0].vertices[:, 1].max() == 40
+
+
+def test_without_an_interval_the_points_of_the_shapes_are_drawn():
+    made = series("a", "dist", [7], FEW)
+    assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]
+    _, shapes = axis_of(made).lines
+    assert shapes.get_markersize() == 2 and np.transpose(shapes.get_data()).tolist() == made["shapes"]
+
+
+def test_looks_of_the_page_are_those_of_the_figure():
+    hollow = series("a", "dist", [1], [1], hollow=True, size=10)
+    step = curve("b", "idr", [1, 2], [1, 2], step=True, quiet=True)
+    drawn = axis_of(hollow, step, series("c", "dvr", [1], [9], off=True), level("exact", [1, 2], 1.5), ticks=["p", "q"])
+    points, steps, exact = drawn.lines
+    assert points.get_markerfacecolor() == "none" and points.get_markersize() == pytest.approx(5.5)
+    assert steps.get_drawstyle() == "steps-post" and list(exact.get_ydata()) == [1.5, 1.5]
+    assert [text.get_text() for text in drawn.figure.legends[0].get_texts()] == ["a", "exact"]
+    assert [label.get_text() for label in drawn.get_xticklabels()] == ["p", "q"]
+
+
+def test_of_axes_that_are_shared_the_first_alone_is_named_and_places_without_a_panel_are_empty():
+    panel = panel_data("", "x", "y", [series("a", "dist", [1], [1])])
+    axes = draw([panel] * 3, 2.0, 2, sharey=True).axes
+    assert [axis.get_ylabel() for axis in axes] == ["y", "", "y", ""] and not axes[3].axison
