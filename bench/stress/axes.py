@@ -12,8 +12,7 @@ from bench.machine.limits import LimitReached
 from bench.records.record import RunStatus
 from bench.solve.solve import Unsupported
 from bench.stress.fit import FITS, judge_fit
-from bench.stress.gradient import judge_gradient
-from bench.stress.rendering import judge_rendering
+from bench.stress.judge import judge_gradient, judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.stress import SCENES
 from renderers.checks import check_choice

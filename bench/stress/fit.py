@@ -4,11 +4,12 @@ Its four parameters are the centre and the logarithm of the radius. The observat
 optimiser is made worse.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.machine.limits import Limits
@@ -18,9 +19,9 @@ from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.scene import View
-from datasets.stress.observations import DISTURBANCES, Observation
 from datasets.stress.solids import Solid, sphere_solid
 from datasets.views import ViewSampler
+from renderers.camera import Camera
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer
 
@@ -30,6 +31,68 @@ DEFINITIONS = {
     "surface_error": "mean magnitude of the fitted sphere's distance at points of the true surface, in scene units",
     "evaluations_per_ray": "field values computed, divided by rays times iterations",
 }
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The observations given to a fit."""
+
+    camera: Camera  # assumed by the fit
+    depth: Float[Tensor, "height width"]
+    observed: Bool[Tensor, "height width"]
+    mask: Bool[Tensor, "height width"]
+
+
+Disturb = Callable[[Observation, float, np.random.Generator], Observation]
+
+
+def depth_noise(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """Normal noise of a standard deviation, in scene units, on each depth."""
+    noise = torch.from_numpy(draw.normal(size=given.depth.shape)).float()
+    return replace(given, depth=given.depth + severity * noise)
+
+
+def depth_outliers(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the depths is replaced by random ones between 1.5 and 3.5."""
+    wild = torch.from_numpy(draw.uniform(1.5, 3.5, given.depth.shape)).float()
+    return replace(given, depth=torch.where(_drawn(given, severity, draw), wild, given.depth))
+
+
+def depth_steps(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """Depths are rounded to multiples of a step, in scene units."""
+    return replace(given, depth=severity * torch.round(given.depth / severity))
+
+
+def missing_depth(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the depths is missing."""
+    return replace(given, observed=given.observed & ~_drawn(given, severity, draw))
+
+
+def mask_errors(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """A share of the mask's pixels is wrong; the depths are unchanged."""
+    return replace(given, mask=given.mask ^ _drawn(given, severity, draw))
+
+
+def wrong_focal_length(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """The assumed focal length is too long by a share."""
+    return replace(given, camera=given.camera.zoomed(1 + severity))
+
+
+def wrong_pose(given: Observation, severity: float, draw: np.random.Generator) -> Observation:
+    """The assumed camera is turned about its centre by an angle, in degrees."""
+    axis = draw.normal(size=3)
+    turn = torch.from_numpy(np.radians(severity) * axis / np.linalg.norm(axis)).float()
+    return replace(given, camera=given.camera.moved(torch.cat([torch.zeros(3), turn])))
+
+
+DISTURBANCES: dict[str, Disturb] = {
+    function.__name__: function
+    for function in (
+        depth_noise, depth_outliers, depth_steps, missing_depth, mask_errors, wrong_focal_length, wrong_pose,
+    )
+}  # fmt: skip
+SETTINGS = {"far_start": "offset", "learning_rate": "learning_rate"}  # of the fit, which the severity replaces
+FITS = (*DISTURBANCES, *SETTINGS, "a_ball")  # the last is undisturbed, for a severity that is a renderer's setting
 
 
 def judge_fit(
@@ -103,10 +166,6 @@ class SphereProblem:
         return _sphere(self.free.detach()).field
 
 
-SETTINGS = {"far_start": "offset", "learning_rate": "learning_rate"}  # of the fit, which the severity replaces
-FITS = (*DISTURBANCES, *SETTINGS, "a_ball")  # the last is undisturbed, for a severity that is a renderer's setting
-
-
 def _draw_spheres(draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:
     """The four true parameters, and those at the start."""
     true = np.append(draw.uniform(-0.05, 0.05, 3), np.log(draw.uniform(*RADII)))
@@ -141,3 +200,7 @@ def _failure(history: History, error: float, largest: float) -> Failure:
     if history.status is RunStatus.DIVERGED:
         return Failure.DIVERGED
     return Failure.NONE if error <= largest else Failure.NOT_REACHED
+
+
+def _drawn(given: Observation, share: float, draw: np.random.Generator) -> Bool[Tensor, "height width"]:
+    return torch.from_numpy(draw.uniform(size=given.depth.shape) < share)

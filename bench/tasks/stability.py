@@ -12,7 +12,7 @@ from bench.records.files import curve_file
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.solve import Unsupported
-from bench.stress import fit, gradient, rendering
+from bench.stress import fit, judge
 from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
@@ -33,8 +33,8 @@ DEFINITIONS = {
     "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
 }
 MEASURED = {
-    "rendering": rendering.DEFINITIONS,
-    "gradient": gradient.DEFINITIONS,
+    "rendering": judge.OF_RENDERINGS,
+    "gradient": judge.OF_GRADIENTS,
     "fit": fit.DEFINITIONS,
 }
 

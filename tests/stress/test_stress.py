@@ -15,8 +15,7 @@ from bench.solve.solve import Unsupported
 from bench.stress import fit
 from bench.stress.axes import Stress, Sweep
 from bench.stress.fit import FITS, _failure, judge_fit
-from bench.stress.gradient import judge_gradient
-from bench.stress.rendering import judge_rendering, truth
+from bench.stress.judge import judge_gradient, judge_rendering, truth
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
 from bench.tables import choice, names

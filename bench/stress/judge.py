@@ -1,9 +1,10 @@
-"""Stress tests of a rendering, compared with the closed-form truth."""
+"""Stress tests of a rendering and of its gradient, compared with the closed-form truth in float64."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Criteria, Failure, Outcome
 from datasets.stress import Exam, FirstHit
 from datasets.stress.solids import incidence_cosines
@@ -12,13 +13,21 @@ from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.rendering import Renderer
 
-DEFINITIONS = {
+SUMS = 8  # random sums of distances, whose gradients are compared
+SEED = 0
+OF_RENDERINGS = {
     "lost": "true hits that were missed",
     "false": "spurious hits: on rays that have no true hit, or begin inside",
     "wrong": "true hits found with an error larger than the pixel's footprint: its width at the true distance, over "
     "the cosine of the angle of incidence",
     "hits": "true hits",
     "evaluations_per_ray": "field values computed, divided by rays",
+}
+OF_GRADIENTS = {
+    "gradient_cosine": "cosine between the gradients of 8 random sums of distances towards the scene's parameters, and "
+    "the true ones, over true hits that were found",
+    "gradient_scale": "projection of that gradient on the true one, divided by the true one's length",
+    "found": "share of the true hits that were found",
 }
 
 
@@ -53,7 +62,7 @@ def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> O
         "distance": torch.where(hit, distance, torch.nan).view(shape).float().numpy(),
         "true_distance": torch.where(true.hit, true.distance, torch.nan).view(shape).float().numpy(),
     }
-    return Outcome(_failure(numbers, hit.numel(), conditions.criteria), numbers, images)
+    return Outcome(_failure_of_pixels(numbers, hit.numel(), conditions.criteria), numbers, images)
 
 
 def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, " n"]]:
@@ -65,7 +74,7 @@ def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, " n"]]:
     return first, width / incidence_cosines(exam.truth.field, rays, first).clamp_min(torch.finfo(width.dtype).tiny)
 
 
-def _failure(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failure:
+def _failure_of_pixels(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failure:
     """The most frequent kind of failure, where failures exceed the criteria."""
     bad = {Failure.LOST: numbers["lost"], Failure.WRONG: numbers["wrong"], Failure.NAN: numbers["nan"]}
     kinds = {}
@@ -74,3 +83,50 @@ def _failure(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failur
     if numbers["false"] > criteria.false_hits * (numbers["hits"] or rays):
         kinds[Failure.FALSE] = numbers["false"]
     return max(kinds, key=lambda kind: kinds[kind]) if kinds else Failure.NONE
+
+
+def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Outcome:
+    """Renders an exam with gradient, and compares the gradient with the true one.
+
+    Raises:
+        Unsupported: where the renderer has no gradient towards the field.
+        LimitReached: where the rendering exceeds its time or memory.
+    """
+    check_field_gradient(renderer)
+    if exam.solid is None or exam.parameters is None:
+        raise ValueError("task.stress.scene has no parameters: choose grazing_plane for measure=gradient")
+    device = conditions.device
+    free = exam.parameters.float().to(device).requires_grad_()
+    watched = conditions.limits.watch(exam.solid(free).field, device)
+    found = rendered(renderer, watched, exam.camera.rays().to(device))
+    exact = exam.parameters.double().requires_grad_()
+    first = exam.solid(exact).trace(exam.camera.double().rays().flat())
+    compared = first.hit & found.hit.flatten().cpu()
+    share = float(compared.sum() / first.hit.sum().clamp_min(1))
+    if share < conditions.criteria.hits or not found.distance.requires_grad:
+        return Outcome(Failure.LOST, {"found": share})
+    signs = torch.randn(SUMS, int(compared.sum()), generator=torch.Generator().manual_seed(SEED), dtype=torch.float64)
+    computed = _gradients(found.distance.flatten()[compared.to(device)].double(), free, signs.to(device)).cpu()
+    true = _gradients(first.distance[compared], exact, signs)
+    cosine = float((computed * true).sum() / (computed.norm() * true.norm()).clamp_min(torch.finfo(true.dtype).tiny))
+    scale = float((computed * true).sum() / true.square().sum())
+    numbers = {"gradient_cosine": cosine, "gradient_scale": scale, "found": share}
+    return Outcome(_failure_of_gradient(cosine, scale, conditions.criteria), numbers)
+
+
+def _gradients(
+    distance: Float[Tensor, " n"], parameters: Float[Tensor, " m"], signs: Float[Tensor, "sums n"]
+) -> Float[Tensor, "sums m"]:
+    sums = (signs * distance).sum(dim=1)
+    rows = [torch.autograd.grad(total, parameters, retain_graph=True)[0] for total in sums]
+    return torch.stack(rows).double()
+
+
+def _failure_of_gradient(cosine: float, scale: float, criteria: Criteria) -> Failure:
+    if cosine != cosine:
+        return Failure.NAN
+    if cosine < 0:
+        return Failure.SIGN
+    if cosine < criteria.cosine:
+        return Failure.DIRECTION
+    return Failure.SCALE if abs(scale - 1) > criteria.scale else Failure.NONE
