@@ -13,8 +13,6 @@ from bench.records.files import digest, to_json, write_text
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus
 
-ODD_NAME = "two words ünïcode 50% #1?"
-
 
 def new_folder(results: Path) -> Path:
     folder = results / "runs" / "run"
@@ -38,14 +36,6 @@ def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
     record.write(folder)
     assert json.loads((folder / "record.json").read_text())["status"] == "ok"
     assert [path.name for path in folder.iterdir()] == ["record.json"]
-
-
-def test_a_status_that_there_is_not_is_not_read(tmp_path):
-    folder = new_folder(tmp_path)
-    make_record(status="splendid").write(folder)
-    records, (problem,) = read_records(tmp_path)
-    assert records == []
-    assert "status in record.json must be one of ok, " in problem and "found 'splendid'" in problem
 
 
 def test_records_and_plans_without_a_method_are_read(tmp_path):
@@ -107,19 +97,12 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
     assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "accuracy": "-inf", "fscore": 0.5}
     (read,), problems = read_records(tmp_path)
     assert problems == []
-    for metrics in (read["metrics"], read["metrics_start"]):
-        assert metrics["chamfer_l2"] == math.inf
-        assert metrics["accuracy"] == -math.inf
-        assert math.isnan(metrics["depth_mae"])
-        assert metrics["fscore"] == 0.5
-    assert math.isnan(read["gemm_fraction"])
-    assert read["flops"] is None
+    assert str([read["metrics"], read["metrics_start"]]) == str([odd, odd])  # where nan is equal to nan
+    assert math.isnan(read["gemm_fraction"]) and read["flops"] is None
 
 
 def test_a_digest_knows_data_and_not_the_order_of_its_keys():
     data = {"a": 1, "b": {"c": [1, 2.5, None], "d": "x"}}
-    shuffled = {"b": {"d": "x", "c": [1, 2.5, None]}, "a": 1}
-    assert digest(data) == digest(shuffled)
-    assert len(digest(data)) == 12
+    assert digest(data) == digest({"b": {"d": "x", "c": [1, 2.5, None]}, "a": 1})
     others = [{**data, "a": 2}, {**data, "b": {"c": [2.5, 1, None], "d": "x"}}, {**data, "e": 0}, {"a": 1}]
     assert len({digest(data), *(digest(other) for other in others)}) == 5

@@ -65,22 +65,17 @@ def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     assert names([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
 
 
-@pytest.mark.parametrize(
-    "config", [{"renderer": "odd", "silhouette": 3}, {"label": {"a": 1}}, {"dataset": {"path": 5}}]
-)
-def test_an_odd_configuration_is_shown_all_the_same(tmp_path, config):
-    write_run(tmp_path, record("odd", config=config), "odd")
-    write_index(tmp_path)
-    assert Page(tmp_path).folders == ["odd"]
-
-
-def test_a_configuration_that_is_nested_without_end_is_cut_off(tmp_path):
+def test_an_odd_configuration_is_shown_all_the_same_and_cut_off_where_it_has_no_end(tmp_path):
     nested: dict = {}
     for _ in range(300):
         nested = {"a": nested}
-    write_run(tmp_path, record("deep", config=nested), "deep")
+    odd = [{"renderer": "odd", "silhouette": 3}, {"label": {"a": 1}}, {"dataset": {"path": 5}}, nested]
+    for number, config in enumerate(odd):
+        write_run(tmp_path, record("odd", config=config), f"odd{number}")
     write_index(tmp_path)
-    ((key, value),) = Page(tmp_path).run("deep")["settings"]
+    page = Page(tmp_path)
+    assert sorted(page.folders) == ["odd0", "odd1", "odd2", "odd3"]
+    ((key, value),) = page.run("odd3")["settings"]
     assert value == "…" and key.count(".") == 20
 
 
@@ -196,8 +191,8 @@ def test_a_mesh_that_names_a_texture_reads_no_other_file(tmp_path, caplog):
     assert len(read_ply(tmp_path / "mesh.ply").faces) == 1280 and not caplog.records
 
 
-@pytest.mark.parametrize(
-    ("change", "why"),
+@each(
+    "change, why",
     [
         (lambda content: content[:-40], "unexpected length"),
         (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
@@ -212,12 +207,10 @@ def test_a_mesh_that_names_a_texture_reads_no_other_file(tmp_path, caplog):
     ],
 )
 def test_a_mesh_that_cannot_be_read_is_said_to_be(tmp_path, change, why):
-    folder = write_run(tmp_path, record("one"), "one")
-    made.write_mesh(folder / "mesh.ply")
-    (folder / "mesh.ply").write_bytes(change((folder / "mesh.ply").read_bytes()))
-    write_index(tmp_path)
-    page = Page(tmp_path)
-    assert why in page.read("mesh", page.runs["key"][0])["none"]
+    made.write_mesh(tmp_path / "mesh.ply")
+    (tmp_path / "mesh.ply").write_bytes(change((tmp_path / "mesh.ply").read_bytes()))
+    with pytest.raises(ValueError, match=why):
+        mesh_data(tmp_path / "mesh.ply")
 
 
 def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
@@ -232,6 +225,9 @@ def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
     monkeypatch.undo()
     write_index(tmp_path, meshes=None)
     assert all("x" in Page(tmp_path).read("mesh", key) for key in page.runs["key"])
+    (tmp_path / "runs" / page.folders[0] / "mesh.ply").write_bytes(b"")
+    write_index(tmp_path)
+    assert "Not a ply file" in Page(tmp_path).read("mesh", page.runs["key"][0])["none"]
 
 
 def test_what_is_gone_leaves_the_page(tmp_path):
