@@ -64,3 +64,10 @@ def test_of_axes_that_are_shared_the_first_alone_is_named_and_places_without_a_p
     panel = panel_data("", "x", "y", [series("a", "dist", [1], [1])])
     axes = draw([panel] * 3, 2.0, 2, sharey=True).axes
     assert [axis.get_ylabel() for axis in axes] == ["y", "", "y", ""] and not axes[3].axison
+
+
+@pytest.mark.parametrize(("shared", "edge"), [({"sharey": "row"}, 8.0), ({"sharey": True}, 200.0), ({}, 2.0)])
+def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
+    values = [[1.0, math.inf], [1.0, 4.0], [1.0, 100.0]]
+    panels = [panel_data("", "x", "y", [curve("a", "dist", [1, 2], own)]) for own in values]
+    assert draw(panels, 2.0, 2, **shared).axes[0].lines[0].get_ydata()[1] == edge

@@ -85,9 +85,11 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
         legend: the columns of the legend; 0 for none.
         how: the width of the figure and what its axes share, see `sheet`.
     """
-    figure, axes = sheet(height, lines, -(-max(len(panels), 1) // lines), **how)
-    for axis, panel in zip(axes.flat, panels, strict=False):
-        _panel(axis, panel)
+    columns = -(-max(len(panels), 1) // lines)
+    figure, axes = sheet(height, lines, columns, **how)
+    size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels with one axis have one edge
+    for place, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
+        _panel(axis, panel, _edge(panels[place // size * size :][:size]))
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
     for axis in axes[:, 1:].flat if "sharey" in how else ():
@@ -97,11 +99,20 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     return figure
 
 
-def _panel(axis: Axes, panel: Panel) -> None:
-    shown = [each for each in panel["series"] if not each.get("off")]
-    values = [v for each in shown for v in (*each["y"], *each.get("high", ())) if math.isfinite(v)]
+def _shown(panel: Panel) -> list[Series]:
+    return [each for each in panel["series"] if not each.get("off")]
+
+
+def _edge(panels: Sequence[Panel]) -> float:
+    """Where what is infinite is drawn: above all else of panels that share an axis."""
+    drawn = [each for panel in panels for each in _shown(panel)]
+    return 2 * max((v for each in drawn for v in (*each["y"], *each.get("high", ())) if math.isfinite(v)), default=1.0)
+
+
+def _panel(axis: Axes, panel: Panel, edge: float) -> None:
+    shown = _shown(panel)
     for each in shown:
-        _series(axis, each, edge=2 * max(values, default=1.0))
+        _series(axis, each, edge)
     for letter in "xy":
         if panel[letter]["log"]:
             style.log_axis(axis, letter, [v for each in shown for v in (*each[letter], *each.get("low", ()))])
