@@ -14,7 +14,7 @@ from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, sh
 NAMES = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
 BASELINES = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # presets
 OVER = "“Over ...”: the ratio of geometric means of Chamfer-L1 to that row over the same shapes; below 1 is better."
-INTERVALS = "95 % bootstrap intervals over shapes"
+INTERVALS = "95 % intervals over shapes, bootstrapped of medians and Student's of ratios"
 RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LOOP)
 
 

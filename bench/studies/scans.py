@@ -1,5 +1,6 @@
 """Completion from depths that a scanner measured, against exact ones at the same pixels."""
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -73,7 +74,8 @@ def _line(row: str, runs: Runs, pairs: dict[str, pd.DataFrame]) -> Line:
 
 def _verdict(lines: list[Line], scans: int) -> str:
     """The least and the largest ratio of the depth errors."""
-    ratios = [(line[f"depth_mae_{RATIO}"], line["row"]) for line in lines if f"depth_mae_{RATIO}" in line]
+    ratios = [(line.get(f"depth_mae_{RATIO}", math.nan), line["row"]) for line in lines]
+    ratios = [(ratio, row) for ratio, row in ratios if not math.isnan(ratio)]  # unknown where either failed alone
     if not ratios:
         return ""
     ends = [f"*{format.number(ratio)}* ({row})" for ratio, row in (min(ratios), max(ratios))]

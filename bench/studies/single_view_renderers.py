@@ -46,9 +46,12 @@ def make(runs: Runs) -> Result:
 
 
 def _least(lines: list[dict[str, Any]]) -> str:
-    """The least ratio of a family to the first row, of how many; empty where there is nothing to compare."""
+    """The least ratio of a family to the first row, of how many; empty where there is nothing to compare.
+
+    A ratio to a row that failed where the other did not is 0 or unknown, and says nothing.
+    """
     taught = [line for line in lines if line["preset"] not in single_view.BASELINES]
-    ratios = {line["method"]: line[FIRST] for line in taught if line.get(FIRST)}
+    ratios = {line["method"]: line[FIRST] for line in taught if line.get(FIRST) and line[FIRST].value > 0}
     if not ratios:
         return ""
     row = min(ratios, key=lambda name: ratios[name].value)

@@ -16,7 +16,7 @@ ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
     "The figure has a line per run of each renderer's first setting, as far as the run came.",
     f"The table has all settings, how many of their runs reached {SCALE * TARGET:g} × 10⁻³, and the median time to it "
-    "over all runs, infinite for a run that did not end ok or ended above it.",
+    "over all runs, infinite for a run that did not end ok or never was at it.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (

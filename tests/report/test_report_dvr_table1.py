@@ -103,6 +103,23 @@ def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path, status, sai
     assert of(tmp_path, single_view_renderers).verdict.endswith(f"shapes, one training each: {said}")
 
 
+def test_a_ratio_to_a_row_that_failed_alone_says_nothing(tmp_path):
+    for index in range(3):
+        more = {"index": index, "experiment": "single_view_renderers"}
+        made(tmp_path, "Newton", 0.2, **more, status="ok" if index else "empty")
+        made(tmp_path, "IDR", 0.3, **more, status="empty" if index == 1 else "ok")
+        made(tmp_path, "Nearest image", 0.1, **more)
+    result = of(tmp_path, single_view_renderers)
+    assert result.verdict == "" and result.table["Over Newton"].tolist() == ["", "– (n = 3)", "0 (n = 3)"]
+
+
+def test_its_intervals_are_named_by_what_they_are_of(tmp_path):
+    for index in range(6):
+        made(tmp_path, "RGB", 0.1 + index / 100, index=index)
+    said = "95 % intervals over shapes, bootstrapped of medians and Student's of ratios."
+    assert said in of(tmp_path, dvr_table1).caption
+
+
 def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
     for index, chamfer in enumerate((0.3, 0.1, 0.4, 0.2)):
         folder = made(tmp_path, "RGB", chamfer, index=index)

@@ -74,3 +74,12 @@ def test_where_both_failed_neither_is_better(tmp_path):
 def test_without_a_pair_there_is_no_ratio(tmp_path):
     made(tmp_path, "exact", 1.0)
     assert row(tmp_path)["Depth error, ratio"] == "–" and page(tmp_path).verdict == ""
+
+
+def test_where_each_failed_alone_the_ratio_is_unknown_and_not_in_the_verdict(tmp_path):
+    for index, depths in enumerate(("exact", "measured")):
+        for other in ("exact", "measured"):
+            made(tmp_path, other, 1.0, index=index, status="ok" if other == depths else "diverged")
+            made(tmp_path, other, 2.0 if other == "exact" else 3.0, index=index, renderer="dist")
+    assert [line["Depth error, ratio"] for line in page(tmp_path).table.to_dict("records")] == ["–", "1.50"]
+    assert "is *1.50* (dist) to *1.50* (dist)" in page(tmp_path).verdict

@@ -64,7 +64,7 @@ class Interval:
 
     def __str__(self) -> str:
         """The estimate, and its interval or else the number of shapes."""
-        return f"{format.number(self.value)} {self.ends()}"
+        return f"{format.number(None if math.isnan(self.value) else self.value)} {self.ends()}"
 
 
 def interquartile_mean(values: Values) -> float | np.ndarray:
@@ -144,7 +144,8 @@ def _logs(group: Any) -> np.ndarray:
 def _of_logarithms(logs: np.ndarray) -> Interval:
     """The exponential of the mean of the shapes' logarithms, with its interval."""
     n, points = len(logs), tuple(np.exp(logs).tolist())
-    middle = float(np.mean(logs))
+    with np.errstate(invalid="ignore"):  # where each fails where the other does not, neither is known to be better
+        middle = float(np.mean(logs))
     if n < FEWEST_SHAPES or not np.isfinite(logs).all():
         return Interval(math.exp(middle) if middle < math.inf else middle, math.nan, math.nan, points)
     half = float(stats.t.ppf((1 + LEVEL) / 2, n - 1) * np.std(logs, ddof=1) / math.sqrt(n))
