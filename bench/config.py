@@ -18,7 +18,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.tables import CONF as CONF
 from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers, register_rows
-from datasets.scene import SPLIT_STRIDE, Split
 
 LEAST = {
     "seed": 0,
@@ -30,6 +29,10 @@ LEAST = {
     "evaluation.picture": 4,
     "evaluation.gallery": 4,
     "evaluation.every": 1,
+}
+POSITIVE = {  # where they are not null: with what to type
+    "time_limit": "600 is ten minutes, null no limit",
+    "memory_limit": "8 is 8 GiB, null all but a tenth",
 }
 DOUBLING = "doubling"
 SELF = "_self_"  # of a list of defaults: the file itself
@@ -144,6 +147,14 @@ def register(*folders: Path) -> None:
     register_resolvers()
 
 
+def check(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
+    """Raises ValueError for what is invalid in a resolved configuration and needs no torch to be found."""
+    check_names(config)
+    check_label(config, overrides)
+    check_top_level(config)
+    build(config["tracker"], "tracker", config["packages"])
+
+
 def check_label(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Raises ValueError where a renderer takes the place of a method's, whose label the run would keep."""
     given = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
@@ -181,8 +192,6 @@ def check_names(config: Mapping[str, Any]) -> None:
 def check_top_level(config: Mapping[str, Any]) -> None:
     """Raises ValueError for a value of the top level that no part checks by itself."""
     evaluation = config["evaluation"]
-    if config["split"] not in list(Split):
-        raise ValueError(f"split must be one of {', '.join(Split)}, not {config['split']!r}")
     if not evaluation["fscore_threshold"] > 0:
         raise ValueError(f"evaluation.fscore_threshold must be positive, not {evaluation['fscore_threshold']}")
     if isinstance(evaluation["every"], str) and evaluation["every"] != DOUBLING:
@@ -195,12 +204,13 @@ def check_top_level(config: Mapping[str, Any]) -> None:
         raise ValueError("only task=stability reads stress: remove it, or set task=stability")
     if evaluation["film"] is not None and evaluation["picture"] is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
-    if config["index"] >= SPLIT_STRIDE:
-        raise ValueError(f"index must be at most {SPLIT_STRIDE - 1}, not {config['index']}: a split has no more shapes")
     for name, least in LEAST.items():
         value = (evaluation if "." in name else config)[name.rpartition(".")[2]]
         if isinstance(value, int) and value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
+    for name, remedy in POSITIVE.items():
+        if config[name] is not None and not config[name] > 0:
+            raise ValueError(f"{name} must be positive, not {config[name]}: {remedy}")
 
 
 def build(

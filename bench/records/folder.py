@@ -5,7 +5,7 @@ import importlib.util
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -15,7 +15,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import OURS, Rerun
+from bench.config import OURS, Rerun, check, check_draw
 from bench.records.files import digest, file_lock, leads_out, link_out, to_json
 from bench.records.record import NEUTRAL_KEYS, RunStatus, read_record
 from bench.tables import own_row
@@ -75,12 +75,18 @@ class Identity:
         return digest([_our_code(), *(_package(name) for name in users), *files])
 
 
-def identify(config: DictConfig, runtime: DictConfig) -> Identity:
-    """The identity of a configuration; `runtime` is `hydra.runtime`, which has the names of the chosen YAMLs.
+def identify(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) -> Identity:
+    """The run that a configuration describes, after all checks of it that need no torch.
+
+    Args:
+        config: without Hydra's own node.
+        runtime: `hydra.runtime`, which has the names of the chosen YAMLs.
+        overrides: of the run.
 
     Raises:
-        ValueError: where the command line removes a part that every run has.
+        ValueError: for an invalid value, and where the command line removes a part that every run has.
     """
+    check_draw(config)
     choices = runtime.choices
     for part in ("task", "renderer", "dataset"):
         if part not in choices:
@@ -92,6 +98,7 @@ def identify(config: DictConfig, runtime: DictConfig) -> Identity:
     seen = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
     named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": seen}
     named["method"] = choices.get("method") or ""
+    check(values, overrides)
     return Identity({name: str(choice) for name, choice in named.items()}, values)
 
 

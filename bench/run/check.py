@@ -9,41 +9,11 @@ from contextlib import redirect_stdout
 from multiprocessing.connection import Connection
 from typing import Any
 
-from omegaconf import DictConfig
-
-from bench.config import Isolation, build, check_draw, check_label, check_names, check_top_level, is_foreign
-from bench.records.folder import Identity, identify
+from bench.config import Isolation, is_foreign
 from bench.records.read import Plan, PlannedCell
-from bench.run.process import BOOT, RunLimits, fork_server, reason_of, signals_delayed, warm_up
-from bench.trackers import Tracker
+from bench.run.process import BOOT, fork_server, reason_of, signals_delayed, warm_up
 
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
-
-
-def identified(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) -> Identity:
-    """The run that a configuration describes, after all checks of it that need no torch.
-
-    Args:
-        config: without Hydra's own node.
-        runtime: `hydra.runtime`.
-        overrides: of the run.
-
-    Raises:
-        ValueError: for an invalid value.
-    """
-    check_draw(config)
-    identity = identify(config, runtime)
-    check_names(identity.config)
-    check_label(identity.config, overrides)
-    check_top_level(identity.config)
-    RunLimits.of(identity.config)
-    tracker_of(identity.config)
-    return identity
-
-
-def tracker_of(config: Mapping[str, Any]) -> Tracker:
-    """The tracker that a run is exported to."""
-    return build(config["tracker"], "tracker", config["packages"])
 
 
 def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, register, type_of, wrong_type
-from bench.records.folder import Identity
-from bench.run.check import identified
+from bench.records.folder import Identity, identify
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
@@ -159,7 +158,7 @@ def _identified(config: DictConfig) -> Identity:
     hydra = HydraConfig.get()
     if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
         config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
-    return identified(config, hydra.runtime, hydra.overrides.task)
+    return identify(config, hydra.runtime, hydra.overrides.task)
 
 
 def _call(program: Callable[[], None]) -> None:

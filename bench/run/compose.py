@@ -19,9 +19,8 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
 from bench.records.files import digest
-from bench.records.folder import Identity
+from bench.records.folder import Identity, identify
 from bench.records.read import Plan, PlannedCell
-from bench.run.check import identified
 
 
 @cache
@@ -115,7 +114,7 @@ def make_plan(config: DictConfig, swept: list[list[str]]) -> Plan:
     for number, overrides in enumerate(swept, 1):
         composed = composer.of(overrides)
         try:
-            identity = identified(composed.config, composed.runtime, overrides)
+            identity = identify(composed.config, composed.runtime, overrides)
         except ValueError as error:
             differing = " ".join(override for override in overrides if override not in common)
             where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""

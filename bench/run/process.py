@@ -4,7 +4,7 @@ import errno
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,7 +14,6 @@ from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any
 
 import psutil
 
@@ -87,17 +86,6 @@ class RunLimits:
 
     seconds: float | None
     memory: float | None
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not self.seconds > 0:
-            raise ValueError(f"time_limit must be positive, not {self.seconds}: 600 is ten minutes, null no limit")
-        if self.memory is not None and not self.memory > 0:
-            raise ValueError(f"memory_limit must be positive, not {self.memory}: 8 is 8 GiB, null all but a tenth")
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> "RunLimits":
-        """The limits that a configuration sets."""
-        return cls(config["time_limit"], config["memory_limit"])
 
     @property
     def bytes(self) -> float:

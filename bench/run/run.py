@@ -11,13 +11,13 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from bench.config import Isolation
+from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
 from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record
-from bench.run.check import refusals, tracker_of
+from bench.run.check import refusals
 from bench.run.command import unwritten
 from bench.run.compose import planned
 from bench.run.plan import show_plan
@@ -137,8 +137,10 @@ def _run_anew(job: Job) -> Record:
 
     try:
         record.write(folder)  # in here, since a signal may come just after it
-        limits, tracker = RunLimits.of(record.config), tracker_of(record.config)
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
+        config = record.config
+        limits = RunLimits(config["time_limit"], config["memory_limit"])
+        tracker = build(config["tracker"], "tracker", config["packages"])
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
         with run_progress(record.name) as progress:
             _carry_out(job, limits, progress, ready)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit

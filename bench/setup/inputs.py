@@ -21,7 +21,7 @@ from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.shape_prior import Prior, PriorSettings, prior_for
 from datasets.own_photographs import Photographed
-from datasets.scene import Dataset, Scene, Split, make_scene, scene_name
+from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, make_scene, scene_name
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.rendering import Renderer, final_notes
@@ -193,7 +193,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     view, auto = parts("view", "auto")
     made, notes = renderer(config["renderer"])
     task, dataset, evaluation, prior, models = parts("task", "dataset", "evaluation", "prior", "models")
-    split, index, threads = Split(config["split"]), config["index"], config["threads"]
+    split, index, threads = *_place(config["split"], config["index"]), config["threads"]
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
     photographed = dataset if isinstance(dataset, Photographed) else None
 
@@ -220,6 +220,15 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     )
     _check(task, inputs, index)
     return Cell(task, inputs, prior, threads)
+
+
+def _place(split: str, index: int) -> tuple[Split, int]:
+    """The place of a shape in a dataset; raises ValueError where no dataset has it."""
+    if split not in list(Split):
+        raise ValueError(f"split must be one of {', '.join(Split)}, not {split!r}")
+    if index >= SPLIT_STRIDE:
+        raise ValueError(f"index must be at most {SPLIT_STRIDE - 1}, not {index}: a split has no more shapes")
+    return Split(split), index
 
 
 def _check(task: Task, inputs: RunInputs, index: int) -> None:

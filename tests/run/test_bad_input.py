@@ -19,7 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, register
 from bench.records import folder as run_folder
-from bench.run.check import identified, refusal
+from bench.records.folder import identify
+from bench.run.check import refusal
 from bench.run.command import _explain, options_first
 from bench.setup import inputs
 from tests.looped import each
@@ -93,7 +94,7 @@ def explained(monkeypatch, *arguments: str) -> str:
         runtime = config.hydra.runtime
         OmegaConf.set_struct(config, False)
         del config["hydra"]
-        return refusal(identified(config, runtime, overrides).config)
+        return refusal(identify(config, runtime, overrides).config)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         return _explain(error)
 
@@ -282,7 +283,7 @@ def test_a_typo_and_help_are_answered_before_anything_slow_is_loaded(tmp_path):
         "code = main()",
         "sys.argv = ['bench', '--help']",
         "main()",
-        "print(*(name for name in ('torch', 'open3d', 'matplotlib', 'pandas') if name in sys.modules))",
+        "print(*(name for name in ('numpy', 'torch', 'open3d', 'pandas') if name in sys.modules))",
         "sys.exit(code)",
     ]
     program = [sys.executable, "-c", "\n".join(code), "renderer.alhpa=1", f"results_dir={tmp_path}"]

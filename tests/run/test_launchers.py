@@ -84,7 +84,7 @@ def folder_of(results: Path, *arguments: str) -> Path:
     runtime = config.hydra.runtime
     OmegaConf.set_struct(config, False)
     del config["hydra"]
-    return results / "runs" / identify(config, runtime).name
+    return results / "runs" / identify(config, runtime, arguments).name
 
 
 @pytest.fixture(scope="module")
