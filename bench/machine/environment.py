@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from bench.records.record import Record
-from renderers.fields.bfloat16 import multiplies_faster
+from renderers.fields.mlp import multiplies_faster
 
 ROOT = Path(__file__).resolve().parents[2]
 GEMM_SIZE = 1024  # of the square matrices whose product is timed

@@ -12,7 +12,7 @@ from bench.machine.limits import LimitReached, Limits
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_of
-from renderers.fields import bfloat16
+from renderers.fields import mlp
 from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.packed_march import Stop
@@ -147,7 +147,7 @@ def test_coarse_values_are_counted_apart_and_limited():
 @pytest.fixture
 def wide(monkeypatch) -> Decoder:
     """A network that offers coarse values on any machine, slowly where they do not pay."""
-    monkeypatch.setattr(bfloat16, "multiplies_faster", lambda device: True)
+    monkeypatch.setattr(mlp, "multiplies_faster", lambda device: True)
     torch.manual_seed(0)
     return Decoder(layers=4, width=256, code_length=8, skip=2, narrow=True).requires_grad_(False)
 
@@ -169,8 +169,8 @@ def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
 
 def test_their_error_is_measured_once_for_each_state_of_the_weights(wide, monkeypatch):
     measured = []
-    largest = bfloat16._largest_error
-    monkeypatch.setattr(bfloat16, "_largest_error", lambda *given: measured.append(1) or largest(*given))
+    largest = mlp._largest_error
+    monkeypatch.setattr(mlp, "_largest_error", lambda *given: measured.append(1) or largest(*given))
     for code in torch.eye(8)[:3]:
         assert wide.at(code).coarse
     assert len(measured) == 1
@@ -196,7 +196,7 @@ def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
     wide.last.weight.requires_grad_(True)
     assert wide.at(code).coarse is None
     wide.requires_grad_(False)
-    monkeypatch.setattr(bfloat16, "multiplies_faster", lambda device: False)
+    monkeypatch.setattr(mlp, "multiplies_faster", lambda device: False)
     assert wide.at(code).coarse is None
 
 
