@@ -11,7 +11,7 @@ from typing import Any
 from bench.records.record import read_record
 
 PARTS = ("metrics", "metrics_start", "evaluations")
-TIMES = ("seconds", "overhead", "gemm", "peak_memory", "wall")  # in the name of a number that no two runs share
+TIMES = ("seconds", "overhead", "gemm", "peak_memory")  # in the name of a number that no two runs share
 
 
 def numbers(record: dict[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,6 @@ ENDED = {
     "field_footprint": "half a pixel (DIST, Eq. 10), in scene units, under which growth ends",
     "field_overhead": "seconds of all fits, also of candidates without improvement, over those of the last one's; "
     "without checkpoints on what is held out",
-    "field_overhead_judged": "the same with checkpoints and with finding the starts",
     "fields_tried": "candidates that were tried",
 }
 
@@ -104,7 +103,6 @@ def ended(growth: Growth) -> dict[str, Any]:
         **error,
         "field_footprint": growth.footprint,
         "field_overhead": growth.overhead,
-        "field_overhead_judged": growth.overhead_judged,
         "fields_tried": len(growth.tried),
     }
 

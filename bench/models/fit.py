@@ -85,7 +85,7 @@ class Fitter:
 
     def begin(self, candidate: Candidate, previous: Model | None, *, evaluate: bool = True) -> Fitted:
         """A candidate's model after its warm start; with `evaluate`, its held-out error is computed as well."""
-        clock, sphere, points = time.perf_counter(), None, self.observations.points
+        sphere, points = None, self.observations.points
         if previous is None and candidate.follows:
             sphere = self.begin(one_part("sphere"), None, evaluate=False)
             previous = sphere.model
@@ -114,7 +114,6 @@ class Fitter:
         if evaluate:
             self._evaluate(fitted)
             fitted.initial_error = fitted.evidence.error
-        fitted.evidence.wall += time.perf_counter() - clock
         return fitted
 
     def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:
@@ -136,13 +135,11 @@ class Fitter:
         """Continues a candidate's fit, then evaluates it; with `checkpoints`, evaluates it on the way as well."""
         if fitted.failed or iterations < 1:
             return
-        clock = time.perf_counter()
         through = self.observations.through(fitted.renderer)
         problem = FitProblem(fitted.model, through, self.settings, fitted.evidence.iterations)
         settings = OptimiserSettings(iterations, fitted.model.learning_rate, "ramped")
         fitted.evidence.iterations += self._run(fitted, problem, settings, checkpoints=checkpoints)
         self._evaluate(fitted)
-        fitted.evidence.wall += time.perf_counter() - clock
 
     def _run(
         self, fitted: Fitted, problem: "FitProblem | WarmStart", settings: OptimiserSettings, *, checkpoints: bool

@@ -97,13 +97,8 @@ class Growth:
         """Seconds of all fits together over those of the final candidate's fit."""
         return self.total("seconds") / max(self.fitted.evidence.seconds, 1e-9)
 
-    @property
-    def overhead_judged(self) -> float:
-        """The same with evaluations on held-out rays and with finding the starts."""
-        return self.total("wall") / max(self.fitted.evidence.wall, 1e-9)
-
     def total(self, name: str) -> float:
-        """The sum over all fits of a cost in Evidence: checkpoints count in `wall` only."""
+        """The sum over all fits of a cost in Evidence."""
         return sum(getattr(evidence, name) for evidence in self.tried)
 
 

@@ -140,7 +140,6 @@ class Evidence:
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
-        wall: seconds in all, with starts and checkpoints.
         iterations: of the fit, without its warm start.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
     """
@@ -155,7 +154,6 @@ class Evidence:
     evaluations: int = 0
     gradients: int = 0
     flops: int = 0
-    wall: float = 0.0
     iterations: int = 0
     checkpoints: list[dict[str, float]] = field(default_factory=list)
 

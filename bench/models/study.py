@@ -4,16 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 
 from bench.models.fit import Fitted, Fitter
 from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence
 from bench.models.observations import Views
-from renderers.boundary import rendered
-from renderers.camera import Rays
 from renderers.checks import check_at_least
-from renderers.field import Counts, Meter
 from renderers.rendering import Renderer
 
 
@@ -101,23 +97,6 @@ class Study:
         if not fitted.failed:
             fitted.evidence.error = self.fitter.observations.error(fitted.model.frozen())
         return fitted.evidence
-
-    @torch.no_grad()
-    def precision(self, fitted: Fitted, rays: Rays) -> dict[str, float]:
-        """Evaluations for rendering rays with either renderer, and the hits that only one of them has."""
-        plain, shape, counts = self.fitter.observations.renderer, fitted.model.frozen(), (Counts(), Counts())
-        hits = [
-            rendered(renderer, Meter(shape, count), rays).hit
-            for renderer, count in zip((plain, self.pixel_precise), counts, strict=True)
-        ]
-        lost, gained = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
-        return {
-            "precision.evaluations": counts[0].value,
-            "precision.evaluations_auto": counts[1].value,
-            "precision.hits": int(hits[0].sum()),
-            "precision.lost": lost,
-            "precision.gained": gained,
-        }
 
     @property
     def _succeeded(self) -> list[Fitted]:

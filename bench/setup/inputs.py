@@ -106,6 +106,13 @@ class RunContext:
     progress: Report
 
     @contextmanager
+    def on_clock(self) -> Iterator[None]:
+        """Within it, the work of a method without a loop: its seconds count as forward ones."""
+        clock = time.perf_counter()
+        yield
+        self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+
+    @contextmanager
     def off_clock(self) -> Iterator[None]:
         """Within it, what is not part of the loop's time: its seconds count as the evaluation's."""
         clock = time.perf_counter()

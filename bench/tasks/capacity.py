@@ -49,10 +49,8 @@ NEEDS = {
     "saved_...": "of the papers' network, over the recommended candidate's; seconds only where the network was fitted",
     "auto....": "the result of early growth (field=auto); its costs are of all candidates that it tried",
     "auto.overhead": "seconds of all fits of early growth over those of its final candidate's, without checkpoints",
-    "auto.overhead_judged": "the same with checkpoints and with finding the starts",
     "frugal....": "the recommended candidate fitted again at pixel precision: renderer.epsilon=auto, "
     "renderer.steps=auto and the rays of an iteration from the loss",
-    "precision....": "held-out rays rendered at the renderer's own epsilon and steps, and at auto (Eqs. 8, 10)",
     "held_out_seeds": "random draws of views that no choice has used",
     "held_out_seeds_within, held_out_seeds_held": "share of the draws on which the recommended candidate is within "
     "one standard error of the draw's best one; on which it is that or under the footprint",
@@ -109,7 +107,7 @@ class Capacity:
             _note_costs(run, fitter, observations, [*growth.tried, *evidence])
             choice, chosen = study.choose()
             metrics = needs(choice, evidence, growth) | study.check(chosen, views, self.checks)
-            metrics |= costs("frugal", study.refit(chosen)) | study.precision(chosen, observations.held_out.rays)
+            metrics |= costs("frugal", study.refit(chosen))
         result = evaluate(chosen.model.frozen(), inputs)
         record.metrics = result.metrics | {"footprint": views.footprint} | metrics
         record.status, record.reason = RunStatus.OK, ""
@@ -171,7 +169,6 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
     for fit in evidence:
         metrics |= costs(fit.candidate, fit)
     metrics |= {"auto.field": last.candidate, **costs("auto", last), "auto.overhead": growth.overhead}
-    metrics["auto.overhead_judged"] = growth.overhead_judged
     metrics |= {f"auto.{name}": growth.total(name) for name in ("seconds", "evaluations", "flops")}
     if last.error is not None:
         target = last.mean + last.error.standard_error
@@ -198,13 +195,12 @@ def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
 
 
 def pixel_precision_summary(metrics: dict[str, Any], candidate: str) -> list[str]:
-    """The fit at pixel precision compared with the plain one, and what rendering at that precision changes."""
+    """The fit at pixel precision compared with the plain one."""
     if "frugal.error" not in metrics:
         return [f"the fit ended as {metrics['frugal.failed']}"]
     values = metrics["frugal.evaluations"] / max(metrics[f"{candidate}.evaluations"], 1)
-    missed, gained, hits = (metrics[f"precision.{name}"] for name in ("lost", "gained", "hits"))
     error = f"error (x1000) {1000 * metrics['frugal.error']:.3g} instead of {1000 * metrics[f'{candidate}.error']:.3g}"
-    return [f"{error}, {100 * values:.0f} % of the field values; {missed} of {hits} hits missed, {gained} gained"]
+    return [f"{error}, {100 * values:.0f} % of the field values"]
 
 
 def summary(choice: Choice, growth: Growth) -> str:

@@ -1,6 +1,5 @@
 """Camera pose without a renderer: Open3D's iterative closest points on the same depth image."""
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,14 +60,13 @@ class PoseICP(PoseTask):
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
         record.metrics_start = self.evaluate(cameras[0], inputs.scene).metrics
         points, normals = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
-        clock = time.perf_counter()
         tried = []
-        for camera in cameras:
-            run.progress("registering points", len(tried), len(cameras))
-            tried.append(self._register(camera, view, points, normals))
+        with run.on_clock():
+            for camera in cameras:
+                run.progress("registering points", len(tried), len(cameras))
+                tried.append(self._register(camera, view, points, normals))
         run.progress("registering points", len(tried), len(cameras))
         found, distance = min(tried, key=lambda result: result[1])
-        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         with run.off_clock():
             after = self.evaluate(found, inputs.scene)

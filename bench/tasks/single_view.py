@@ -1,6 +1,5 @@
 """Shape and colour from one image, by a network trained on many shapes (DVR, Sec. 4.1)."""
 
-import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -252,12 +251,11 @@ class OneImage:
             mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.given
         else:
             others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
-            clock = time.perf_counter()
-            if self.method == NEAREST:
-                place = most_alike(images.image(self.given), others)
-            else:
-                place = best_shape(inputs.scene.mesh, recipe.dataset, count)
-            record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+            with run.on_clock():
+                if self.method == NEAREST:
+                    place = most_alike(images.image(self.given), others)
+                else:
+                    place = best_shape(inputs.scene.mesh, recipe.dataset, count)
             mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), others[place].shots()
             record.notes.append(f"training shape {place}")
         with run.off_clock():
@@ -275,10 +273,9 @@ def _inferred(
     run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]
 ) -> tuple[OccupancyOf, Mesh | None]:
     """The shape that an image shows, with its mesh, on the run's clock."""
-    clock = time.perf_counter()
-    shape = model.at(model(image[None].to(run.inputs.device))[0])
-    mesh = surface_of(shape, run.inputs)
-    run.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+    with run.on_clock():
+        shape = model.at(model(image[None].to(run.inputs.device))[0])
+        mesh = surface_of(shape, run.inputs)
     return shape, mesh
 
 

@@ -1,6 +1,5 @@
 """The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -44,10 +43,9 @@ class _Photographs(ABC):
             self.images, self.depths, inputs, longest=self.longest, every=self.held_out, masks=self.masks
         )
         record.notes = [*record.notes, subject.found, "no renderer took part"]
-        clock = time.perf_counter()
-        mesh = cut_off(self.surface(subject))
-        mesh = None if mesh is None else with_colours(mesh, subject.given)
-        record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        with run.on_clock():
+            mesh = cut_off(self.surface(subject))
+            mesh = None if mesh is None else with_colours(mesh, subject.given)
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
             note_surface(run, mesh, subject, {})

@@ -62,7 +62,6 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert metrics["auto.field"] == "rounded_box"
     assert metrics["auto.overhead"] > 1
     assert metrics["auto.evaluations"] > metrics["rounded_box.evaluations"]
-    assert metrics["precision.evaluations_auto"] < metrics["precision.evaluations"]
     assert metrics["frugal.evaluations"] < metrics["rounded_box.evaluations"]
     assert 0 <= metrics["held_out_seeds_within"] <= metrics["held_out_seeds_held"] == 1
     assert metrics["chamfer_l2"] < 0.01
@@ -73,10 +72,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert [note.split()[2] for note in settings] == ["renderer.epsilon=auto", "renderer.steps=auto"]
     saved = next(note for note in record.notes if note.startswith("pixel precision: error"))
     values = 100 * metrics["frugal.evaluations"] / metrics["rounded_box.evaluations"]
-    assert (
-        f", {values:.0f} % of the field values; {metrics['precision.lost']} of {metrics['precision.hits']} hits missed"
-        in saved
-    )
+    assert saved.endswith(f", {values:.0f} % of the field values")
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert {line["candidate"] for line in lines} == {"sphere", "rounded_box"}
