@@ -9,11 +9,12 @@ from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
 from bench.models.candidates import by_size
 from bench.models.fit import FitProblem, Fitter
 from bench.models.growth import Growth, grow
+from bench.models.model import Evidence
 from bench.models.observations import RayObservations
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
 from bench.records.files import curve_file
-from bench.records.record import RunStatus
+from bench.records.record import Record, RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS, InverseTask, check_field_gradient, draw, note_costs, note_result
 from datasets.scene import Scene
@@ -69,7 +70,7 @@ def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
         settings = replace(choice.models.fit, iterations=task.optimiser.iterations)
         fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
         growth = grow(fitter, by_size(choice.candidates, choice.models.size), choice.models.growth)
-    _note_growth(run, fitter, growth, observed=int(given.observed.sum()))
+    note_fits(record, growth.tried, fitter)
     with run.off_clock():
         first, last = growth.first, growth.fitted.model.frozen()
         record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
@@ -122,16 +123,17 @@ def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | Non
     return None
 
 
-def _note_growth(run: RunContext, fitter: Fitter, growth: Growth, *, observed: int) -> None:
-    iterations, values = sum(evidence.iterations for evidence in growth.tried), int(growth.total("evaluations"))
-    rays = max(iterations * fitter.observations.rays, 1)
+def note_fits(record: Record, fits: list[Evidence], fitter: Fitter) -> None:
+    """Notes the costs of fits in the record."""
+    observations = fitter.observations
+    iterations, values = sum(fit.iterations for fit in fits), sum(fit.evaluations for fit in fits)
     evaluations = {
         "value": values,
-        "gradient": int(growth.total("gradients")),
-        "per_ray": growth.total("evaluations") / rays,
-        "rays_per_iteration": fitter.observations.rays,
-        "observed": observed,
+        "gradient": sum(fit.gradients for fit in fits),
+        "per_ray": values / max(iterations * observations.rays, 1),
+        "rays_per_iteration": observations.rays,
+        "observed": int(observations.given.observed.sum() + observations.held_out.observed.sum()),
         "iterations": iterations,
     }
     seconds = {"forward": 0.0, "backward": 0.0} | fitter.spent
-    note_costs(run.record, seconds=seconds, flops=int(growth.total("flops")), evaluations=evaluations)
+    note_costs(record, seconds=seconds, flops=int(sum(fit.flops for fit in fits)), evaluations=evaluations)

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench.models.candidates import one_part
-from bench.models.held_out import HeldOutError
 from bench.models.model import Candidate, Evidence, Model, Seen
 from bench.models.observations import RayObservations, generator
 from bench.records.record import RunStatus
@@ -46,7 +45,6 @@ class Fitted:
         model: its current field.
         renderer: through which it is fitted, with its own measured thickness where it follows the shape.
         evidence: its result and cost so far.
-        initial_error: its held-out error after the warm start, where it was evaluated.
     """
 
     candidate: Candidate
@@ -54,7 +52,6 @@ class Fitted:
     model: Model
     renderer: Renderer
     evidence: Evidence
-    initial_error: HeldOutError | None = None
 
     @property
     def failed(self) -> bool:
@@ -113,7 +110,6 @@ class Fitter:
             fitted.evidence.flops += sum(counts.flops(previous.frozen()) or 0 for counts in counted)
         if evaluate:
             self._evaluate(fitted)
-            fitted.initial_error = fitted.evidence.error
         return fitted
 
     def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:

@@ -117,7 +117,7 @@ def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) 
     short = min(max(ceil(settings.trial * whole), MIN_TRIAL), ceil(whole / 4))
     _load()
     smallest, end = fitter.begin(candidates[0], None), "there is no larger candidate"
-    first, initial_error = smallest.model.frozen(), smallest.initial_error
+    first, initial_error = smallest.model.frozen(), smallest.evidence.error
     fits = {candidates[0].name: smallest}
 
     def trial(candidate: Candidate, trials: Trials) -> Evidence | None:

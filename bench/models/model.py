@@ -71,7 +71,6 @@ class Model:
 
     @property
     def size(self) -> Size:
-        """Its free and its stored numbers."""
         free = sum(parameter.numel() for parameter in self.parameters)
         return Size(free, free + self.held, self.sparse_bytes)
 

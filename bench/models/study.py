@@ -1,7 +1,7 @@
 """Fits all candidates to one shape, chooses the one that it needs, and checks that choice."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,63 +44,42 @@ class Choice:
     enough: bool  # its error is under the footprint
 
 
-@dataclass
-class Study:
-    """The fits of all candidates to the same observations.
+def fit_all(fitter: Fitter, candidates: list[Candidate]) -> Iterator[Fitted]:
+    """Fits every candidate; each may begin from the best one before it."""
+    fitter, best = replace(fitter, part="fit_all"), None
+    for candidate in candidates:
+        fitted = fitter.begin(candidate, None if best is None else best.model)
+        fitter.fit(fitted, fitter.settings.iterations, checkpoints=True)
+        if not fitted.failed and (best is None or fitted.evidence.mean < best.evidence.mean):
+            best = fitted
+        yield fitted
+
+
+def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSettings, *, seed: int) -> dict[str, float]:
+    """The share of random draws of further views on which the choice holds; see `shares`."""
+    further = views.further(settings.views, seed)
+    errors = {fit: further.error(fit.model.frozen(), views.renderer) for fit in fits if not fit.failed}
+    return shares(errors[chosen], list(errors.values()), settings, footprint=views.footprint, seed=seed)
+
+
+def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: float) -> Evidence:
+    """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
 
     Args:
-        fitter: fits with the configured renderer.
-        pixel_precise: the same renderer at pixel precision.
-        fewest_rays: share of the rays that the fit at pixel precision begins with.
-        measure: of size, by which the smallest candidate is chosen.
+        chosen: the candidate.
+        fitter: that fitted it.
+        renderer: at pixel precision; the fit is evaluated as all others are.
+        fewest_rays: share of the rays that it begins with.
     """
-
-    fitter: Fitter
-    pixel_precise: Renderer
-    fewest_rays: float
-    measure: str
-    fits: list[Fitted] = field(default_factory=list)
-
-    def fit_all(self, candidates: list[Candidate]) -> Iterator[Fitted]:
-        """Fits every candidate; each may begin from the best one before it."""
-        fitter = replace(self.fitter, part="fit_all")
-        for candidate in candidates:
-            best = min(self._succeeded, key=lambda fitted: fitted.evidence.mean, default=None)
-            fitted = fitter.begin(candidate, None if best is None else best.model)
-            fitter.fit(fitted, fitter.settings.iterations, checkpoints=True)
-            self.fits.append(fitted)
-            yield fitted
-
-    def choose(self) -> tuple[Choice, Fitted]:
-        """The recommended candidate and its fit."""
-        evidence = [fitted.evidence for fitted in self.fits]
-        choice = choose(evidence, self.fitter.observations.footprint, self.measure)
-        return choice, next(fitted for fitted in self.fits if fitted.evidence is choice.chosen)
-
-    def check(self, chosen: Fitted, views: Views, settings: CheckSettings) -> dict[str, float]:
-        """The share of random draws of further views on which the choice holds; see `shares`."""
-        observations, further = self.fitter.observations, views.further(settings.views, self.fitter.seed)
-        errors = {fitted: further.error(fitted.model.frozen(), observations.renderer) for fitted in self._succeeded}
-        footprint, seed = observations.footprint, self.fitter.seed
-        return shares(errors[chosen], list(errors.values()), settings, footprint=footprint, seed=seed)
-
-    def refit(self, chosen: Fitted) -> Evidence:
-        """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
-
-        It is evaluated as all others are.
-        """
-        settings = replace(self.fitter.settings, fewest_rays=self.fewest_rays)
-        observations = self.fitter.observations.through(self.pixel_precise)
-        fitter = replace(self.fitter, settings=settings, observations=observations, part="frugal", spent={})
-        fitted = fitter.begin(chosen.candidate, chosen.previous, evaluate=False)
-        fitter.fit(fitted, settings.iterations, checkpoints=False)
-        if not fitted.failed:
-            fitted.evidence.error = self.fitter.observations.error(fitted.model.frozen())
-        return fitted.evidence
-
-    @property
-    def _succeeded(self) -> list[Fitted]:
-        return [fitted for fitted in self.fits if fitted.evidence.error is not None]
+    settings = replace(fitter.settings, fewest_rays=fewest_rays)
+    frugal = replace(
+        fitter, settings=settings, observations=fitter.observations.through(renderer), part="frugal", spent={}
+    )
+    fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
+    frugal.fit(fitted, settings.iterations, checkpoints=False)
+    if not fitted.failed:
+        fitted.evidence.error = fitter.observations.error(fitted.model.frozen())
+    return fitted.evidence
 
 
 def shares(

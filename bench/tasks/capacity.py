@@ -5,12 +5,12 @@ from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
 from bench.models.candidates import PAPERS, by_size, candidate
-from bench.models.field import SIZES
-from bench.models.fit import Fitter
+from bench.models.field import SIZES, note_fits
+from bench.models.fit import Fitted, Fitter
 from bench.models.growth import Growth, grow
 from bench.models.model import Evidence, Size
-from bench.models.observations import RayObservations, Views
-from bench.models.study import CheckSettings, Choice, Study
+from bench.models.observations import Views
+from bench.models.study import CheckSettings, Choice, check, choose, fit_all, refit
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates
 from bench.records.files import curve_file
@@ -96,18 +96,22 @@ class Capacity:
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
-            pixel_precise, settings_notes = inputs.pixel_precise
-            study = Study(fitter, pixel_precise, self.frugal_rays, models.size)
             growth = grow(fitter, candidates, models.growth)
-            for fitted in study.fit_all(candidates):
-                record.metrics |= costs(fitted.candidate.name, fitted.evidence)  # in case the run is stopped
-                filmstrip.add(fitted.candidate.name, fitted.model.frozen())
-                run.progress("fitting all candidates", len(study.fits), len(candidates), fitted.evidence.mean)
-            evidence = [fitted.evidence for fitted in study.fits]
-            _note_costs(run, fitter, observations, [*growth.tried, *evidence])
-            choice, chosen = study.choose()
-            metrics = needs(choice, evidence, growth) | study.check(chosen, views, self.checks)
-            metrics |= costs("frugal", study.refit(chosen))
+            fits: dict[str, Fitted] = {}
+            for fitted in fit_all(fitter, candidates):
+                name = fitted.candidate.name
+                fits[name] = fitted
+                record.metrics |= costs(name, fitted.evidence)  # in case the run is stopped
+                filmstrip.add(name, fitted.model.frozen())
+                run.progress("fitting all candidates", len(fits), len(candidates), fitted.evidence.mean)
+            evidence = [fitted.evidence for fitted in fits.values()]
+            note_fits(record, [*growth.tried, *evidence], fitter)
+            choice = choose(evidence, views.footprint, models.size)
+            chosen = fits[choice.chosen.candidate]
+            checked = check(chosen, list(fits.values()), views, self.checks, seed=inputs.seed)
+            renderer, settings_notes = inputs.pixel_precise
+            frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
+            metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
         result = evaluate(chosen.model.frozen(), inputs)
         record.metrics = result.metrics | {"footprint": views.footprint} | metrics
         record.status, record.reason = RunStatus.OK, ""
@@ -115,27 +119,14 @@ class Capacity:
             record.status, record.reason = RunStatus.EMPTY, "the recommended field has no surface in the unit sphere"
         else:
             result.mesh.save(run.folder / "mesh.ply")
-        saving = pixel_precision_summary(metrics, chosen.candidate.name)
-        precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, *saving]]
+        saving = pixel_precision_summary(frugal, chosen.evidence)
+        precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, saving]]
         record.notes = [*record.notes, summary(choice, growth), *final_notes(chosen.renderer), *precision_notes]
         filmstrip.save(
             run.folder, f"{record.title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name
         )
         if inputs.evaluation.picture is not None:
             draw_candidates(run.folder, record.metrics, record.title)
-
-
-def _note_costs(run: RunContext, fitter: Fitter, observations: RayObservations, evidence: list[Evidence]) -> None:
-    rays = sum(candidate.iterations for candidate in evidence) * observations.rays
-    values = sum(candidate.evaluations for candidate in evidence)
-    run.record.seconds |= fitter.spent
-    run.record.flops = sum(candidate.flops for candidate in evidence)
-    run.record.evaluations = {
-        "value": values,
-        "gradient": sum(candidate.gradients for candidate in evidence),
-        "per_ray": values / max(rays, 1),
-        "observed": int(observations.given.observed.sum() + observations.held_out.observed.sum()),
-    }
 
 
 def costs(name: str, evidence: Evidence) -> dict[str, Any]:
@@ -194,13 +185,13 @@ def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     return {f"saved_{key}": ratio for key, ratio in ratios.items()}
 
 
-def pixel_precision_summary(metrics: dict[str, Any], candidate: str) -> list[str]:
+def pixel_precision_summary(frugal: Evidence, plain: Evidence) -> str:
     """The fit at pixel precision compared with the plain one."""
-    if "frugal.error" not in metrics:
-        return [f"the fit ended as {metrics['frugal.failed']}"]
-    values = metrics["frugal.evaluations"] / max(metrics[f"{candidate}.evaluations"], 1)
-    error = f"error (x1000) {1000 * metrics['frugal.error']:.3g} instead of {1000 * metrics[f'{candidate}.error']:.3g}"
-    return [f"{error}, {100 * values:.0f} % of the field values"]
+    if frugal.error is None:
+        return f"the fit ended as {frugal.status}: {frugal.reason}"
+    share = frugal.evaluations / max(plain.evaluations, 1)
+    error = f"error (x1000) {1000 * frugal.mean:.3g} instead of {1000 * plain.mean:.3g}"
+    return f"{error}, {100 * share:.0f} % of the field values"
 
 
 def summary(choice: Choice, growth: Growth) -> str:
