@@ -2,17 +2,18 @@
 
 import math
 import sys
-
-import pytest
+from pathlib import Path
 
 import bench.studies
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import choose
 from bench.report.write import paper
+from bench.report.write.caption import SMOKE
 from bench.report.write.paper import find_paper, papers, studies, write_paper
-from bench.report.write.result import Shown
+from bench.report.write.result import Shown, read_shown
 from bench.studies import table1
+from tests.looped import each
 from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
 
 STUDY = """
@@ -36,8 +37,8 @@ def record(**changed) -> dict:
     return {"renderer": "dist", "method": "", "dataset": "car", "config": {}, **changed}
 
 
-@pytest.mark.parametrize(
-    ("changed", "preset", "name"),
+@each(
+    "changed, preset, name",
     [
         ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
         ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
@@ -50,8 +51,8 @@ def test_a_row_is_its_preset_under_a_name(changed, preset, name):
     assert row_of(record(**changed)) == Row(preset, name)
 
 
-@pytest.mark.parametrize(
-    ("renderer", "target", "base"),
+@each(
+    "renderer, target, base",
     [
         ("dist_aggressive", "renderers.DIST", "dist"),
         ("dvr", "renderers.DVR", "dvr"),
@@ -133,3 +134,37 @@ def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path)
     runs = choose(read_records(tmp_path)[0], table1.READS[0], tmp_path)
     assert list(runs.frame.row) == [DYNAMIC, NAIVE] and list(runs.frame.status) == ["ok", "timeout"]
     assert list(runs.error("queries", 1.0)) == [7.0, math.inf] and runs.left_out == 2
+
+
+PAPER = Path(__file__).parents[2] / "results" / "paper"
+PICTURES = {
+    *("single_view_figures", "dvr_figures", "completion_gallery", "misplaced_gallery", "multiview_gallery"),
+    *("rerendering", "stability_curves"),
+}
+
+
+def test_every_shipped_page_has_a_question_and_a_verdict_with_a_number():
+    for path in PAPER.glob("*.json"):
+        shown, name = read_shown(path), path.stem
+        assert shown.title.endswith(".") and shown.caption and (shown.rows or shown.drawn or shown.chart), name
+        assert all(len(row) == len(shown.columns) for row in shown.rows), name
+        if name in PICTURES:
+            continue
+        assert shown.question.endswith("?") and shown.verdict.endswith("."), name
+        marked = shown.verdict.split("*")[1::2]
+        assert marked and all(any(c.isdigit() for c in part) for part in marked), name
+        assert shown.verdict.count("*") % 2 == 0 and "nan" not in shown.verdict and len(shown.verdict) < 400, name
+
+
+def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
+    for label in ("quick", "slow"):
+        write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
+    write_paper(read_records(tmp_path)[0], tmp_path)
+    shown = read_shown(tmp_path / "paper" / "table1.json")
+    assert shown.verdict == SMOKE and shown.question.endswith("?") and shown.experiments == ["table1"]
+
+
+@each("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])
+def test_an_odd_file_beside_a_table_adds_nothing(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    assert read_shown(tmp_path / "a.json") == Shown()
