@@ -11,10 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import file_lock, leads_out, link_out
 from bench.records.folder import content_of, put_into, set_aside
 from bench.records.read import check_links, run_folders
-from bench.records.record import read_record
+from bench.records.record import file_lock, leads_out, link_out, read_record
 from bench.report.write.html import write_index
 
 UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from bench.machine.environment import describe
 from bench.progress import Report, notice
-from bench.records.files import digest, file_lock, to_json, write_text
+from bench.records.record import digest, file_lock, to_json, write_text
 from datasets.mesh import Mesh
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from renderers.checks import check_at_least, check_positive

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bench.records.files import is_plain_name, write_text
 from bench.records.format import number
 from bench.records.read import RESULTS, read_records
+from bench.records.record import is_plain_name, write_text
 from bench.report.data.records import Record
 from bench.report.data.runs import Runs, choose, shared_loss
 from bench.report.tuning import (

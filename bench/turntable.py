@@ -15,8 +15,7 @@ from torch import Tensor
 
 from bench.evaluate.colours import painted
 from bench.pictures.run_figures import LIGHT, normals_image, picture_normals
-from bench.records.files import leads_out
-from bench.records.record import read_record
+from bench.records.record import leads_out, read_record
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import Truth, View, see

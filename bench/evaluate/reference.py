@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.progress import notice
-from bench.records.files import digest
+from bench.records.record import digest
 from bench.shape_prior import Prior, kept
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals, steepest

@@ -13,8 +13,7 @@ from bench.models.model import Evidence
 from bench.models.observations import RayObservations
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
-from bench.records.files import curve_file
-from bench.records.record import Record, RunStatus
+from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS, InverseTask, check_field_gradient, draw, note_costs, note_result
 from datasets.scene import Scene

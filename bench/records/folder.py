@@ -16,8 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import OURS, Rerun, check, check_draw
-from bench.records.files import digest, file_lock, leads_out, link_out, to_json
-from bench.records.record import NEUTRAL_KEYS, RunStatus, read_record
+from bench.records.record import NEUTRAL_KEYS, RunStatus, digest, file_lock, leads_out, link_out, read_record, to_json
 from bench.tables import own_row
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,8 +8,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import decoded, is_plain_name, leads_out, link_out, to_json, write_text
-from bench.records.record import NOT_RUN, SCHEMA, Record, now, read_record, started
+from bench.records.record import (
+    NOT_RUN,
+    SCHEMA,
+    Record,
+    decoded,
+    is_plain_name,
+    leads_out,
+    link_out,
+    now,
+    read_record,
+    started,
+    to_json,
+    write_text,
+)
 
 RESULTS = "results/local"  # the results folder unless another is given, as conf/config.yaml has it
 PLAN = "plan.json"

@@ -18,9 +18,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
-from bench.records.files import digest
 from bench.records.folder import Identity, identify
 from bench.records.read import Plan, PlannedCell
+from bench.records.record import digest
 
 
 @cache

@@ -13,10 +13,9 @@ from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
-from bench.records.files import write_text
 from bench.records.folder import Claim, Identity, claimed, release, reusable
 from bench.records.read import Plan
-from bench.records.record import Record, RunStatus, now, read_record
+from bench.records.record import Record, RunStatus, now, read_record, write_text
 from bench.run.check import refusals
 from bench.run.command import unwritten
 from bench.run.compose import planned

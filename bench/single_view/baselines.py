@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import surface_metrics
 from bench.progress import Report
-from bench.records.files import digest
+from bench.records.record import digest
 from bench.setup.inputs import RunInputs
 from bench.shape_prior import kept
 from bench.single_view.images import ImagesOf

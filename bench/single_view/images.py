@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
-from bench.records.files import digest
+from bench.records.record import digest
 from bench.shape_prior import kept
 from datasets.captures.hull import carve
 from datasets.mesh import Mesh

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from bench.machine.environment import describe
 from bench.progress import Report
-from bench.records.files import digest, file_lock, to_json, write_text
+from bench.records.record import digest, file_lock, to_json, write_text
 from bench.shape_prior import save_whole
 from bench.single_view.images import VERSION as IMAGES
 from bench.single_view.images import ImagesOf, Imaging

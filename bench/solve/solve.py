@@ -13,8 +13,7 @@ from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
-from bench.records.files import curve_file
-from bench.records.record import Record, RunStatus
+from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise

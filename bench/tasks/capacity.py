@@ -13,8 +13,7 @@ from bench.models.observations import Views
 from bench.models.study import CheckSettings, Choice, check, choose, fit_all, refit
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates
-from bench.records.files import curve_file
-from bench.records.record import RunStatus
+from bench.records.record import RunStatus, curve_file
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES

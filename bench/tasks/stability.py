@@ -8,8 +8,7 @@ import numpy as np
 from bench.machine.limits import Limits
 from bench.pictures.run_figures import draw_failure
 from bench.pictures.style import PIXEL_NAMES
-from bench.records.files import curve_file
-from bench.records.record import RunStatus
+from bench.records.record import RunStatus, curve_file
 from bench.setup.inputs import RunContext
 from bench.solve.solve import Unsupported
 from bench.stress import fit, judge

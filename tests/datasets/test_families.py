@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.config import CONF, load
-from bench.records.files import digest
+from bench.records.record import digest
 from bench.tables import read_rows
 from datasets.families import BUILDERS, HALF_GRID, Family, bounded
 from datasets.scene import SPLIT_STRIDE, Split, seed_of

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.files import digest, to_json, write_text
 from bench.records.read import read_records
-from bench.records.record import Record, RunStatus
+from bench.records.record import Record, RunStatus, digest, to_json, write_text
 
 
 def new_folder(results: Path) -> Path:

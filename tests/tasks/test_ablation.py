@@ -14,8 +14,7 @@ from matplotlib.image import imread
 from bench.config import load
 from bench.evaluate.reference import Reference
 from bench.machine.limits import Limits
-from bench.records.files import to_json
-from bench.records.record import RunStatus
+from bench.records.record import RunStatus, to_json
 from bench.setup.inputs import RunContext
 from bench.solve.solve import Unsupported
 from bench.tasks import ablation

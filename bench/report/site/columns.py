@@ -4,11 +4,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import digest, plain
 from bench.records.format import plural
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.names import in_order, settings_of, told_apart
-from bench.records.record import NEUTRAL_KEYS, row_name, started
+from bench.records.record import NEUTRAL_KEYS, digest, plain, row_name, started
 from bench.report.data.records import (
     OURS,
     Record,

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from bench.records.files import leads_out
-from bench.records.record import PICTURES
+from bench.records.record import PICTURES, leads_out
 from bench.report.write.paper import key_of, link
 
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.records.files import file_lock, plain, write_bytes, write_text
 from bench.records.read import check_results, read_records
+from bench.records.record import file_lock, plain, write_bytes, write_text
 from bench.report.site.columns import columns
 from bench.report.site.detail import detail
 from bench.report.site.files import Folder

@@ -12,8 +12,8 @@ from pkgutil import iter_modules
 from typing import Any
 from urllib.parse import quote
 
-from bench.records.files import leads_out, write_text
 from bench.records.read import PLAN
+from bench.records.record import leads_out, write_text
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.caption import SMOKE
 from bench.report.write.result import Result, Shown, markdown, read_shown, write

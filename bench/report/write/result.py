@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
-from bench.records.files import plain
+from bench.records.record import plain
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
