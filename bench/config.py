@@ -294,15 +294,6 @@ def _lacking(cls: type, role: type) -> str:
     return f"it lacks {', '.join(missing)}: see {role.__module__}" if missing else ""
 
 
-def is_foreign(node: Any) -> bool:
-    """Whether a configuration, or a part of it, names a class of a package that is not ours."""
-    if isinstance(node, list):
-        return any(map(is_foreign, node))
-    if not isinstance(node, Mapping):
-        return False
-    return str(node.get("_target_", OURS[0])).split(".")[0] not in OURS or any(map(is_foreign, node.values()))
-
-
 def build_once(
     nodes: Mapping[str, Any], packages: Sequence[str], targets: Mapping[str, str], built: dict[str, Any]
 ) -> list[Any]:

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import timedelta
 from typing import Protocol, runtime_checkable
 
 from rich.console import Console
@@ -16,12 +15,10 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
-    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
 PLAIN = 15.0  # seconds between two printed lines of a phase, where there is no terminal
 NARROW = 80  # columns of a terminal, below which a line of progress has no room for a bar
@@ -56,18 +53,9 @@ def notices_to(receive: Callable[[str], None]) -> None:
     _receive = receive
 
 
-class _Left(TimeRemainingColumn):
-    """The time left: the one that a task says, in seconds under `left`, or else one by its speed so far."""
-
-    def render(self, task: Task) -> Text:
-        if (left := task.fields.get("left")) is None:
-            return super().render(task)
-        return Text(str(timedelta(seconds=round(left))), style="progress.remaining")
-
-
 def columns(width: int) -> list[ProgressColumn]:
     """What a line of progress shows; on a narrow terminal its name, how many are done, and the time left."""
-    name, count, left = TextColumn("{task.description}", markup=False), MofNCompleteColumn(), _Left()
+    name, count, left = TextColumn("{task.description}", markup=False), MofNCompleteColumn(), TimeRemainingColumn()
     if width < NARROW:
         return [name, count, left]
     padded, said = TextColumn("{task.description:<28}", markup=False), TextColumn("{task.fields[said]}", markup=False)

@@ -1,110 +1,115 @@
-"""What runs will take, by finished ones: `plan=true` lists runs and starts none; the time left of a sweep."""
+"""Runs that are planned: each is checked before any starts; `plan=true` lists them, and what finished ones took.
 
+A configuration is built by the code that its run builds it with, `bench.setup.inputs.cell_of`.
+"""
+
+import io
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping
+from contextlib import redirect_stdout
+from dataclasses import asdict
 from statistics import median
 from typing import Any
 
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
+from bench.run.process import reason_of
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
+HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
 
 
 class Shown(BaseException):
     """A plan was shown in place of a sweep. Not an Exception, which Hydra would turn into a warning."""
 
 
-class Estimates:
-    """The seconds of finished runs, by task, renderer, method and scale."""
-
-    def __init__(self, records: Iterable[dict[str, Any]] = ()) -> None:
-        self.known: dict[Any, list[float]] = defaultdict(list)
-        for record in records:
-            self.add(record)
-
-    def add(self, record: dict[str, Any]) -> None:
-        """Learns from a run that took its whole time."""
-        total = record["seconds"].get("total")
-        if record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf"):
-            self.known[_kind(record)].append(total)
-
-    def of(self, planned: dict[str, Any]) -> list[float]:
-        """The seconds of the finished runs with the same task, renderer, method and scale."""
-        return self.known.get(_kind(planned), [])
-
-
-def _kind(record: dict[str, Any]) -> Any:
-    scale = record["config"].get("scale")
-    name = str(scale.get("name")) if isinstance(scale, dict) else None
-    return record["task"], record["renderer"], record.get("method", ""), name
-
-
-@dataclass
-class Remaining:
-    """What is left of a sweep.
+def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
+    """Why the run of a configuration would be refused; empty where it would not, or would fail in another way.
 
     Args:
-        cells: those that are not reused, by their ids.
-        estimates: of the results folder; they learn from each cell that ends.
-        workers: how many cells run at a time.
-        latest: when a cell ended last, in seconds since the sweep began.
+        config: resolved, as plain data.
+        built: what cells of a sweep share; see `cell_of`.
     """
+    from bench.setup.inputs import cell_of  # it imports torch
 
-    cells: dict[str, dict[str, Any]]
-    estimates: Estimates = field(default_factory=Estimates)
-    workers: int = 1
-    latest: float = 0.0
-
-    def ended(self, cell: str, record: dict[str, Any], elapsed: float) -> None:
-        """Notes that a cell has ended."""
-        if self.cells.pop(cell, None) is not None:
-            self.latest = elapsed
-            if not record.get("reused"):  # another command ran it meanwhile
-                self.estimates.add(record)
-
-    def left(self, elapsed: float) -> float | None:
-        """Seconds left, `elapsed` seconds after the sweep began; None where no finished run is like one of them."""
-        known = [median(like) for cell in self.cells.values() if (like := self.estimates.of(cell))]
-        if not known and self.cells:
-            return None
-        whole = sum(known) / max(len(known), 1) * len(self.cells) / self.workers  # the others take what these take
-        return max(whole - (elapsed - self.latest), 0.0)
+    try:
+        with redirect_stdout(io.StringIO()):  # of classes of the user's
+            cell_of(config, built)
+    except (ValueError, OSError) as error:
+        return reason_of(error)
+    except Exception:  # noqa: BLE001 - of a class of the user's; the run records it
+        return ""
+    return ""
 
 
-def remaining(plan: Plan, reused: set[str], workers: int) -> Remaining:
-    """What a sweep has to do, as it is before its first cell."""
-    records = read_records(plan.results_dir)[0] if plan.results_dir.is_dir() else []
-    cells = {cell.id: asdict(cell) for cell in plan.cells if cell.id not in reused}
-    return Remaining(cells, Estimates(records), max(1, min(workers, len(cells))))
+def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
+    """Checks all cells of a sweep, before it is written down.
+
+    Args:
+        plan: the sweep.
+        launcher: the choice of `hydra/launcher`; another machine may have a GPU where this one has none.
+        reused: ids of the cells whose finished run is there already, so that they need not be checked.
+
+    Raises:
+        ValueError: for an invalid cell, with the cell and what is wrong with it.
+    """
+    away = {} if launcher in HERE else {"device": "cpu"}
+    cells = [cell for cell in plan.cells if cell.id not in reused]
+    built: dict[str, Any] = {}  # what they share
+    found = [refusal(cell.config | away, built) for cell in cells]
+    bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]
+    if bad:
+        raise ValueError(_of_sweep(plan, *bad[0], len(bad)))
+
+
+def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
+    """One line on a sweep that is refused: its first invalid cell, why, and how many are invalid."""
+    if count == len(plan.cells):
+        return reason
+    where = " ".join(plan.differing(cell)) or cell.id
+    others = f"; {count} of {len(plan.cells)} cells are invalid" if count > 1 else ""
+    return f"cell {plan.cells.index(cell) + 1} of {len(plan.cells)} ({where}): {reason}{others}; nothing was run"
+
+
+def times(records: Iterable[dict[str, Any]]) -> dict[Any, list[float]]:
+    """The seconds of the runs that took their whole time, by `kind`."""
+    known: dict[Any, list[float]] = defaultdict(list)
+    for record in records:
+        total = record["seconds"].get("total")
+        if record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf"):
+            known[kind(record)].append(total)
+    return known
+
+
+def kind(run: dict[str, Any]) -> Any:
+    """What runs that take about as long share: task, renderer, method and scale."""
+    scale = run["config"].get("scale")
+    name = str(scale.get("name")) if isinstance(scale, dict) else None
+    return run["task"], run["renderer"], run.get("method", ""), name
 
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     """Prints a line for each cell, and one for the whole plan."""
-    left = remaining(plan, reused, workers)
-    taken = {name: left.estimates.of(cell) for name, cell in left.cells.items()}
+    known = times(read_records(plan.results_dir)[0] if plan.results_dir.is_dir() else [])
+    taken = {cell.id: known.get(kind(asdict(cell)), []) for cell in plan.cells if cell.id not in reused}
     for number, cell in enumerate(plan.cells, 1):
+        named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {cell.dataset}"
         about = "reused" if cell.id in reused else about_as_long(taken[cell.id])
-        print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named(cell), about) if part))
+        print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named, about) if part))
     parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]
     if reused:
         parts.append(f"{len(reused)} reused")
     if unknown := sum(not like for like in taken.values()):
         parts.append(f"{unknown} of unknown time")
     text = ", ".join(parts) + ("" if taken else "; nothing is left to do")
-    if known := [median(like) for like in taken.values() if like]:
-        text += f"; about {seconds(sum(known) / left.workers)}, {left.workers} at a time"
+    if each := [median(like) for like in taken.values() if like]:
+        at_once = min(workers, len(taken))
+        text += f"; about {seconds(sum(each) / at_once)}, {at_once} at a time"
         text += f", without the {unknown} of unknown time" if unknown else ""
         text += "; the training of a missing prior is not counted"
     print(text)
-
-
-def named(cell: PlannedCell) -> str:
-    """The task, the row and the dataset of a cell."""
-    return ", ".join((cell.task, row_name(cell.config, cell.renderer), cell.dataset))
 
 
 def about_as_long(like: list[float]) -> str:

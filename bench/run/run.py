@@ -16,10 +16,9 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Claim, Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.run.check import refusals
 from bench.run.command import unwritten
 from bench.run.compose import planned
-from bench.run.plan import show_plan
+from bench.run.plan import refusal, show_plan
 from bench.run.process import (
     Job,
     Message,
@@ -95,7 +94,7 @@ def _check(identity: Identity) -> None:
     reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
     if not reused and not config["plan"]:
         warm_up()  # the server of processes loads what runs take, while this process loads what the check takes
-    if not reused and (reason := refusals([config])[0]):
+    if not reused and (reason := refusal(config)):
         raise ValueError(reason)
     if config["plan"]:
         cell = planned(identity, [])

@@ -19,9 +19,8 @@ from bench.records.format import number, plural, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
-from bench.run.check import check_plan
 from bench.run.compose import identity_of, make_plan, swept_over
-from bench.run.plan import Remaining, Shown, remaining, show_plan
+from bench.run.plan import Shown, check_plan, show_plan
 from bench.run.process import warm_up
 
 IN_LINE = {  # metrics in the line of a cell
@@ -50,11 +49,11 @@ class Sweep:
     shown = ExitStack()
 
     @classmethod
-    def start(cls, plan: Plan, left: Remaining) -> None:
+    def start(cls, plan: Plan, reused: set[str]) -> None:
         """Writes and keeps the plan, and shows the sweep's progress from now on."""
         plan.write()
         cls.plan = plan
-        cls.shown.enter_context(followed(plan, left))
+        cls.shown.enter_context(followed(plan, reused))
 
     @classmethod
     def end(cls) -> None:
@@ -89,7 +88,7 @@ class Planner(Callback):
             if config.plan:
                 show_plan(plan, reused, workers)
                 raise Shown
-            Sweep.start(plan, remaining(plan, reused, workers))
+            Sweep.start(plan, reused)
         except Exception as error:
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
@@ -124,24 +123,31 @@ def workers_of(config: DictConfig) -> int:
 
 
 @contextmanager
-def followed(plan: Plan, left: Remaining) -> Iterator[None]:
+def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
     """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
 
     It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
+
+    Args:
+        plan: the sweep.
+        reused: ids of cells that take no time, since their finished run is there already.
     """
     with display() as shown:
-        progress = shown.add_task("sweep", total=len(plan.cells), said="", left=left.left(0.0))
+        progress = shown.add_task("sweep", total=len(plan.cells) - len(reused), said="")
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
         begun = time.monotonic()
 
-        def place(time_left: float | None) -> str:
-            """What stands in front of a cell's line where there is no terminal."""
+        def place(run: int) -> str:
+            """What stands in front of a cell's line where there is no terminal; `run` cells were run."""
             if not shown.disable:
                 return ""
             parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if time_left is not None and pending:
-                parts.append(f"{seconds(time_left)} left")
+            if run and (to_run := len(pending.keys() - reused)):
+                parts.append(f"{seconds((time.monotonic() - begun) / run * to_run)} left")
             return f"[{', '.join(parts)}] "
+
+        def run_by_now() -> int:
+            return len(plan.cells) - len(reused | pending.keys())
 
         def update() -> None:
             nonlocal failed
@@ -149,11 +155,9 @@ def followed(plan: Plan, left: Remaining) -> Iterator[None]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    left.ended(cell.id, record, time.monotonic() - begun)
                     text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
-                    print(place(left.left(time.monotonic() - begun)) + text, flush=True)
-            ended = len(plan.cells) - len(pending)
-            shown.update(progress, completed=ended, said=f"{failed} failed", left=left.left(time.monotonic() - begun))
+                    print(place(run_by_now()) + text, flush=True)
+            shown.update(progress, completed=run_by_now(), said=f"{failed} failed")
 
         def follow() -> None:
             while not stop.wait(max(INTERVAL, 1e-3 * len(pending))):

@@ -20,8 +20,8 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import CONF, register
 from bench.records import folder as run_folder
 from bench.records.folder import identify
-from bench.run.check import refusal
 from bench.run.command import _explain, options_first
+from bench.run.plan import refusal
 from bench.setup import inputs
 from tests.looped import each
 from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, wait_for

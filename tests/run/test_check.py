@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.read import Plan, PlannedCell, read_records
+from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record
 from bench.run import process
-from bench.run.check import check_plan, refusal, refusals
+from bench.run.plan import check_plan, refusal
 from bench.run.process import Job
 from tests import tiny
 from tests.run.driving import command, errors
@@ -70,13 +70,6 @@ def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plai
     for act, words in (("raise RuntimeError", ""), ("raise ValueError('no')", "no"), ("print('made')", lacks)):
         assert refusal(plain(*own(act))) == words
     assert capsys.readouterr().out == ""
-
-
-def test_a_class_that_ends_its_process_ends_its_run_alone(plain, own, tmp_path):
-    mine = own("os._exit(3)")
-    assert refusals([plain(*mine)] * 2) == ["", ""]
-    assert command("-m", *mine, "seed=0,1", f"results_dir={tmp_path / 'r'}", *SMALL).code == 1
-    assert [record["status"] for record in read_records(tmp_path / "r")[0]] == ["crashed"] * 2
 
 
 @pytest.fixture

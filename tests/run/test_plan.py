@@ -12,7 +12,7 @@ from bench.prior import main as prior_main
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
 from bench.run import run as run_module
-from bench.run.plan import Estimates, Remaining
+from bench.run.plan import kind, times
 from bench.single_view import store as networks
 from bench.train import main as train_main
 from tests.run.driving import command
@@ -27,7 +27,7 @@ OF_NETWORK = (train_main, "+method=single_view", "task.training.steps=7", "task.
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusals", lambda configs: [""] * len(configs))
+    monkeypatch.setattr(run_module, "refusal", lambda config: "")
     return tmp_path / "r"
 
 
@@ -140,31 +140,8 @@ def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_ti
     unlike = [run(1.0, task="pose"), run(1.0, renderer="dvr"), run(1.0, scale="desk"), run(1.0, method="dist_mask")]
     broken = [run(1.0, status=status) for status in ("crashed", "killed", "oom", "refused", "not_run")]
     odd = [run(float("inf")), run(None), run(0.0), run(1.0, config={"scale": 3}), run(1.0, config={"scale": None})]
-    assert Estimates([*unlike, *broken, *odd]).of(run()) == []
-    assert Estimates([*unlike, run(2.0), run(3.0, status="timeout")]).of(run()) == [2.0, 3.0]
-
-
-def left_of(cells: int, *took: float, workers: int = 1) -> Remaining:
-    return Remaining({str(n): run() for n in range(cells)}, Estimates([run(seconds) for seconds in took]), workers)
-
-
-def test_the_time_left_is_the_median_of_like_runs_for_each_cell_and_learns_from_those_that_end():
-    assert left_of(3).left(5.0) is None
-    assert left_of(6, 10.0, 20.0, 90.0, workers=2).left(0.0) == pytest.approx(60.0)
-    left = left_of(4, 10.0)
-    left.cells["3"] = run(renderer="dvr")  # no run like it has ended: it takes what the others take
-    assert left.left(0.0) == pytest.approx(40.0)
-    left.ended("0", run(30.0), 30.0)
-    left.ended("1", run(30.0), 60.0)
-    assert [left.left(60.0), left.left(70.0), left.left(999.0)] == pytest.approx([60.0, 50.0, 0.0])
-
-
-@pytest.mark.parametrize("ended", [{"status": "crashed"}, {"status": "killed"}, {"reused": True}])
-def test_a_cell_that_did_not_take_its_whole_time_does_not_stand_for_the_others(ended):
-    left = left_of(3, 10.0)
-    left.ended("0", run(0.1) | ended, 0.1)
-    left.ended("a reused one", run(0.1), 0.1)
-    assert left.left(0.1) == pytest.approx(20.0)
+    assert kind(run()) not in times([*unlike, *broken, *odd])
+    assert times([*unlike, run(2.0), run(3.0, status="timeout")])[kind(run())] == [2.0, 3.0]
 
 
 @pytest.fixture

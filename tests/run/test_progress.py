@@ -47,9 +47,9 @@ def test_a_line_of_progress_fits_its_terminal(width):
     file = io.StringIO()
     console = Console(width=width, force_terminal=True, color_system=None, file=file)
     shown = Progress(*progress.columns(width), console=console)
-    shown.add_task("sweep", total=200, completed=20, said="3 failed", left=3725.4)
+    shown.add_task("sweep", total=200, completed=20, said="3 failed")
     console.print(shown.get_renderable())
     (line,) = file.getvalue().splitlines()
     assert len(line) <= width
-    assert "20/200" in line and "1:02:05" in line
+    assert "20/200" in line and "-:--:--" in line
     assert ("3 failed" in line) is (width >= 80)
