@@ -39,7 +39,10 @@ class LocalMeshes:
     def __post_init__(self) -> None:
         check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
         check_at_least("dataset.strength", self.strength, 0, "0 switches deformations off")
-        find_meshes(self.path)
+        try:
+            find_meshes(self.path)
+        except ValueError as error:
+            raise ValueError(f"dataset.path: {error}") from None
 
     @property
     def name(self) -> str:

@@ -37,7 +37,7 @@ def find_meshes(path: str | Path) -> list[Path]:
         found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
         if not found:
             raise ValueError(
-                f"path: a folder must hold mesh files ({known}), found none directly in '{path}'; "
+                f"a folder must hold mesh files ({known}), found none directly in '{path}'; "
                 "name the folder that has them, or one file"
             )
         return found
@@ -45,10 +45,10 @@ def find_meshes(path: str | Path) -> list[Path]:
         siblings = [file.name for file in path.parent.iterdir()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, n=1)
         remedy = f"did you mean '{path.parent / near[0]}'?" if near else "check the spelling and the current folder"
-        raise ValueError(f"dataset.path must be a mesh file or a folder of them, found nothing at '{path}'; {remedy}")
+        raise ValueError(f"a mesh file or a folder of them is asked for, found nothing at '{path}'; {remedy}")
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(
-            f"path: a mesh file must end in one of {known}, found '{path.name}'; export it in one of these formats"
+            f"a mesh file must end in one of {known}, found '{path.name}'; export it in one of these formats"
         )
     return [path]
 
@@ -84,7 +84,7 @@ def read_mesh(path: str | Path) -> Mesh:
     """
     path = Path(path)
     if path.is_dir():
-        raise ValueError(f"path: must be one mesh file, found the folder '{path}'; list it with find_meshes")
+        raise ValueError(f"must be one mesh file, found the folder '{path}'; list it with find_meshes")
     (path,) = find_meshes(path)
     try:
         return _read(path)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import pytest
 import trimesh
@@ -15,7 +14,7 @@ from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import combinations
 from bench.setup.inputs import Task
-from bench.tables import GROUPS, choice, names, nearest, read_yaml
+from bench.tables import GROUPS, choice, names, read_yaml
 from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer
@@ -265,42 +264,19 @@ def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_pl
 
 
 @each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
-def test_rows_of_an_experiment_are_told_apart_and_a_colour_is_of_one_class(name):
+def test_rows_of_an_experiment_are_told_apart(name):
     params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
     rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
     alike = [row for row in rows if not row.startswith("tuned/")]  # drawn as their methods, hollow
     assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)
-    classes = {(look(row).colour, class_of(row)) for row in alike}
-    assert len({colour for colour, _ in classes}) == len(classes)
-
-
-def class_of(row: str) -> str:
-    """The class of a row's renderer; of a method without one, the method."""
-    said = [row] if row in names("renderer") else renderers_of(row)
-    return type(load("renderer", said[-1])).__name__ if said else row
-
-
-def renderers_of(method: str) -> list[str]:
-    """The renderers that a method chooses, that of its own last."""
-    return [base["override /renderer"] for base in defaults_of(method) if "override /renderer" in base]
 
 
 def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
-    known = {look(name).colour for name in visible("renderer") if name != "custom"}
-    assert len(known) > 20 and not known & {*style._COLOURS}
-
-
-@each("name", METHODS)
-def test_a_method_has_the_colour_of_its_renderer(name):
-    renderers = renderers_of(name)
-    assert not renderers or look(name).colour == look(renderers[-1]).colour
-
-
-def defaults_of(method: str) -> list[Any]:
-    """The `defaults` of a method, those of what it builds on before its own."""
-    own = choice("method", method).get("defaults", [])
-    bases = [base.removeprefix("/method/") for base in own if isinstance(base, str) and base != "_self_"]
-    return [each for base in bases for each in defaults_of(base)] + own
+    classes = {name: type(load("renderer", name)) for name in visible("renderer") if name != "custom"}
+    known = {(look(name).colour, cls) for name, cls in classes.items()}
+    colours = {colour for colour, _ in known}
+    assert len(known) == len(colours) > 20  # a colour is of one class
+    assert not colours & {*style._COLOURS}
 
 
 def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():
@@ -415,9 +391,3 @@ def test_a_draw_is_refused_where_no_setting_is_drawn(compose_config):
     with pytest.raises(ValueError, match=r"only a method of method/space reads draw: add \+method=space/NAME"):
         check_draw(compose_config("renderer=dist", "draw=3"))
     check_draw(compose_config("+method=space/dist_mask", "draw=3"))
-
-
-def test_a_name_of_a_folder_is_compared_with_the_names_there():
-    known = ["dist_mask", "tuned/dist_mask", "tuned/idr_mask", "space/dist_mask"]
-    assert nearest("tuned/dist_masc", known).startswith(": did you mean tuned/dist_mask")
-    assert "did you mean dist_mask" in nearest("dist_masc", known)

@@ -1,6 +1,5 @@
 """A renderer is one file and one YAML: every experiment that compares renderers then has a row for it."""
 
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, build
+from bench.config import build
 from bench.records.record import row_name
 from bench.run import sweep
 from bench.run.command import command_line
@@ -103,16 +102,6 @@ def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderer
     assert "mine_on_keinert.yaml" not in ConfigStore.instance().repo["renderer"]  # of another command alone
 
 
-def test_places_are_no_part_of_a_run(swept, tmp_path, package):
-    fig4, own = ("+experiment=fig4", f"packages=[{package}]"), tmp_path / "conf/renderer/mine.yaml"
-    plan, _ = swept(*fig4, folder=tmp_path / "conf")
-    before = {cell.renderer: cell.id for cell in plan.cells}
-    own.write_text(f"{own.read_text()}_rows_: {{fig4: 3.5}}\n")
-    plan, _ = swept(*fig4, folder=tmp_path / "conf")
-    assert {cell.renderer: cell.id for cell in plan.cells} == before
-    assert rows(plan)[2:5] == ["dist_aggressive", "mine", "dist_coarse_to_fine"]
-
-
 def test_the_command_line_narrows_and_replaces_the_rows(swept):
     plan, _ = swept("+experiment=table1", "renderer=dvr,dist")
     assert rows(plan) == ["dvr", "dist"]
@@ -147,28 +136,35 @@ def test_combinations_are_those_that_hydra_runs(swept):
 MINE = (
     "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}\n"
 )
-SPACE = "label: Mine\ntask:\n  silhouette_weight: ${drawn:0,1.0,100.0}\n"
-
-
 SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
 
 
 OWN_ROWS = {
-    "methods": "mine_row: {renderer: dist, label: Mine, space: {renderer.alpha: '${drawn:3,1.0,2.0}'}}\n",
+    "methods": "mine_row: &mine {renderer: dist, label: Mine, space: {renderer.alpha: '${drawn:3,1.0,2.0}'}}\n"
+    "mine_untuned: *mine\n",
     "tuned": "mine_row: {base: /method/mine_row, label: 'Mine, tuned', renderer.alpha: 1.25}\n",
 }
 
 
-def test_methods_of_ones_own_may_be_rows_of_tables(swept, tmp_path):
+def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(swept, tmp_path):
     (tmp_path / "own").mkdir()
     for table, text in OWN_ROWS.items():
         (tmp_path / f"own/{table}.yaml").write_text(text)
+    spaces, own = {*names("method/space")}, {"mine_row", "mine_untuned"}
+    plan, _ = swept("+experiment=tuning", "draw=3", "split=test", folder=tmp_path / "own")
+    cells = {cell.method.removeprefix("space/"): cell for cell in plan.cells}
+    assert {*cells} == (spaces - SLOW) | own
+    mine = cells["mine_row"].config
+    assert mine["label"] == "Mine" and 1 < mine["renderer"]["alpha"] < 2
     few = ("index=0", "dataset=sofa", "task.points=20")
     plan, _ = swept("+experiment=tuned", *few, folder=tmp_path / "own")
+    methods = [cell.method for cell in plan.cells]
+    assert {*methods} >= {"dist_mask", "dist_mask_paper", "mine_row", "tuned/mine_row"}
+    assert methods.index("tuned/mine_row") == methods.index("mine_row") + 1
+    assert "mine_untuned" not in methods
+    assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_row"}
     tuned = {cell.method: cell.config["renderer"]["alpha"] for cell in plan.cells if "mine_row" in cell.method}
     assert tuned == {"mine_row": 1.5, "tuned/mine_row": 1.25}
-    plan, _ = swept("+method=space/mine_row", "draw=3", folder=tmp_path / "own")
-    assert plan.cells[0].config["label"] == "Mine" and 1 < plan.cells[0].config["renderer"]["alpha"] < 2
 
 
 @pytest.mark.parametrize(("file", "text", "message"), [
@@ -184,37 +180,6 @@ def test_a_broken_file_of_the_users_is_named(swept, tmp_path, capsys, file, text
     with pytest.raises(IndexError):  # there is no plan
         swept("+experiment=mine" if "experiment" in file else "+experiment=table1", folder=tmp_path / "own")
     assert message in capsys.readouterr().err
-
-
-def own_methods(folder: Path) -> None:
-    """Two methods with search spaces, of which one has been tuned, as files."""
-    files = {"": "label: Mine\n", "space": SPACE, "tuned": "label: Mine, tuned\n"}
-    for name, of in (("mine_mask", files), ("mine_untuned", {"": files[""], "space": SPACE})):
-        for part, text in of.items():
-            path = folder / "method" / part / f"{name}.yaml"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(f"# @package _global_\n{text}")
-
-
-def test_the_tuning_has_all_spaces_but_slow_ones_and_the_methods_that_were_tuned(swept, tmp_path):
-    own_methods(tmp_path / "own")
-    plan, _ = swept("+experiment=tuning", "draw=0", "split=test", folder=tmp_path / "own")
-    spaces = {*names("method/space")}
-    own = {"mine_mask", "mine_untuned"}
-    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in (spaces - SLOW) | own}
-    plan, _ = swept("+experiment=tuned", "task.points=20", folder=tmp_path / "own")
-    methods = [cell.method for cell in plan.cells]
-    assert {*methods} >= {"dist_mask", "dist_mask_paper", "mine_mask", "tuned/mine_mask"}
-    assert methods.index("tuned/mine_mask") == methods.index("mine_mask") + 1
-    assert "mine_untuned" not in methods
-    assert {name.removeprefix("tuned/") for name in methods if name.startswith("tuned/")} <= {*spaces, "mine_mask"}
-
-
-def test_slow_methods_join_the_tuning_by_the_command_that_its_file_names(swept):
-    (named,) = re.findall(r"by (\+method=\S+)", (CONF / "experiment/tuning.yaml").read_text())
-    plan, _ = swept("+experiment=tuning", "draw=0", "split=test", named)
-    assert {cell.method for cell in plan.cells} == {f"space/{name}" for name in SLOW}
-    assert {cell.config["experiment"] for cell in plan.cells} == {"tuning"}
 
 
 def test_a_sweep_composes_its_choices_once_for_the_plan_and_each_cell_once_to_run_it(swept, monkeypatch):

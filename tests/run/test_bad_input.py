@@ -1,8 +1,6 @@
 """Every mistake of a user's ends in one clear line that says what to do, before anything slow."""
 
-import errno
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -56,18 +54,11 @@ def assert_one_line(err: str, *words: str) -> None:
 @each("argument, words", [
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
     ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, idr, mesh_proxy, naive, neus", "and variants")),
-    ("+experiment=unseen_bac", ("unknown experiment", "did you mean unseen_back")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
     ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
-    ("task=a/b", ("unknown task 'a/b'", "completion")),
-    ("hydra/launcher=foo", ("unknown hydra/launcher 'foo'",)),
-    ("+method=dist_msk", ("unknown method 'dist_msk'", "did you mean dist_mask")),
-    ("renderer=dist_agressive", ("unknown renderer 'dist_agressive'", "did you mean dist_aggressive")),
     ("+sede=1", ("unknown key 'sede'", "did you mean seed")),
     ("+experiment=fig10", ("unknown experiment 'fig10'", "fig10_focal", "fig10_start")),
     ("task.iterations=3", ("unknown key 'task.iterations'", "task.optimiser.iterations")),
-    ("points=5", ("unknown key 'points'", "task.points")),
-    ("silhouette.weight=2", ("unknown key 'silhouette.weight'",)),
     ("seed=x", ("seed must be a whole number, not 'x'",)),
     ("verbose=maybe", ("verbose must be true or false, not 'maybe'",)),
     ("device=gpu", ("device must be one of auto, cpu, cuda, not 'gpu'",)),
@@ -75,7 +66,6 @@ def assert_one_line(err: str, *words: str) -> None:
     ("renderer", ("'renderer'", "=")),
     ("newton", ("'newton' is no setting: write renderer=newton",)),
     ("renderer=dist,,dvr", ("'renderer=dist,,dvr' has a comma without a value beside it",)),
-    ("renderer=dist,", ("'renderer=dist,' has a comma without a value beside it",)),
     ("--mutlirun", ("unknown option '--mutlirun'", "did you mean --multirun")),
 ])  # fmt: skip
 def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, argument, words):
@@ -147,13 +137,6 @@ def test_options_may_stand_anywhere(given, arranged):
     assert options_first(given) == arranged
 
 
-def test_a_mask_loss_that_no_task_reads_is_refused_before_any_run(bench, tmp_path):
-    code, _, err = bench("-m", "task=gradients", "silhouette=hinge,own")
-    assert code == 2
-    assert_one_line(err, "cell 1 of 2 (silhouette=hinge): ", "read silhouette: remove it")
-    assert not (tmp_path / "r" / "runs").exists()
-
-
 def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
     code, _, err = bench("+method=dist_mask", "renderer=dvr", "plan=true")
     assert code == 2
@@ -163,28 +146,15 @@ def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
 
 @each("argument, words", [
     ("renderer.steps=abc", ("renderer.steps must be a whole number, not 'abc'",)),
-    ("renderer.alpha=fast", ("renderer.alpha must be a number, not 'fast'",)),
-    ("renderer.epsilon=nan", ("epsilon must be positive, not nan",)),
     ("+renderer.alhpa=1", ("renderer has no key 'alhpa'", "did you mean alpha")),
     ("renderer=custom", ("renderer._target_ must be given", "renderer._target_=PACKAGE.CLASS")),
-    ("renderer._target_=renderers.Dist", ("'renderers.Dist'", "cannot be imported")),
-    ("view.resolution=-3", ("resolution must be at least 4, not -3", "resolution=64")),
-    ("view.field_of_view=200", ("field_of_view must lie between 0 and 180",)),
     ("view.azimuth=3", ("view.azimuth must be a list of 2, not 3",)),
     ("models.candidates=sphere", ("models.candidates must be a list", ": write models.candidates=[sphere]")),
-    ("view.azimuth=[360,0]", ("azimuth",)),
     ("task.points=0", ("points must be positive, not '0'", "dense")),
-    ("task.points=101%", ("points must be at most 100%", "dense")),
-    ("task.points=abc", ("points must be an amount, not 'abc'", "dense")),
-    ("task.optimiser.iterations=0", ("task.optimiser.iterations must be at least 1, not 0",)),
     ("split=tst", ("split must be one of train, validation, test, not 'tst'",)),
-    ("index=-1", ("index must be at least 0, not -1",)),
     ("index=1000000", ("index must be at most 999999, not 1000000",)),
-    ("threads=0", ("threads must be at least 1, not 0",)),
     ("time_limit=0", ("time_limit must be positive",)),
-    ("evaluation.grid=2", ("evaluation.grid must be at least 8, not 2",)),
     ("evaluation.fscore_threshold=0", ("threshold must be positive",)),
-    ("prior.steps=0", ("prior.steps must be at least 1, not 0",)),
     ("dataset=mesh", ("dataset.path must be given: set dataset.path=",)),
     ("results_dir=", ("results_dir must name a folder",)),
 ])  # fmt: skip
@@ -244,16 +214,6 @@ def test_a_results_folder_that_cannot_be_written_is_an_error(bench, tmp_path):
         assert_one_line(err, "error: ", named, "set results_dir to a folder you can write")
 
 
-def test_a_disk_that_is_full_from_the_start_is_an_error(bench, tmp_path, monkeypatch):
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    code, _, err = bench()
-    assert code == 1
-    assert_one_line(err, "error: ", f"No space left on device ({tmp_path / 'r'})", "free space")
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_disk_that_fills_up_during_a_run_is_an_error(bench, monkeypatch):
     def fill_up(folder):
@@ -299,29 +259,19 @@ def test_help_may_be_read_in_part():
     assert done.returncode == 0 and done.stdout.startswith(b"`python -m bench") and done.stderr == b""
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
-def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path, name):
+def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path):
     arguments = (*TINY, "task.optimiser.iterations=1000000", f"results_dir={tmp_path}")
     with driver(tmp_path / "output", *arguments) as running:
         wait_for(lambda: lines_of_curves(tmp_path) > 3, running)
-        stopped = running.send(getattr(signal, name))
-    err = stopped.err
-
+        stopped = running.send(signal.SIGTERM)  # SIGKILL and Ctrl-C: of sweeps, in test_launchers
     (folder,) = (tmp_path / "runs").iterdir()
     record = json.loads((folder / "record.json").read_text())
     lines = (folder / "curve.jsonl").read_text().splitlines()
-    assert record["status"] == "killed"
-    assert record["reason"]
+    assert (stopped.code, record["status"]) == (130, "killed")
+    assert_one_line(stopped.err, "stopped by SIGTERM")
+    assert "stopped by SIGTERM" in record["reason"]
     assert len(lines) > 3
-    assert [json.loads(line)["iteration"] for line in lines[:-1]] == list(range(len(lines) - 1))
-    if name != "SIGKILL":
-        by = "stopped by SIGTERM"  # of Ctrl-C: a sweep in test_launchers
-        assert stopped.code == 130
-        assert_one_line(err, by)
-        assert by in record["reason"]
-        counted = record["evaluations"]["iterations"]  # an iteration counts just before its line is written
-        assert counted in (len(lines), len(lines) + 1)
-        assert record["metrics_start"]
-    else:
-        assert stopped.code == -signal.SIGKILL
-        assert "killed before it could say why" in record["reason"]
+    assert [json.loads(line)["iteration"] for line in lines] == list(range(len(lines)))
+    counted = record["evaluations"]["iterations"]  # an iteration counts just before its line is written
+    assert counted in (len(lines), len(lines) + 1)
+    assert record["metrics_start"]

@@ -105,7 +105,6 @@ def test_a_gpu_is_looked_for_where_the_runs_are(planned, monkeypatch):
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (("-m", "seed=0,1", "renderer.steps=50,0"), "cell 2 of 4 (seed=0 renderer.steps=0): steps must be at least 1"),
     (("-m", "index=0,-1"), "cell 2 of 2 (index=-1): index must be at least 0"),
     (("memory_limit=-1",), "memory_limit must be positive"),
 ])  # fmt: skip

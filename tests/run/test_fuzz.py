@@ -73,12 +73,6 @@ RELAXED = settings(
 )
 
 
-@settings(RELAXED, max_examples=10)
-@given(overrides=st.lists(OVERRIDES, min_size=1, max_size=2))
-def test_ten_command_lines(results, overrides):
-    check(results, overrides)
-
-
 @pytest.mark.slow
 @seed(3)
 @settings(RELAXED, max_examples=300, derandomize=False)

@@ -1,6 +1,5 @@
 """plan=true lists what would run, with the time that finished runs took, and leaves nothing behind."""
 
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -118,15 +117,6 @@ def test_a_single_run_is_planned_too(results):
     assert not results.exists()
     write(results, planned(results)[0], 30.0)
     assert "reused" in command(*one).out
-
-
-def test_that_it_was_planned_does_not_change_a_run(results):
-    cells = planned(results)
-    assert cells[0].config["plan"] is True
-    write(results, cells[0], 30.0)
-    path = results / "runs" / cells[0].id / "record.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "diverged"}))
-    assert "reused" in command(*SWEEP, "plan=true", f"results_dir={results}").out
 
 
 def run(total=10.0, *, status="ok", renderer="dist", task="completion", scale="smoke", **more):

@@ -1,9 +1,7 @@
 """A run that ends badly leaves a record that says how; it is stopped at its limit, and costs no other run."""
 
-import json
 import multiprocessing
 import signal
-import subprocess
 import time
 from types import SimpleNamespace
 
@@ -108,26 +106,3 @@ def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
         assert at_work(tmp_path)
         assert forked.send(signal.SIGKILL).code == -signal.SIGKILL
     wait_for(lambda: not at_work(tmp_path))
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 160 KiB, which the pictures of a run fill."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", str(place)], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("a small disk cannot be mounted here; it takes a right that this user lacks")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
-
-
-def test_a_disk_that_fills_up_leaves_a_record_that_says_so(isolated, small_disk):
-    code, _, err = isolated(*FAILING, "+renderer.how=not", "evaluation.picture=24", f"results_dir={small_disk}")
-    assert code == 1
-    assert "Traceback" not in err
-    (path,) = small_disk.glob("runs/*/record.json")
-    record = json.loads(path.read_text())
-    assert record["status"] == "crashed"
-    assert "No space left on device" in record["reason"]
-    assert record["metrics"]["chamfer_l2"] > 0  # what was measured before is kept
