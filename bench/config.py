@@ -85,15 +85,6 @@ class EvaluationSettings:
     every: int | str | None = MISSING
     film: str | None = MISSING
 
-    def checkpoints(self, iterations: int) -> set[int]:
-        """The iterations, counted from 0, before which the current state is evaluated: with the first also the last."""
-        if self.every is None:
-            return set()
-        last = iterations - 1
-        if self.every == DOUBLING:
-            return {0, last} | {2**power for power in range(last.bit_length()) if 2**power < last}
-        return {*range(0, last, int(self.every)), last}
-
 
 @dataclass
 class Config:

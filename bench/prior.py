@@ -1,7 +1,4 @@
-"""`python -m bench.prior dataset=sofa`: trains the prior of a dataset, or finds it, and prints its path.
-
-With `plan=true` it says what would be trained, and trains nothing.
-"""
+"""`python -m bench.prior dataset=sofa`: trains the prior of a dataset, or finds it, and prints its path."""
 
 import sys
 
@@ -20,10 +17,6 @@ def main() -> int:
         cell = cell_of(run.config)
         dataset, settings, folder = cell.inputs.dataset, cell.prior, cell.inputs.cache
         path = find(dataset, settings, folder)
-        if run.config["plan"]:
-            what = f"prior of {dataset.name}: shapes {settings.shapes}, steps {settings.steps}"
-            print(f"{what}  {'to be trained' if path is None else f'there already: {path}'}")
-            return
         if path is None:
             with run_progress("prior") as progress:
                 path = make_prior(dataset, settings, folder, cell.inputs.device, progress)

@@ -1,7 +1,4 @@
-"""`python -m bench.train task=single_view dataset=car`: trains the network that the task needs, and prints its path.
-
-With `plan=true` it says what would be trained, and trains nothing.
-"""
+"""`python -m bench.train task=single_view dataset=car`: trains the network that the task needs, and prints its path."""
 
 import sys
 
@@ -27,14 +24,6 @@ def main() -> int:
             cell.start()
             inputs = cell.inputs
             recipe = cell.task.recipe(inputs, run.config)
-            if run.config["plan"]:
-                found = recipe.find(inputs.cache)
-                begun = (inputs.cache / f"{recipe.stem}.state").exists()
-                todo = "was stopped, and goes on where it was" if begun else "to be trained"
-                what = f"network of {recipe.dataset.name}: shapes {recipe.shapes}, images of each {recipe.views}"
-                steps = f"steps {recipe.training.steps}"
-                print(f"{what}, {steps}  {todo if found is None else f'there already: {found}'}")
-                return
             path = recipe.make(inputs.cache, inputs.device, progress)
         print(told(recipe.load(path)[1]), file=sys.stderr)
         print(path)

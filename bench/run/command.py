@@ -49,7 +49,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     """Composes the configuration of the command line and gives what it describes to `job`, in a sweep once a cell.
 
     Args:
-        job: what the command does; where its cells are no runs, `plan=true` is its to read.
+        job: what the command does.
         runs: whether the cells of a sweep are runs, so that they have a plan.
 
     Returns:
@@ -62,7 +62,10 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     def guarded(config: DictConfig) -> None:
         begun.append(config)
         try:
-            job(_identified(config))
+            identity = _identified(config)
+            if config.plan and not runs:
+                raise ValueError("plan=true lists runs, and this command starts none: remove it")
+            job(identity)
             raise_if_stopped()
         except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
             raised.append(error)
@@ -70,7 +73,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     if (text := _answer(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
         return _print(text)
     catch_signals()
-    Sweep.other = None if runs else job
+    Sweep.runs = runs
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         sys.argv[1:] = options_first(sys.argv[1:])

@@ -27,8 +27,6 @@ def show(folder: Path, record: Record) -> None:
             table.add_row(metric.label, number(before, metric.factor), number(after, metric.factor), metric.better)
     if table.row_count:
         console.print(table)
-    elif "recommended_field" in record.metrics:
-        console.print(_candidates(record))
     elif record.metrics:
         console.print(_measured(record))
     if "iterations" in record.evaluations:
@@ -80,33 +78,13 @@ def _print_next(results_dir: Path) -> None:
     print(f"page and tables: python -m bench.report{where}")
 
 
-def _candidates(record: Record) -> Table:
-    """The error and costs of each candidate of a capacity run; the recommended one is marked."""
-    from bench.pictures.size_chart import Candidates  # only here: it loads matplotlib, which most commands do not need
-
-    candidates = Candidates.of(record.metrics)
-    half_pixel = number(candidates.footprint, 1000)
-    title = f"{record.title}; errors x1000, half a pixel is {half_pixel}"
-    table = Table(box=box.SIMPLE_HEAD, title=escape(title))
-    for heading in ("", "field", "stored", "free", "FLOPs", "error", "s.e.", "fit"):  # at most 80 columns wide
-        table.add_column(heading, justify="left" if heading in ("", "field") else "right", no_wrap=heading == "field")
-    for candidate in candidates.results:
-        numbers = candidate.numbers
-        mark = "=>" if candidate is candidates.chosen else "best" if candidate is candidates.best else ""
-        size = f"{numbers['stored']:,}", f"{numbers['free']:,}"
-        error = number(numbers.get("error"), 1000), number(numbers.get("standard_error"), 1000)
-        table.add_row(
-            mark, candidate.label, *size, count(numbers["flops_per_query"]), *error, seconds(numbers["seconds"])
-        )
-    return table
-
-
 def _measured(record: Record) -> Table:
-    """All metrics of a task that measures without optimising."""
+    """The metrics of a task that measures without optimising; of one that recommends a field, what it recommends."""
     table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
     table.add_column("")
     table.add_column("measured", justify="right")
-    for name, value in record.metrics.items():
-        metric = SHOWN.get(name, Metric(name))
+    recommended = [name for name in record.metrics if name.startswith("recommended")]
+    for name in recommended or record.metrics:
+        metric, value = SHOWN.get(name, Metric(name)), record.metrics[name]
         table.add_row(metric.label, number(value, metric.factor))
     return table

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import Isolation, Rerun
 from bench.progress import display, notice
-from bench.records.folder import Identity, reusable
+from bench.records.folder import reusable
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
@@ -39,13 +39,10 @@ class Refused(BaseException):
 
 
 class Sweep:
-    """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs.
-
-    `other`: called for each cell by commands that start no runs (`bench.train`, `bench.prior`); None otherwise.
-    """
+    """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs."""
 
     plan: Plan | None = None
-    other: Callable[[Identity], None] | None = None
+    runs = True  # whether its cells are runs: those of `bench.train` and `bench.prior` are not
     shown = ExitStack()
 
     @classmethod
@@ -70,9 +67,7 @@ class Planner(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Plans the sweep and starts to follow it."""
-        if Sweep.other is not None:
-            if config.plan:
-                self.list_others(config, Sweep.other)
+        if not Sweep.runs:
             return
         try:
             swept, workers = swept_over(config), workers_of(config)
@@ -93,18 +88,9 @@ class Planner(Callback):
             raise Refused(error) from error
         self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
 
-    def list_others(self, config: DictConfig, tell: Callable[[Identity], None]) -> None:
-        """Lists the cells of a sweep that are no runs, in this process."""
-        try:
-            for cell in make_plan(config, swept_over(config)).cells:
-                tell(identity_of(cell))
-        except Exception as error:
-            raise Refused(error) from error
-        raise Shown
-
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Gives Hydra its own check back."""
-        if Sweep.other is None:
+        if Sweep.runs:
             Sweeper.validate_batch_is_legal = self.check
 
 

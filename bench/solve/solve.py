@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from bench.config import DOUBLING
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
@@ -214,7 +215,7 @@ def descend(
             loss before its step; its errors are of the same parameters.
     """
     history = History()
-    checkpoints = run.inputs.evaluation.checkpoints(settings.iterations)
+    checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
     known: dict[int, dict[str, float]] = {}
 
     def check(iteration: int) -> None:
@@ -245,6 +246,16 @@ def descend(
         finally:
             _note_history(run.record, problem, history)
     return history
+
+
+def checkpoints_of(every: int | str | None, iterations: int) -> set[int]:
+    """The iterations, counted from 0, before which the current state is evaluated: with the first also the last."""
+    if every is None:
+        return set()
+    last = iterations - 1
+    if every == DOUBLING:
+        return {0, last} | {2**power for power in range(last.bit_length()) if 2**power < last}
+    return {*range(0, last, int(every)), last}
 
 
 def note_costs(

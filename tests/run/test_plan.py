@@ -6,20 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from bench import shape_prior as priors
 from bench.prior import main as prior_main
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
 from bench.run import run as run_module
 from bench.run.plan import kind, times
-from bench.single_view import store as networks
 from bench.train import main as train_main
 from tests.run.driving import command
 
 SWEEP = ("-m", "scale=smoke", "isolation=off", "threads=1", "renderer=dist,dvr", "seed=0,1")
-SMALL = ("scale=smoke", "threads=1", "device=cpu")
-OF_PRIOR = (prior_main, *SMALL)
-OF_NETWORK = (train_main, "+method=single_view", "task.training.steps=7", "task.shapes=3", *SMALL)
 
 
 @pytest.fixture
@@ -134,51 +129,6 @@ def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_ti
     assert times([*unlike, run(2.0), run(3.0, status="timeout")])[kind(run())] == [2.0, 3.0]
 
 
-@pytest.fixture
-def trained(tmp_path, monkeypatch, capsys):
-    """The exit status and the outputs of a command with plan=true, in which nothing can be trained."""
-
-    def never(*_, **__):
-        raise AssertionError("it trains")
-
-    monkeypatch.setattr(priors, "train", never)
-    monkeypatch.setattr(priors, "distance_samples", never)
-    monkeypatch.setattr(networks.Lessons, "train", never)
-    monkeypatch.setattr(networks.Imaging, "images", never)
-
-    def run(main, *arguments: str) -> tuple[int, list[str], str]:
-        monkeypatch.setattr(sys, "argv", ["bench", "plan=true", f"results_dir={tmp_path / 'r'}", *arguments])
-        code = main()
-        done = capsys.readouterr()
-        return code, done.out.splitlines(), done.err
-
-    return run
-
-
-@pytest.mark.parametrize(("command", "what"), [
-    (OF_PRIOR, "prior of sphere: shapes 24, steps 500"),
-    (OF_NETWORK, "network of sphere: shapes 3, images of each 24, steps 7"),
-])  # fmt: skip
-def test_it_says_what_would_be_trained_and_leaves_nothing(trained, tmp_path, command, what):
-    assert trained(*command, "dataset=sphere") == (0, [f"{what}  to be trained"], "")
-    assert not (tmp_path / "r").exists()
-
-
-def test_what_is_there_is_not_trained(trained):
-    assert "there already: " in trained(prior_main, "dataset=sofa")[1][0]
-    assert "there already: " in trained(train_main, "+method=single_view", "dataset=sofa")[1][0]
-
-
-def test_a_stopped_training_goes_on(trained, monkeypatch):
-    known = []
-    monkeypatch.setattr(networks.Recipe, "find", lambda self, cache: known.append((self, cache)))
-    trained(*OF_NETWORK, "dataset=sphere")
-    (recipe, cache), *_ = known
-    cache.mkdir(parents=True)
-    (cache / f"{recipe.stem}.state").write_text("")
-    assert trained(*OF_NETWORK, "dataset=sphere")[1][0].endswith("  was stopped, and goes on where it was")
-
-
 def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
     where = f"results_dir={tmp_path / 'r'}"
     monkeypatch.setattr(sys, "argv", ["bench", "-m", "dataset=sofa,plane", where])
@@ -187,7 +137,11 @@ def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
     assert not list((tmp_path / "r").rglob("plan.json"))
 
 
-@pytest.mark.parametrize("command", [OF_PRIOR, OF_NETWORK])
-def test_an_invalid_value_is_an_error(trained, command):
-    code, out, err = trained(*command, "dataset=mesh", "dataset.path=none.ply")
-    assert (code, out) == (2, []) and "none.ply" in err and len(err.splitlines()) == 1
+@pytest.mark.parametrize("main", [prior_main, train_main])
+def test_a_training_is_not_planned_and_refuses_what_is_invalid(tmp_path, main):
+    for wrong, words in (
+        (("plan=true",), "plan=true lists runs"),
+        (("dataset=mesh", "dataset.path=none.ply"), "none.ply"),
+    ):
+        done = command("+method=single_view", "scale=smoke", *wrong, f"results_dir={tmp_path / 'r'}", main=main)
+        assert (done.code, done.out) == (2, "") and words in done.err and len(done.err.splitlines()) == 1
