@@ -1,11 +1,14 @@
 """The last lines of a command say what to look at next, on narrow terminals and in logs too."""
 
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from bench.records.read import RESULTS, Plan, PlannedCell
 from bench.records.record import Record, RunStatus
+from bench.run import sweep
 from bench.run.summary import show, show_sweep
 
 
@@ -55,3 +58,15 @@ def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
     show_sweep(plan, tmp_path / "index.html", plan.folder / "table.md")
     out = capsys.readouterr().out.splitlines()
     assert {f"table of this sweep: {plan.folder}/table.md", f"report: {tmp_path}/index.html"} <= {*out}
+
+
+def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_were_run(tmp_path, capsys, monkeypatch):
+    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    monkeypatch.setattr(sweep, "time", SimpleNamespace(monotonic=count(0.0, 10.0).__next__))
+    for name in ("a", "b"):
+        ended(tmp_path, name)
+    with sweep.followed(Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00"), {"a"}):
+        pass
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("[1/4] ok  ") and second.startswith("[2/4, 20.0 s left] ok  ")
