@@ -165,7 +165,7 @@ NO_FACES = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty 
 ERRORS = (
     (["bare"], "bare has no mesh.ply: name a run folder that has one, or a mesh file"),
     (["killed"], "killed has no mesh.ply: the run has no mesh (killed: out of time); name another run"),
-    (["nothing.ply"], "error: a mesh file or a folder of them is asked for, found nothing at 'nothing.ply'; check"),
+    (["nothing.ply"], "error: a mesh file or a folder of them is asked for, found nothing at 'nothing.ply'"),
     (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
     (["broken.ply"], "broken.ply': must be a whole .ply file, but reading failed"),
     (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
