@@ -65,6 +65,13 @@ def test_a_record_from_elsewhere_with_an_odd_value_leaves_the_table_whole(result
     assert len(runs) == 4 and str(runs[name].dtype) == "string" and runs[name][0] == str(value)
 
 
+@pytest.mark.parametrize("odd", [{"a": 1}, 3])
+def test_a_machine_whose_name_is_no_text_is_written_as_text(results, odd):
+    environment = record("odd")["environment"] | {"cpu": odd}
+    write_run(results, record("odd", environment=environment, started="2025-03-04T10:00:00Z"), "odd")
+    assert bench.load(results).cpu[0] == str(odd)
+
+
 def test_no_folder_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="there is no such folder"):
         bench.load(tmp_path / "nowhere")

@@ -2,7 +2,10 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 import bench.studies
 from bench.records.read import read_records
@@ -96,11 +99,14 @@ def test_a_study_is_found_by_its_file(tmp_path, monkeypatch):
         sys.modules.pop("bench.studies.mine", None)
 
 
-def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch):
+@pytest.mark.parametrize("caption", [False, True])
+def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch, caption):
     write_run(tmp_path, "table1", NAIVE, metrics=costs(3))
     write_run(tmp_path, "fig4", NAIVE, metrics=costs(3))
     broken = next(study for study in studies() if "fig4" in study.pages)
-    monkeypatch.setitem(broken.pages, "fig4", lambda runs: {}["lost"])
+    made = broken.pages["fig4"]
+    late = lambda runs: replace(made(runs), estimates=map({}.__getitem__, ["lost"]), interval="one")  # noqa: E731
+    monkeypatch.setitem(broken.pages, "fig4", late if caption else lambda runs: {}["lost"])
     problems: list[str] = []
     written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
     assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]

@@ -93,8 +93,9 @@ def _series(values: list[Any], kind: str) -> pd.Series:
             return pd.Series(values, dtype=kind)
         except (TypeError, ValueError, OverflowError):
             return pd.Series([None if value is None else str(value) for value in values], dtype=TEXT)
-    known = pd.Index(sorted({str(value) for value in values if value is not None}), dtype="str")
-    return pd.Series(pd.Categorical(values, categories=known))
+    texts = [None if value is None else str(value) for value in values]
+    known = pd.Index(sorted({text for text in texts if text is not None}), dtype="str")
+    return pd.Series(pd.Categorical(texts, categories=known))
 
 
 def _cell(value: Any) -> Any:

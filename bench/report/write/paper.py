@@ -80,13 +80,16 @@ def write_paper(
         experiments = [selection.experiment for selection in study.reads]
         try:
             results = study.results(records, results_dir)
+            pages = [
+                (name, result, result.shown(100 * study.place + place, experiments))
+                for place, (name, result) in enumerate(results.items())
+            ]
         except BROKEN as error:
             if problems is None:
                 raise
             problems.append(f"not made: {', '.join(study.pages)} ({type(error).__name__}: {error})")
             continue
-        for place, (name, result) in enumerate(results.items()):
-            shown = result.shown(100 * study.place + place, experiments)
+        for name, result, shown in pages:
             if into is None or not shown.caption.startswith(SMOKE):
                 written.append(write(result, shown, (into or results_dir) / FOLDER / name)[0])
     return written
