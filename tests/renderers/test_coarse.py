@@ -13,7 +13,7 @@ from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_of
 from renderers.fields import mlp
-from renderers.fields.analytic import box, capsule, plane, sphere, torus
+from renderers.fields.analytic import capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.packed_march import Stop
 from renderers.rendering import Status, at_iteration, fresh
@@ -117,19 +117,6 @@ def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind):
     on_ball = found.hit & (found.distance < 2.05)
     assert inside.sum() > 1000
     assert (on_ball ^ inside).sum() <= 0.02 * inside.sum()
-
-
-def test_rays_are_not_marched_to_where_coarse_values_say_nothing():
-    assert NEWTON.tracer.stride().epsilon == NEWTON.march_epsilon
-    assert NEWTON.tracer.stride(ERROR).epsilon == pytest.approx(ERROR / 4)
-    assert NEWTON.tracer.stride(1e-6).epsilon == NEWTON.march_epsilon
-
-
-def test_coarse_values_can_be_switched_off():
-    meter = Meter(Offering(box((0.5, 0.4, 0.3)), ERRORS["rippled"]))
-    with torch.no_grad():
-        load("renderer", "newton", coarse=False).render(meter, camera().rays())
-    assert meter.counts.coarse == 0
 
 
 def test_coarse_values_are_counted_apart_and_limited():

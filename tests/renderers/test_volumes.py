@@ -12,9 +12,10 @@ from bench.config import load
 from renderers.camera import Rays, sphere_span
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
+from renderers.relaxed_boundary import _lowest
 from renderers.rendering import Blurred, Scheduled, Status, Volume, at_iteration
 from renderers.volumes.integrate import Samples, by_importance, evenly, weights
-from renderers.volumes.volsdf import _passing
+from renderers.volumes.volsdf import Bound, _passing
 from tests.renderers.analytic_cases import CASES, Case, vector
 
 NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
@@ -73,6 +74,15 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
             places += index.tolist()
         assert sorted(places) == list(range(len(entry)))
         assert sharp / len(entry) > (0.9 if error_bound == 0.1 else 0.5)  # others are sampled for more
+
+
+def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
+    """Lemma 2: of few samples, whatever the values; here those of a field that has no space for a large step."""
+    renderer, rays = replace(VOLSDF, samples=3, rounds=0, error=0.1), parallel(6).flat()
+    entry, leave, meets = sphere_span(rays)
+    field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
+    for _, found, width in renderer.bounded(field, rays[meets], entry[meets], leave[meets]):
+        assert (Bound.of(found).greatest(width) <= renderer.error).all()
 
 
 @pytest.mark.slow
@@ -174,14 +184,6 @@ def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
     assert (mixed & (rendering.volume.summed(rendering.volume.distance, 41) > 2.1)).any()
 
 
-def test_a_ray_that_leaves_a_surface_passes_none():
-    """Its values only rise: there is nothing that could come into view."""
-    leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    ray = Rays(vector((0.505, 0, 0))[None], vector((1, 0, 0))[None])
-    rendering = BAND.render(sphere(leaf), ray)
-    assert rendering.volume is not None and len(rendering.volume.weight) == 0
-
-
 def test_of_two_surfaces_within_the_band_the_first_counts():
     front, behind = (torch.tensor(0.2, dtype=torch.float64, requires_grad=True) for _ in range(2))
 
@@ -242,24 +244,30 @@ def test_leaving_out_faint_samples_changes_no_gradient(renderer, monkeypatch):
     torch.testing.assert_close(found[0], found[1], rtol=2e-3, atol=0)
 
 
-def test_weights_are_the_light_that_stays():
+@VOLUMES
+@pytest.mark.parametrize("case", PLANES, ids=lambda case: case.name)
+def test_the_residual_is_the_field_where_the_ray_ends(renderer, case):
+    """Of a plane it is linear along the ray, as between two samples."""
+    rendering = renderer.render(case.field(), case.rays())
+    assert rendering.residual.item() == pytest.approx(case.field()(rendering.points).item(), abs=1e-12)
+
+
+def test_weights_importance_and_sums_worked_out_by_hand():
     passing = vector((0.5, 1.0, 0.25)).log()[None]
     torch.testing.assert_close(weights(passing), vector((0.5, 0.0, 0.375))[None])
-
-
-def test_importance_draws_where_it_lies():
-    distance = vector((0, 1, 2, 4))[None]
-    drawn = by_importance(distance, vector((0, 1, 0))[None], 4)
+    drawn = by_importance(vector((0, 1, 2, 4))[None], torch.stack([vector((0, 1, 0))]), 4)
     torch.testing.assert_close(drawn, vector((1.125, 1.375, 1.625, 1.875))[None], rtol=0, atol=1e-4)
-    even = by_importance(distance, torch.zeros(1, 3).double(), 4)
+    even = by_importance(vector((0, 1, 2, 4))[None], torch.zeros(1, 3).double(), 4)
     torch.testing.assert_close(even, vector((0.5, 1.5, 2.5, 3.5))[None])
-
-
-def test_a_volume_sums_any_values():
     volume = Volume(torch.tensor([2, 0, 2]), vector((1, 2, 3)), vector((0.5, 1, 0.25)))
-    torch.testing.assert_close(volume.summed(vector((2, 3, 4)), 4), vector((3, 0, 2, 0)))
     channels: Tensor = vector((1, 0, 0, 1, 1, 1)).view(3, 2)
     torch.testing.assert_close(volume.summed(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
+
+
+def test_the_band_looks_where_the_parabola_through_three_samples_is_lowest():
+    places = vector((0.0, 0.3, 0.9, 0.1, 0.3, 0.35)).view(2, 3).T
+    lowest = vector((0.37, 0.28))
+    torch.testing.assert_close(_lowest(places, 3 * (places - lowest) ** 2 + 0.1), lowest)
 
 
 def test_settings_that_cannot_be_are_refused():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bench.config import load
+from renderers import warm as warm_module
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Field, Kind, Meter
@@ -73,22 +74,10 @@ def test_a_field_that_becomes_steep_loses_nothing(warm):
     assert min(hits[16:]) >= 0.9 * hits[0] > 28  # from where it is twice as steep; before, it is taken for a distance
 
 
-def test_a_shape_that_stays_costs_its_hits_and_little_besides(warm):
-    rays = camera_of(64, angles=(30.0, 25.0)).rays()
-    (found, first), _, _, (again, values) = in_turn(warm, [ball(0.5)] * 4, rays)
-    assert torch.equal(found.hit, again.hit)
-    torch.testing.assert_close(again.distance, found.distance, atol=5e-5, rtol=0)
-    assert found.hit.sum() < values < 0.45 * first
-
-
-def test_what_enters_where_nothing_was_hit_is_seen(warm):
-    entering = [sphere(0.2, (0.3, 1.3 - 0.03 * i, 0.2)) for i in range(16)]
-    fields = [ball(0.4, x=-0.4) | other for other in entering]
-    assert most_differing(warm, fields) <= 1
-
-
-def test_hits_that_leave_become_misses(warm):
-    assert most_differing(warm, [ball(0.4 - 0.04 * i) for i in range(10)]) <= 1
+def test_what_enters_where_nothing_was_hit_is_seen_and_hits_that_leave_become_misses(warm):
+    entering = [ball(0.4, x=-0.4) | sphere(0.2, (0.3, 1.3 - 0.03 * i, 0.2)) for i in range(16)]
+    assert most_differing(warm, entering) <= 1
+    assert most_differing(fresh(warm), [ball(0.4 - 0.04 * i) for i in range(10)]) <= 1
 
 
 @pytest.mark.parametrize("second", [box((0.6, 0.3, 0.4)), NOTHING, ball(0.3) | ball(0.3, x=-0.6)])
@@ -131,8 +120,16 @@ def test_after_too_many_disagreements_nothing_is_taken_from_memory(warm):
     assert meter.counts.value == begun()
 
 
-def test_the_audit_takes_one_ray_in_a_hundred_and_another_one_each_time(warm):
+def test_the_audit_takes_one_ray_in_a_hundred_and_another_one_each_time(warm, monkeypatch):
+    taken, compare = torch.zeros(SIZE * SIZE), warm_module._differing
+
+    def recorded(kept, found, audited):
+        taken.add_(audited)
+        return compare(kept, found, audited)
+
+    monkeypatch.setattr(warm_module, "_differing", recorded)
     in_turn(warm, [ball(0.5)] * 11)
+    assert taken.max() == 1 and taken.sum() == warm.memory.audited
     assert 9.5 < warm.memory.audited / (SIZE * SIZE / AUDITED) < 10.5
     assert final_notes(warm) == [
         f"renderer.warm: 0 of {warm.memory.audited} audited rays had another answer when marched anew"
@@ -168,10 +165,8 @@ def test_a_camera_that_moves_is_another_image_and_rays_that_are_gone_are_forgott
 
 
 def test_rays_with_a_gradient_are_not_remembered(warm):
-    origins = RAYS.origins.clone().requires_grad_(True)
-    for iteration in range(2):
-        found = at_iteration(warm, iteration).render(ball(0.5), replace(RAYS, origins=origins))
-    assert found.distance.requires_grad
+    rays = replace(RAYS, origins=RAYS.origins.clone().requires_grad_(True))
+    assert all(found.distance.requires_grad for found, _ in in_turn(warm, [ball(0.5)] * 2, rays))
     assert not warm.memory.images
 
 
