@@ -43,34 +43,17 @@ def write_tables(results):
     other = {"name": "dvr", "colour": "#d1495b", "symbol": "^", "x": [3.0], "y": [1.0]}
     panel = {"title": "one", "x": {"title": "time", "log": True}, "y": {"title": "error", "log": True}}
     chart = {"panels": [panel | {"series": [points, other]}]}
-    front = {
-        "place": 1,
-        "title": "Error over time.",
-        "caption": "What is plotted.",
-        "notes": ["A note."],
-        "chart": chart,
-    }
+    front = {"place": 1, "title": "Error over time.", "caption": "What is plotted.", "notes": ["A note."]}
     front |= {"question": "What does accuracy cost?", "verdict": "The least error is *0.5*."}
     front |= {"columns": ["Setting", "Time", "Words"], "chart": chart}
     front |= {"rows": [["slow", "12.0 s", "b"], ["fast", "300 ms", "a"], ["none", "–", "c"]]}
     (folder / "speed_front.json").write_text(json.dumps(front))
     (folder / "speed_front.csv").write_text("setting,time\nslow,12\n")
     axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
-    cell = {
-        "short": "0.1",
-        "full": "0.1 (0.05 to 0.2)",
-        "shade": 0.4,
-        "status": "ok",
-        "reason": "",
-        "folder": "completion-0002",
-    }
-    lost = cell | {
-        "short": "unsupported",
-        "shade": None,
-        "status": "unsupported",
-        "folder": "gone",
-        "reason": "no alpha",
-    }
+    cell = {"short": "0.1", "full": "0.1 (0.05 to 0.2)", "shade": 0.4, "status": "ok", "reason": ""}
+    cell |= {"folder": "completion-0002"}
+    lost = cell | {"short": "unsupported", "shade": None, "status": "unsupported", "folder": "gone"}
+    lost |= {"reason": "no alpha"}
     atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
     where = {"place": 2, "title": "Where it breaks.", "columns": ["Axis", "dist"], "rows": [["wires", "0.1"]]}
     where |= {"question": "Where?", "verdict": "At *0.1*.", "atlas": atlas}
@@ -147,6 +130,9 @@ def test_a_failed_run_stands_last_with_its_status_in_words(results, tab):
     page.get_by_label("Status", exact=True).select_option("crashed")
     assert rows_of(page).count() == 1
     assert page.locator("#machines").count() == 0  # it has no machine, which is not another one
+    page.locator("#board-list tbody th a").click()
+    page.get_by_text("What helps:").wait_for()
+    assert "An error ended it." in page.locator(".happened").inner_text()
 
 
 def test_metrics_without_a_better_direction_rank_nothing(tmp_path, tab):
@@ -171,18 +157,17 @@ def test_times_of_several_machines_are_flagged(tmp_path, tab):
     assert page.locator("#machines").count() == 0 and rows_of(page).count() == 1
 
 
-def test_a_run_has_its_page(results, tab):
+def test_a_run_has_its_page_with_the_result_first_scaled_as_in_tables(results, tab):
     page = tab(results).open("#/runs?view=runs")
     page.locator("#board-list tbody th a").first.press("Enter")
     page.get_by_role("heading", name="Make it again").wait_for()
     text = page.locator("main").inner_text()
-    for words in (
-        "It ended as planned.",
-        "python -m bench task=completion",
-        "runs = bench.load(",
-        "of optimisation",
-    ):
+    for words in ("It ended as planned.", "python -m bench task=completion", "runs = bench.load(", "of optimisation"):
         assert words in text
+    titles = page.locator("main h2").all_inner_texts()
+    assert titles[0] == "Result" and titles.index("Costs") > titles.index("Curve")
+    row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
+    assert row.locator("td").all_inner_texts() == ["45.6", "1.00", "lower"]
     page.get_by_text("metrics, with definitions").click()
     assert "Sum of two means." in page.locator("main").inner_text()
     assert page.locator("main img").count() == len(made.PICTURES)
@@ -191,21 +176,6 @@ def test_a_run_has_its_page(results, tab):
     assert page.locator(".chart .panel").count() == 2
     page.get_by_role("button", name="Seconds").click()
     page.get_by_text("seconds of optimisation").first.wait_for()
-
-
-def test_a_run_has_its_result_first_scaled_as_in_tables(results, tab):
-    page = tab(results).open("#/run/completion-0001")
-    page.get_by_role("heading", name="Result").wait_for()
-    titles = page.locator("main h2").all_inner_texts()
-    assert titles[0] == "Result" and titles.index("Costs") > titles.index("Curve")
-    row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
-    assert row.locator("td").all_inner_texts() == ["45.6", "2.00", "lower"]
-
-
-def test_a_failed_run_says_what_helps(results, tab):
-    page = tab(results).open("#/run/broken")
-    page.get_by_text("What helps:").wait_for()
-    assert "An error ended it." in page.locator(".happened").inner_text()
 
 
 def test_the_mesh_turns_under_the_mouse_and_the_keys(results, tab):
@@ -243,17 +213,6 @@ def test_a_mesh_is_shown_in_its_colours_or_in_grey(tmp_path, tab):
     page.wait_for_timeout(300)
     red, green, blue = middle(plot)
     assert max(red, green, blue) < 1.2 * min(red, green, blue)
-
-
-def test_two_meshes_turn_together(results, tab):
-    page = tab(results).open("#/compare/completion-0000/completion-0001")
-    plots = drawn(page)
-    before = [plot.screenshot() for plot in plots.all()]
-    drag(page, plots.first)
-    after = [plot.screenshot() for plot in plots.all()]
-    cameras = plots.evaluate_all("all => all.map((plot) => JSON.stringify(plot.layout.scene.camera.eye))")
-    assert len(before) == 2 and all(a != b for a, b in zip(before, after, strict=True))
-    assert cameras[0] == cameras[1]
 
 
 def drawn(page):
@@ -319,6 +278,12 @@ def test_two_runs_are_compared(results, tab):
     assert "renderer._label_" in text and "index" in text
     row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
     assert row.locator("td").all_inner_texts() == ["1.00", "2.00", "2.00", "A"]
+    plots = drawn(page)
+    before = [plot.screenshot() for plot in plots.all()]
+    drag(page, plots.first)  # both turn together
+    after = [plot.screenshot() for plot in plots.all()]
+    cameras = plots.evaluate_all("all => all.map((plot) => JSON.stringify(plot.layout.scene.camera.eye))")
+    assert len(before) == 2 and all(a != b for a, b in zip(before, after, strict=True)) and cameras[0] == cameras[1]
     address = page.evaluate("location.hash")
     page.get_by_role("link", name="Swap").click()
     page.get_by_role("heading", name="Settings that differ").wait_for()

@@ -253,7 +253,10 @@ def test_what_another_put_in_the_place_of_a_script_is_replaced(tmp_path):
         (folder / f"{linked}.js").rename(outside.with_name(kind))
         (folder / f"{linked}.js").symlink_to(outside.with_name(kind))
         (folder / f"{edited}.js").write_text("evil();")
+    (results / "page" / "data" / "run" / f"{'0' * 16}.js").write_text("evil();")
+    (results / "page" / html.START).write_text("evil();")
     write_index(results)
+    assert not any("evil();" in path.read_text(encoding="utf-8") for path in (results / "page").rglob("*.js"))
     for kind in ("run", "mesh"):
         outside.with_name(kind).write_text("evil();")
         for key in (linked, edited):

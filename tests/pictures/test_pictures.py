@@ -1,5 +1,6 @@
-"""The strip and the film of a run: frames in their order, and none where pictures are off."""
+"""Pictures of runs: the strip and the film, what galleries are made of, legends that stay within their figure."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from PIL import Image
 
 from bench.config import load
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
+from bench.pictures.run_figures import ViewPair, _show_depth, save_gallery
+from bench.pictures.style import legend_below
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, View, see
 from renderers.fields.analytic import sphere
@@ -18,6 +21,14 @@ from tests.reconstruct.test_losses import ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, run_of
 
 CAMERA = camera_of(16)
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> list[Figure]:
+    """The figures that are saved, in place of their files."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    return figures
 
 
 @pytest.fixture
@@ -57,20 +68,18 @@ def test_a_strip_alone_is_the_default(inputs, tmp_path):
         assert strip.width < 1.35 * 110 * (MOST + 1)
 
 
-@pytest.mark.parametrize("own", [0, 1])
-def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, monkeypatch, own):
-    drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn):
     filmstrip = Filmstrip(inputs, "by rung")
     for name in range(3 * MOST):
         filmstrip.add(f"rung_{name}", sphere(0.5), CAMERA)
-    filmstrip.save(tmp_path, "a ball", f"rung_{own}")
-    labels = [tick.label2 for tick in drawn[0].axes[0].xaxis.get_major_ticks()]  # those at the top
-    names = [label.get_text() for label in labels]
-    assert len(names) == MOST + 1
-    assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MOST - 1}", "truth")
-    assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {own}"]
-    assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
+    for own in (0, 1):
+        filmstrip.save(tmp_path, "a ball", f"rung_{own}")
+        labels = [tick.label2 for tick in drawn[-1].axes[0].xaxis.get_major_ticks()]  # those at the top
+        names = [label.get_text() for label in labels]
+        assert len(names) == MOST + 1
+        assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MOST - 1}", "truth")
+        assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {own}"]
+        assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
 
 
 def test_nothing_is_drawn_where_pictures_are_off(inputs, tmp_path):
@@ -87,20 +96,14 @@ def photograph(height: int, width: int, *, masked: bool = True) -> Shown:
     return Shown(View(shot.camera, shot.depth, shot.normals, mask), shot.colours, masked)
 
 
-def drawn_strip(inputs, tmp_path, monkeypatch, true: Shown) -> Figure:
-    """The figure of a strip of two coloured frames, seen by the photograph's camera."""
-    drawn, pictures = [], replace(inputs, evaluation=replace(inputs.evaluation, picture=32))
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    filmstrip = Filmstrip(pictures, true=true)
+@pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
+def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, drawn, size, masked):
+    true = photograph(*size, masked=masked)
+    filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), true=true)
     for iteration, radius in enumerate((0.3, 0.7)):
         filmstrip.add(iteration, cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), true.view.camera)
     filmstrip.save(tmp_path, "a ball")
-    return drawn[0]
-
-
-@pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
-def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, monkeypatch, size, masked):
-    figure = drawn_strip(inputs, tmp_path, monkeypatch, photograph(*size, masked=masked))
+    (figure,) = drawn
     axis = figure.axes[0]
     rows = [label.get_text() for label in axis.get_yticklabels()]
     assert rows == ["colours", "normals", *([SILHOUETTE] if masked else [])]
@@ -134,12 +137,71 @@ def test_a_photograph_is_enlarged_with_its_parts_in_place():
     assert small.colours is not None and small.colours.shape == (5, 10, 3) and small.masked
 
 
-def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
     for true in (None, photograph(16, 16)):
         filmstrip = Filmstrip(inputs, true=true)
         filmstrip.add(0, sphere(0.5), CAMERA)
         filmstrip.save(tmp_path, "a ball")
         labels = [label.get_text() for label in drawn[-1].axes[0].get_yticklabels()]
         assert labels == ["normals", SILHOUETTE]
+
+
+def half_ball(radius: float) -> Mesh:
+    """A ball of which the half towards the camera, at z above 0, is there."""
+    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    vertices, faces = np.array(made.vertices), np.array(made.faces)
+    return Mesh(vertices, faces[(vertices[faces][..., 2] >= 0).all(axis=1)]).compact()
+
+
+def test_shapes_are_seen_by_two_cameras_and_depths_where_they_are_given(inputs, tmp_path):
+    inputs = replace(inputs, evaluation=replace(inputs.evaluation, gallery=24))
+    scene = inputs.scene
+    observed = scene.view.mask & (torch.arange(256).view(16, 16) % 5 == 0)
+    save_gallery(tmp_path, inputs, observed, {"start": None, "found": half_ball(0.4)})
+    with np.load(tmp_path / "images.npz") as images:
+        found = dict(images)
+    assert np.array_equal(np.isfinite(found["given"]), observed.numpy())
+    given = scene.view.depth.numpy()[observed.numpy()]
+    np.testing.assert_allclose(found["given"][observed.numpy()], given, atol=2e-3)
+    assert {name: array.shape for name, array in found.items() if name != "given"} == {
+        f"{kind}_{part}": (2, 24, 24, *more)
+        for kind in ("start", "found", "true")
+        for part, more in (("normals", (3,)), ("hit", ()))
+    }
+    front, behind = found["true_hit"]
+    assert front.sum() > 60 and np.array_equal(front, front[:, ::-1]) and abs(int(behind.sum()) - int(front.sum())) < 20
+    assert found["true_normals"][0, 12, 12, 2] > 0.9  # towards the camera
+    assert 0 < found["found_hit"][0].sum() < 0.6 * front.sum()  # the smaller ball
+    assert (found["found_normals"][1][found["found_hit"][1]][:, 2] < 0).mean() > 0.5  # its inside, from behind
+    assert not found["start_hit"].any()
+
+
+def test_depths_are_coloured_from_the_nearest_to_the_farthest():
+    view = see(Truth(half_ball(0.6), closed=False), CAMERA)
+    pair = ViewPair("truth", view, view)
+    image = _show_depth(Figure().subplots(), pair, (pair,))
+    known = view.depth[view.mask]
+    assert image.get_clim() == (known.min(), known.max()) and known.min() < known.max()
+
+
+def test_a_run_writes_them_where_they_are_asked_for(isolated, tmp_path):
+    small = ("scale=smoke", "evaluation.picture=null", "evaluation.grid=24", "evaluation.points=100", "isolation=off")
+    code, out, _ = isolated("task=deepsdf", *small, "task.optimiser.iterations=2", "evaluation.gallery=12")
+    assert code == 0
+    folder = tmp_path / "r" / "runs" / out.split("/")[-1].strip()
+    with np.load(folder / "images.npz") as images:
+        record = json.loads((folder / "record.json").read_text())
+        assert np.isfinite(images["given"]).sum() == record["evaluations"]["observed"]
+        assert all(images[f"{kind}_hit"].any() for kind in ("start", "found", "true"))
+
+
+def test_a_legend_wider_than_the_figure_takes_fewer_columns():
+    for length, columns in ((3, 4), (30, 2), (300, 1)):
+        figure = Figure(figsize=(7, 3), layout="constrained")
+        axes = figure.subplots()
+        for name in range(8):
+            axes.plot([0, 1], [name, name], label=f"{name}".ljust(length, "x"))
+        legend_below(figure, axes)
+        (legend,) = figure.legends
+        assert legend._ncols == columns
+        assert legend.get_window_extent().width <= figure.bbox.width or columns == 1
