@@ -6,7 +6,7 @@ from bench.report.study import Result, Runs, Selection, compare, gallery, median
 PLACE = 40
 READS = (Selection("table3"),)
 REFERENCE = "multiview_dist"
-# DIST (Liu et al. 2020), Table 3: Chamfer from truth to prediction x 1000 (mean or median: not said), 50 shapes of PMO's test set.
+# DIST (Liu et al. 2020), Table 3: Chamfer from truth to prediction x 1000, of 50 shapes of the test set of PMO.
 PUBLISHED = {
     "car": {"PMO": 0.661, "PMO, random start": 1.187, "DIST, random start": 0.919},
     "plane": {"PMO": 1.129, "PMO, random start": 6.124, "DIST, random start": 1.595},
@@ -17,7 +17,7 @@ NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
     f"All runs start from random codes, one per shape, the same for each method. {NOTE}",
     "“Published” is DIST, Table 3, which does not say whether it has means or medians: 50 shapes of PMO's renderings "
-    "of ShapeNet, with another prior and metric scale, not to be compared directly with the measured rows.",
+    "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
 )
 MESH = "multiview_mesh"  # the preset that PMO's rows are to be read beside
 ON_MESH = (

@@ -72,6 +72,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
     assert row(result, "start: random codes")["Median"] == "8.00"
     assert row(result, "published: DIST, random start")["Median"] == "0.919"
     assert row(result, "published: PMO, random start")["Median"] == "1.187"  # as the paper prints it
+    assert "does not say whether it has means or medians" in told(result)
     assert "cannot be compared directly" in told(result)
     assert "PMO (Lin et al. 2019)" not in told(result)  # there is no mesh row
 
