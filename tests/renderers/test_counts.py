@@ -66,24 +66,6 @@ def test_dist_on_a_plane_asks_as_often_as_equation_8_says(degrees, alpha):
         assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_queries(degrees, 1.0)
 
 
-def test_the_papers_example_of_a_grazing_ray():
-    # DIST, A.1: at 10 degrees to the surface alpha = 1.5 takes 33 steps in place of 52, to where d (1 - alpha sin)^k is
-    # 5e-5. Epsilon bounds the field's value, d sin(10 degrees) of that, so that the queries are fewer.
-    steps = {alpha: ceil(log(EPSILON) / log(1 - alpha * sin(radians(10)))) for alpha in (1.0, 1.5)}
-    assert steps == {1.0: 52, 1.5: 33}
-    for alpha, most in steps.items():
-        count = forward(replace(PLAIN, alpha=alpha, steps=200), GROUND, down(80.0))
-        assert count == plane_queries(80.0, alpha) < most
-
-
-@each("radius", [0.4, 0.6])  # smaller, and the first step passes the centre
-def test_head_on_at_a_sphere_the_rest_shrinks_by_one_minus_alpha(radius):
-    head_on = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
-    assert forward(PLAIN, sphere(radius), head_on) == 2  # the first step ends on the surface
-    halvings = ceil(log((1 - radius) / EPSILON, 2))
-    assert forward(replace(PLAIN, alpha=1.5), sphere(radius), head_on) == halvings + 1
-
-
 def marched(rays: Rays, radius: float, *, alpha: float, steps: int) -> int:
     """Queries of sphere tracing at a sphere about the origin, ray by ray, from the geometry of a triangle."""
     queries = 0

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from renderers import DIST
 from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
@@ -17,13 +16,7 @@ from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, ground, vector
 
 NAIVE = load("renderer", "naive", steps=100, epsilon=1e-11, silhouette_average="all")
-DIST_PLAIN = DIST(
-    steps=300, epsilon=1e-11, alpha=1.0, extra_step_cap=None, step_clamp=None, active_only=True, coarse_to_fine=False,
-    careful_split=True,
-    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0,
-    silhouette_signed=True,
-    silhouette_average="all",
-)  # fmt: skip
+DIST_PLAIN = load("renderer", "dist", steps=300, epsilon=1e-11, alpha=1.0, extra_step_cap=None, coarse_to_fine=False)
 by_case = each("case", CASES)
 
 
@@ -96,23 +89,6 @@ def test_dist_back_propagates_one_value_a_sample_whatever_the_steps(steps, sampl
     replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
     assert naive.counts.value == steps
     assert samples < naive.counts.gradient <= steps  # none goes through the steps behind the last
-
-
-def test_rays_that_hit_nothing_carry_one_sample_and_no_gradient_of_distance():
-    # Passes the ball at 0.7, and a ray that passes the unit sphere.
-    rays = Rays(vector((0.7, 0, -2, 2, 0, -2)).view(2, 3), vector((0, 0, 1)).expand(2, 3))
-    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    meter = Meter(sphere(radius))
-    rendering = replace(DIST_PLAIN, n_gradient_samples=3).render(meter, rays)
-    marched = meter.counts.value
-    assert (rendering.status == Status.MISS).all()
-    (gradient,) = torch.autograd.grad(rendering.distance.sum(), radius, allow_unused=True, retain_graph=True)
-    assert gradient is None or gradient == 0
-    before = meter.counts.gradient
-    rendering.closest.sum().backward()
-    assert meter.counts.gradient - before == 1
-    assert radius.grad == -1
-    assert marched > 3
 
 
 BESIDE = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a ball of radius 0.5 by 0.2

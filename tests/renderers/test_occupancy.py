@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from renderers.field import Flops, Kind, occupancy_field, occupancy_logits
-from renderers.fields import occupancy
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.occupancy import OccupancyNetwork
 from tests.looped import each
@@ -85,18 +84,6 @@ def test_gradients_flow_to_weights_code_and_points_as_in_the_unbound_network(cod
     reference = torch.autograd.grad(plain(network, code, points)[output].square().sum(), wanted)
     torch.testing.assert_close(bound, reference, rtol=1e-10, atol=1e-13)
     assert all(gradient.abs().sum() > 0 for gradient in bound)
-
-
-@pytest.mark.parametrize("count", [0, 6, 7, 8, 20])
-def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
-    network, (code, points) = make(), draw(4, count)
-    whole = both(network, code, points)
-    sizes = []
-    network.first.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
-    monkeypatch.setattr(occupancy, "CHUNK", 7)
-    torch.testing.assert_close(both(network, code, points), whole, rtol=0, atol=1e-14)
-    assert sum(sizes) == 2 * count
-    assert max(sizes) <= 7
 
 
 def test_flops_are_two_a_weight_without_the_code_and_twice_that_back_to_weights():
