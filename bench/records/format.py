@@ -1,6 +1,7 @@
 """Formats numbers for readers: three significant digits, `∞` for infinite, `–` for missing."""
 
 import math
+from collections.abc import Callable, Mapping
 
 MISSING = "–"
 INFINITE = "∞"
@@ -69,3 +70,24 @@ def seconds(x: int | float | None) -> str:
 def interval(low: float | None, high: float | None) -> str:
     """The ends of an interval, such as [0.12, 0.34]; empty where there is none."""
     return "" if low is None or math.isnan(low) else f"[{number(low)}, {number(high)}]"
+
+
+def ends(
+    what: str, values: Mapping[str, float | None], n: str, *, show: Callable[[float], str] = number, most: bool = False
+) -> str:
+    """A verdict: the least and the largest of known values, and whose they are; empty without a finite one.
+
+    Args:
+        what: the quantity.
+        values: of each row.
+        n: the sample in words.
+        show: gives the text of a value.
+        most: whether the largest is the best, and stands first.
+    """
+    known = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
+    ordered = sorted(known, key=lambda row: -known[row] if most else known[row])
+    if not ordered or math.isinf(known[ordered[0]]):
+        return ""
+    best, worst = (f"{show(known[row])}" for row in (ordered[0], ordered[-1]))
+    rest = f" to {worst} ({ordered[-1]})" if len(ordered) > 1 else ""
+    return f"{what}: *{best}* ({ordered[0]}){rest}; n = {n}."

@@ -57,30 +57,10 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
     return lines
 
 
-def best(
-    lines: Sequence[Mapping[str, Any]], name: str, what: str, n: str, *, scale: float = 1.0, most: str = "least"
-) -> str:
-    """A sentence on the rows with the best, the next and the worst median; empty without two rows.
-
-    Rows with fewer runs than others are left out, since they are not of the same shapes.
-
-    Args:
-        lines: as `medians` gives them.
-        name: the metric.
-        what: its name in words.
-        n: the sample in words.
-        scale: of the metric.
-        most: "least", or "largest" where that is the best.
-    """
-    whole = max((line["runs"] for line in lines), default=0)
-    known = [line for line in lines if line[name] is not None and line["runs"] == whole]
-    known.sort(key=lambda line: line[name], reverse=most == "largest")
-    if len(known) < 2 or not np.isfinite(known[0][name]):
-        return ""
-    values = [format.number(line[name], scale=scale) for line in known]
-    said = [f"{value} ({line['method']})" for value, line in zip(values, known, strict=True)]
-    end = f", and at the other end {said[-1]}" if len(known) > 2 else ""
-    return f"The {most} median {what} is *{values[0]}* ({known[0]['method']}), then {said[1]}{end}; n = {n}."
+def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
+    """A median of the rows with as many runs as any, by row: those of fewer are not of the same shapes."""
+    most = max((line["runs"] for line in lines), default=0)
+    return {line["method"]: line[name] for line in lines if line["runs"] == most}
 
 
 @style.styled

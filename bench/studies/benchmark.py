@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import pandas as pd
-
 from bench.report.data.records import Record, measured, setting
 from bench.report.study import Result, Runs, Selection, format, table
 
@@ -46,29 +44,20 @@ def make(runs: Runs) -> Result:
         "Seconds of one rendering and of one step of an optimisation, and their ratios to those of the first renderer "
         f"of the same round: medians of {' or '.join(map(str, rounds))} rounds, in brackets the least and the largest.",
         question="Which renderer is fastest, timed in turn in one process?",
-        verdict=_verdict(pd.DataFrame(lines)),
+        verdict=_verdict(lines),
         remarks=NOTES,
         columns=COLUMNS,
         lines=lines,
     )
 
 
-def _verdict(data: pd.DataFrame) -> str:
-    """The least ratio of a step at the largest size that ended ok; empty where there is none."""
-    if "step_ratio" not in data:
-        return ""
-    known = data[(data["status"] == "ok") & data["step_ratio"].notna()]
-    large = known[known["size"] == known["size"].max()]
-    others = large[~large["first"]]
-    if not len(others):
-        return ""
-    best = others.loc[others["step_ratio"].idxmin()]
-    ends = format.interval(best["step_ratio_low"], best["step_ratio_high"])
-    return (
-        f"At {best['size']} × {best['size']} pixels a step of {best['renderer']} takes "
-        f"*{format.number(best['step_ratio'])}* {ends} of the time of {large['renderer'].iloc[0]}; n = "
-        f"{best['rounds']:.0f} rounds on one shape."
-    )
+def _verdict(lines: list[dict[str, Any]]) -> str:
+    """The ratios of a step at the largest size that ended ok."""
+    known = [line for line in lines if line["status"] == "ok" and line.get("step_ratio") is not None]
+    size = max((line["size"] for line in known), default=0)
+    ratios = {line["renderer"]: line["step_ratio"] for line in known if line["size"] == size and not line["first"]}
+    first = next((line["renderer"] for line in known if line["first"]), "")
+    return format.ends(f"A step at {size} × {size} pixels over that of {first}", ratios, "one shape")
 
 
 def _place(record: Record) -> tuple[int, int]:

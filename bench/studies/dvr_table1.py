@@ -1,7 +1,5 @@
 """Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
 
-import math
-
 from bench.report.data.records import Record, Row, error, grouped, row_of
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, single_view, table
 
@@ -52,7 +50,7 @@ def make(runs: Runs) -> Result:
         "Medians over shapes, of costs over those that ended ok, by what the training of the network may know; "
         "Chamfer-L1 in scene units, times 1000.",
         question="How much must a training know, so that one image gives a shape?",
-        verdict=_verdict(of_family),
+        verdict=" ".join(filter(None, (_verdict(name, own) for name, own in of_family.items()))),
         interval=single_view.INTERVALS,
         estimates=[line["interval"] for line in lines if "interval" in line],
         remarks=NOTES,
@@ -63,18 +61,11 @@ def make(runs: Runs) -> Result:
     )
 
 
-def _verdict(of_family: dict[str, list[dict]]) -> str:
-    """The best training by the Chamfer-L1 in each family, of those with as many shapes as any."""
-    said = []
-    for family, lines in of_family.items():
-        trained = [line for line in lines if line["method"] in TRAINED and line["chamfer_l1"] is not None]
-        n = max((line["runs"] for line in trained), default=0)
-        known = {x["method"]: x["chamfer_l1"] for x in trained if x["runs"] == n and math.isfinite(x["chamfer_l1"])}
-        if known:
-            first = min(known, key=lambda row: known[row])
-            alone = table.thousandfold(known.get("RGB"))
-            said.append(f"{family}: {first} *{table.thousandfold(known[first])}*, RGB alone {alone} (n = {n})")
-    return f"Least median Chamfer-L1 × 1000 of the trainings: {'; '.join(said)}." if said else ""
+def _verdict(family: str, lines: list[dict]) -> str:
+    """The trainings of a family by their Chamfer-L1."""
+    errors = medians.whole([line for line in lines if line["method"] in TRAINED], "chamfer_l1")
+    n = format.plural(max(line["runs"] for line in lines), "shape")
+    return format.ends(f"Median Chamfer-L1 × 1000 of {family}", errors, n, show=table.thousandfold)
 
 
 def figures(runs: Runs) -> Result:

@@ -86,8 +86,11 @@ def make(runs: Runs) -> Result:
         f"Medians over {scenes} of errors on what the photographs see; in the figure a point per scene, and the "
         f"median.{_conditions(runs)}",
         question="Which method finds shape and colour from photographs?",
-        verdict=medians.best(
-            lines, "seen_chamfer_l1", "Chamfer-L1 × 1000 of what the photographs see", scenes, scale=SCALE
+        verdict=format.ends(
+            "Median Chamfer-L1 × 1000 of what the photographs see",
+            medians.whole(lines, "seen_chamfer_l1"),
+            scenes,
+            show=table.thousandfold,
         ),
         remarks=NOTES,
         columns=COLUMNS,

@@ -36,18 +36,12 @@ def make(runs: Runs) -> Result:
 
 
 def _verdict(runs: Runs) -> str:
-    """The row and family between whose conditions the median error changes most."""
+    """By which factor the median error of each row and family changes between conditions."""
     keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{one.key}") for one in CONDITIONS)]
     of_rows = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
-    spread = (of_rows.max() / of_rows.min()).dropna().sort_values()
-    if spread.empty:
-        return ""
-    row, family = spread.index[-1]
-    ratio = format.number(spread.iloc[-1])
-    shapes = format.plural(len(set(zip(runs.frame.family, runs.frame.solid, strict=True))), "shape")
-    return (
-        f"Over all conditions the median error changes by a factor of up to *{ratio}* ({row}, {family}); n = {shapes}."
-    )
+    spread = {", ".join(names): ratio for names, ratio in (of_rows.max() / of_rows.min()).items()}
+    shapes = format.plural(len(runs.frame[["family", "solid"]].drop_duplicates()), "shape")
+    return format.ends("Largest over least median error of all conditions", spread, shapes)
 
 
 PAGES = {"fig10": make}

@@ -70,12 +70,11 @@ def _successes(records: Sequence[Record]) -> str:
 
 
 def _verdict(runs: Runs) -> str:
-    """The shares of successes of each row, over all conditions but known places."""
+    """The share of successes of each row, over all conditions but known places."""
     off = [record for record in runs.records if not place_known(record)]
-    counts = {row.name: (sum(map(_succeeded, own)), len(own)) for row, own in grouped(off, row_of).items()}
-    said = "; ".join(f"{row} *{right} of {of}*" for row, (right, of) in counts.items())
+    shares = {row.name: sum(map(_succeeded, own)) / len(own) for row, own in grouped(off, row_of).items()}
     shapes = format.plural(len({solid(record) for record in off}), "shape")
-    return f"Runs with an error below {SUCCESS:g}: {said}; n = {shapes}." if said else ""
+    return format.ends(f"Runs with an error below {SUCCESS:g}", shares, shapes, show=table.percent, most=True)
 
 
 def pictures(runs: Runs) -> Result:

@@ -1,6 +1,6 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
-from bench.report.study import Result, Runs, Selection, gallery, table
+from bench.report.study import Result, Runs, Selection, format, gallery, table
 
 PLACE = 210
 READS = (Selection("fig4", alike=("dataset", "view", "prior", "task")),)
@@ -21,18 +21,14 @@ def make(runs: Runs) -> Result:
     chosen = runs.of_newest_scene()
     found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
     data = table.to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
-    wrong = (data["lost"] + data["false"]).dropna().astype(float)
-    least, most = (data.loc[wrong.idxmin()], data.loc[wrong.idxmax()]) if len(wrong) else ({}, {})
+    wrong = dict(zip(chosen.names(), (data["lost"] + data["false"]).astype(float), strict=True))
     return Result(
         chosen,
         "Errors of each strategy in the image.",
         "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
         "normals.",
         question="Which pixels does each strategy get wrong?",
-        verdict=f"Missed and spurious pixels: *{wrong.min():.0f}* ({least['row']}) to {wrong.max():.0f} "
-        f"({most['row']}) of {most['hits']:,.0f}; n = one shape."
-        if len(wrong)
-        else "",
+        verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.whole),
         remarks=(*found.missing, *NOTES),
         data=data,
         figure=gallery.draw(found.blocks, largest=found.largest),

@@ -58,7 +58,12 @@ def make(runs: Runs) -> Result:
         "Loss and Chamfer distance as shapes are completed.",
         "Loss and Chamfer distance over iterations and seconds.",
         question="What is gained in each iteration?",
-        verdict=_verdict(lines),
+        verdict=format.ends(
+            "Median error at the end (Chamfer × 1000)",
+            {line["row"]: line.get("end") for line in lines},
+            f"{format.plural(min(line['runs'] for line in lines), 'run')} a row",
+            show=table.thousandfold,
+        ),
         remarks=(*unread, _loss(runs), *NOTES),
         data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
         columns=COLUMNS,
@@ -76,17 +81,6 @@ def _end(own: list[pd.DataFrame], failed: list[bool]) -> dict[str, Any]:
             return {}
         ends.append(math.inf if lost else known.iloc[-1])
     return {"end": float(np.median(ends)), "low": min(ends), "high": max(ends)}
-
-
-def _verdict(lines: list[dict[str, Any]]) -> str:
-    known = sorted((line for line in lines if "end" in line), key=lambda line: line["end"])
-    if not known or not math.isfinite(known[0]["end"]):
-        return ""
-    best, last = known[0], known[-1]
-    return (
-        f"{best['row']} ends with the lowest median error, *{format.number(best['end'], SCALE)}* (Chamfer × 1000), "
-        f"{last['row']} with {format.number(last['end'], SCALE)}; n = {min(line['runs'] for line in known)} runs a row."
-    )
 
 
 def _loss(runs: Runs) -> str:

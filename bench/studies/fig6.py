@@ -48,7 +48,13 @@ def make(runs: Runs) -> Result:
         "Camera pose from a depth image and a silhouette of a known shape.",
         PLOTTED.format(**settings),
         question="From how far off is the camera of a known shape found?",
-        verdict=_verdict(found[found.degrees == angles[-1]], angles[-1]),
+        verdict=format.ends(
+            f"Cameras found from {angles[-1]:g} degrees",
+            {row: own.found[own.degrees == angles[-1]].mean() for (row, _), own in rows.items()},
+            format.plural(len(found[["family", "solid"]].drop_duplicates()), "shape"),
+            show=table.percent,
+            most=True,
+        ),
         interval="95 % intervals over shapes (Clopper and Pearson)",
         estimates=[_rate(own) for _, own in found.groupby(["row", "preset", "degrees"])],
         remarks=[note.format(**settings) for note in NOTES],
@@ -84,15 +90,6 @@ def _rate(found: pd.DataFrame) -> statistics.Interval:
 
 def _share(found: pd.DataFrame | None) -> str:
     return "" if found is None else table.counted(found.found.sum(), len(found), _rate(found))
-
-
-def _verdict(far: pd.DataFrame, angle: float) -> str:
-    """The rows that find most and fewest cameras from the largest angle."""
-    counts = far.groupby("row", sort=False).found.agg(["sum", "size"])
-    most, least = counts["sum"].idxmax(), counts["sum"].idxmin()
-    said = {row: f"{counts['sum'][row]} of {counts['size'][row]}" for row in (most, least)}
-    shapes = format.plural(len(far[far.row == most][["family", "solid"]].drop_duplicates()), "shape")
-    return f"From {angle:g} degrees {most} finds *{said[most]}* cameras, {least} {said[least]}; n = {shapes}."
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:

@@ -23,33 +23,22 @@ def make(runs: Runs) -> Result:
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
     found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
     lines = [(record, _counts(record, drawn)) for record, drawn in zip(chosen.records, found.counts, strict=True)]
+    wrong = {
+        f"epsilon = {_epsilon(record):g}": counts["lost_share"] + counts["false_share"]
+        for record, counts in lines
+        if record["status"] == "ok" and "lost_share" in counts and _epsilon(record) is not None
+    }
     return Result(
         chosen,
         "Erosion and dilation of the image by the convergence threshold.",
         "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
         "blue) above the angle to the reference's.",
         question="Which threshold of convergence shows the true outline?",
-        verdict=_verdict(lines),
+        verdict=format.ends("Missed and spurious pixels over the hits", wrong, "one shape", show=_percent),
         remarks=(*found.missing, *NOTES),
         columns=COLUMNS,
         lines=lines,
         figure=gallery.draw(found.blocks, largest=found.largest),
-    )
-
-
-def _verdict(lines: list[tuple[records.Record, dict[str, Any]]]) -> str:
-    """The threshold with the fewest wrong pixels; empty where none is known."""
-    wrong = {
-        _epsilon(record): 100 * (counts["lost_share"] + counts["false_share"])
-        for record, counts in lines
-        if record["status"] == "ok" and "lost_share" in counts and _epsilon(record) is not None
-    }
-    if not wrong:
-        return ""
-    best, worst = min(wrong, key=wrong.__getitem__), max(wrong, key=wrong.__getitem__)
-    return (
-        f"Missed and spurious pixels together are fewest at epsilon = {best:g}: *{wrong[best]:.2g} %* of the hits; at "
-        f"{worst:g} they are {wrong[worst]:.2g} %; n = one shape."
     )
 
 
@@ -66,7 +55,7 @@ def _epsilon(record: records.Record) -> float | None:
 
 
 def _percent(share: float | None) -> str:
-    return format.number(share) if share is None else f"{100 * share:.2g} %"
+    return format.number(share) if share is None else f"{format.number(share, 100)} %"
 
 
 COLUMNS = (  # of a record and its counts

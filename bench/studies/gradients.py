@@ -103,16 +103,11 @@ def _by_blur(runs: Runs) -> pd.DataFrame:
 
 
 def _verdict(data: pd.DataFrame) -> str:
-    """How many renderers have a pooled cosine of 0.99 in every band of hits."""
+    """The least pooled cosine of each renderer in the bands of hits."""
     hits = data[data["band"].isin(ANGLES)]
-    cosine = hits["code_pooled_cosine"].where(hits["status"] == "ok").fillna(-1.0)
-    least = cosine.groupby(hits["name"], sort=False).min()
-    worst = least.idxmin()
-    rest = f"the least is {least[worst]:.2f}, of {worst}" if least[worst] >= 0 else f"{worst} has none"
-    return (
-        f"*{int((least >= 0.99).sum())} of {len(least)}* renderers have a pooled cosine of at least 0.99 with the true "
-        f"gradient in every band of hits; {rest} (n = one shape)."
-    )
+    least = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False).min()
+    said = f"Least pooled cosine in any band of hits, {(least >= 0.99).sum()} of {len(least)} of 0.99 or more"
+    return format.ends(said, least.to_dict(), "one shape", show=_cosine, most=True)
 
 
 def _verdict_visible(data: pd.DataFrame) -> str:

@@ -26,7 +26,7 @@ def make(runs: Runs) -> Result:
         "Held-out photographs: how well the shape and its colours match them, medians over folders; in the figure a "
         "point per folder, and the median.",
         question="Which method is best on real photographs?",
-        verdict=medians.best(lines, "psnr", "PSNR of held-out photographs in dB", folders, most="largest"),
+        verdict=format.ends("PSNR of held-out photographs (dB)", medians.whole(lines, "psnr"), folders, most=True),
         remarks=records.definitions(runs.records, DEFINED),
         columns=COLUMNS,
         lines=lines,

@@ -1,6 +1,5 @@
 """Completion from depths that a scanner measured, against exact ones at the same pixels."""
 
-import math
 from typing import Any
 
 import pandas as pd
@@ -45,7 +44,11 @@ def make(runs: Runs) -> Result:
         "Median errors over scans (times 1000; depths in scene units, distances between surfaces in their squares) "
         "with exact and with measured depths, and the ratio of both.",
         question="Do depths that a scanner measured complete a shape as exact ones do?",
-        verdict=_verdict(lines, scans),
+        verdict=format.ends(
+            "Depth error with measured depths over that with exact ones",
+            {line["row"]: line.get(f"depth_mae_{RATIO}") for line in lines},
+            format.plural(scans, "scan"),
+        ),
         remarks=NOTES,
         columns=COLUMNS,
         lines=lines,
@@ -70,16 +73,6 @@ def _line(row: str, runs: Runs, pairs: dict[str, pd.DataFrame]) -> Line:
             exact, measured = (mine[depths].to_numpy()[:, None] for depths in (EXACT, MEASURED))
             line[f"{metric}_{RATIO}"] = statistics.geometric_ratio([*measured], [*exact]).value
     return line
-
-
-def _verdict(lines: list[Line], scans: int) -> str:
-    """The least and the largest ratio of the depth errors."""
-    ratios = [(line.get(f"depth_mae_{RATIO}", math.nan), line["row"]) for line in lines]
-    ratios = [(ratio, row) for ratio, row in ratios if not math.isnan(ratio)]  # unknown where either failed alone
-    if not ratios:
-        return ""
-    ends = [f"*{format.number(ratio)}* ({row})" for ratio, row in (min(ratios), max(ratios))]
-    return f"The depth error with measured depths is {' to '.join(ends)} times that with exact ones; n = {scans} scans."
 
 
 PAGES = {"scans": make}

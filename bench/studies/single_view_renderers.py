@@ -26,15 +26,12 @@ def make(runs: Runs) -> Result:
     """A line per family and row."""
     of_family = [single_view.lines_of(runs, name, (FIRST, *single_view.BASELINES)) for name in runs.families()]
     lines = [line for own in of_family for line in own]
-    said = [*filter(None, map(_least, of_family))]
-    once = ", one training each" if runs.frame.seed.nunique() == 1 else ""
-    verdict = f"Chamfer-L1 over that of the network that Newton taught, on the same unseen shapes{once}: "
     return Result(
         runs,
         "Shape from one image, by the renderer of the training.",
         "Chamfer-L1 in scene units, times 1000; medians over shapes.",
         question="Does it matter which renderer teaches a network of one image?",
-        verdict=f"{verdict}{'; '.join(said)}." if said else "",
+        verdict=" ".join(filter(None, map(_verdict, of_family))),
         interval=single_view.INTERVALS,
         estimates=[line["interval"] for line in lines],
         remarks=NOTES,
@@ -45,18 +42,12 @@ def make(runs: Runs) -> Result:
     )
 
 
-def _least(lines: list[dict[str, Any]]) -> str:
-    """The least ratio of a family to the first row, of how many; empty where there is nothing to compare.
-
-    A ratio to a row that failed where the other did not is 0 or unknown, and says nothing.
-    """
+def _verdict(lines: list[dict[str, Any]]) -> str:
+    """The ratios of a family's networks to the first row; one of 0, where that row failed, says nothing."""
     taught = [line for line in lines if line["preset"] not in single_view.BASELINES]
-    ratios = {line["method"]: line[FIRST] for line in taught if line.get(FIRST) and line[FIRST].value > 0}
-    if not ratios:
-        return ""
-    row = min(ratios, key=lambda name: ratios[name].value)
-    among = f", the least of {len(ratios)}" if len(ratios) > 1 else ""
-    return f"{lines[0]['family']}: {row} *{format.number(ratios[row].value)}* {ratios[row].ends()}{among}"
+    ratios = {line["method"]: line[FIRST].value for line in taught if line.get(FIRST) and line[FIRST].value > 0}
+    n = format.plural(max(line["runs"] for line in lines), "unseen shape")
+    return format.ends(f"Chamfer-L1 over that of Newton's network, {lines[0]['family']}", ratios, n)
 
 
 PAGES = {"single_view_renderers": make}

@@ -82,16 +82,11 @@ def _key(metric: str) -> str:
 
 
 def _verdict(data: pd.DataFrame) -> str:
-    """Which strategy costs least, of those that finish; empty where fewer than two do."""
-    found = data[(data["status"] == "ok") & data["step_s"].notna()].sort_values("step_s")
-    if len(found) < 2:
-        return ""
+    """The cheapest strategy and the dearest of those that finish."""
+    found = data[(data["status"] == "ok") & data["step_s"].notna()]
     limits = int(data["status"].isin(["timeout", "oom"]).sum())
-    first, last = ((format.seconds(found["step_s"].iloc[i]), found["row"].iloc[i]) for i in (0, -1))
-    return (
-        f"A step takes *{first[0]}* with {first[1]} and {last[0]} with {last[1]}; {limits} of "
-        f"{len(data)} rows reach a limit at this size (n = one shape)."
-    )
+    said = f"A step, where it finishes ({limits} of {len(data)} rows reach a limit at this size)"
+    return format.ends(said, dict(zip(found["row"], found["step_s"], strict=True)), "one shape", show=format.seconds)
 
 
 def _size(record: records.Record) -> str:

@@ -37,7 +37,11 @@ def make(runs: Runs) -> Result:
         "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken; "
         "evaluations are medians of runs that ended ok.",
         question="What is tuning worth?",
-        verdict=_verdict(methods, lines),
+        verdict=format.ends(
+            f"Error of the best of {max(budgets, default=0)} draws over that of one draw",
+            {line["method"]: line["worth"] and line["worth"].value for line in lines},
+            f"{len({run[0] for method in methods for run in method.test_runs})} test shapes",
+        ),
         interval="95 % intervals over test shapes (Student's, of logarithms)",
         estimates=[found for line in lines for found in line["curve"].values()],
         remarks=_notes(runs, methods),
@@ -72,16 +76,6 @@ def _notes(runs: Runs, methods: list[Tuning]) -> list[str]:
     told = f"{waiting} planned runs have not ended: draws and shapes that some method lacks are left out."
     sizes = {"validation": methods[0].validation.shape[1], "test": len(methods[0].test_runs)}
     return [*(note.format(**sizes) for note in NOTES), *([told] if waiting else []), *left_out(runs, methods)]
-
-
-def _verdict(methods: list[Tuning], lines: list[Line]) -> str:
-    """What the best draw is worth, of the method that gains the most and of the one that gains the least."""
-    known = [(line["worth"].value, line["method"]) for line in lines if line["worth"] is not None]
-    if not known:
-        return ""
-    ends = [f"*{format.number(value)}* ({label})" for value, label in (min(known), max(known))]
-    draws, n = len(methods[0].draws), len({run[0] for run in methods[0].test_runs})
-    return f"The best of {draws} draws has {' to '.join(ends)} times the error of one draw; n = {n} test shapes."
 
 
 def draw(lines: list[Line]) -> Figure:

@@ -1,7 +1,5 @@
 """Photographs from one side: what renderers make of the side that none of them shows, and where their weights lie."""
 
-import math
-
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, records, table
 
 PLACE = 51
@@ -45,25 +43,17 @@ def make(runs: Runs) -> Result:
         f"Medians over {format.plural(len(every), 'scene')}, distances in scene units, times 1000; in the figure, "
         "colours above and normals below, from behind.",
         question="What leaves bumps on the side that no photograph shows?",
-        verdict=_verdict(lines, format.plural(len(every), "scene")),
+        verdict=format.ends(
+            "Roughness of the unseen side above the truth's (degrees)",
+            medians.whole(lines, "unseen_roughness"),
+            format.plural(len(every), "scene"),
+        ),
         remarks=(*NOTES, *records.definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
         figure=gallery.draw(blocks),
     )
-
-
-def _verdict(lines: list[dict], n: str) -> str:
-    """Rows whose unseen sides are no bumpier than the truth's, and the bumpiest one."""
-    bumps = {line["method"]: line["unseen_roughness"] for line in lines if line["unseen_roughness"] is not None}
-    smooth = [row for row, value in bumps.items() if value <= 0]
-    worst = max(bumps, key=lambda row: bumps[row], default="")
-    said = [f"no bumpier than the truth, by their medians: {'; '.join(smooth)}"] if smooth else []
-    if worst and 0 < bumps[worst] < math.inf:
-        said.append(f"the bumpiest, by *{bumps[worst]:.1f}°* more than the truth: {worst}")
-    told = "; ".join([*said, f"n = {n}"])
-    return f"{told[0].upper()}{told[1:]}." if said else ""
 
 
 PAGES = {"unseen_back": make}

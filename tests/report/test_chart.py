@@ -1,4 +1,4 @@
-"""A chart is drawn as a figure from the data that the page gets."""
+"""A chart is drawn as a figure from the data that the page gets; a verdict is written of numbers."""
 
 import math
 
@@ -7,6 +7,7 @@ import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 
 from bench.pictures import style
+from bench.records.format import ends
 from bench.report.data.statistics import Interval
 from bench.report.write.chart import curve, draw, level, panel_data, series
 
@@ -71,3 +72,11 @@ def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
     values = [[1.0, math.inf], [1.0, 4.0], [1.0, 100.0]]
     panels = [panel_data("", "x", "y", [curve("a", "dist", [1, 2], own)]) for own in values]
     assert draw(panels, 2.0, 2, **shared).axes[0].lines[0].get_ydata()[1] == edge
+
+
+def test_a_verdict_has_the_best_and_the_worst_row_and_none_where_nothing_is_finite():
+    values = {"a": 2.0, "b": math.inf, "c": 1.0, "d": None, "e": math.nan}
+    assert ends("Error", values, "3 shapes") == "Error: *1.00* (c) to ∞ (b); n = 3 shapes."
+    assert ends("Score", {"a": 2.0, "c": 1.0}, "3 shapes", most=True) == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."
+    assert ends("Error", {"a": 2.0}, "1 shape") == "Error: *2.00* (a); n = 1 shape."
+    assert ends("Error", {"b": math.inf}, "3 shapes") == ends("Error", {}, "3 shapes") == ""

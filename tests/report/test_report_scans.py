@@ -57,9 +57,9 @@ def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, me
     made(tmp_path, "exact", 1.0, index=1)
     made(tmp_path, "measured", 2.0, index=1, status=status)
     line, result = row(tmp_path), page(tmp_path)
+    assert (f": *{ratio}* (newton); n = " in result.verdict) is (status == "refused")
     assert (line["Depth error, measured"], line["Depth error, ratio"]) == (measured, ratio)
     assert line["Failed"] == failed
-    assert f"is *{ratio}* (newton) to *{ratio}* (newton)" in result.verdict
     assert status in result.data["status"].tolist()
 
 
@@ -68,7 +68,6 @@ def test_where_both_failed_neither_is_better(tmp_path):
         made(tmp_path, "exact", 1.0, index=index, status=status)
         made(tmp_path, "measured", 4.0, index=index, status=status)
     assert row(tmp_path)["Depth error, ratio"] == "2.00"  # of 4 and 1
-    assert "is *2.00* (newton)" in page(tmp_path).verdict
 
 
 def test_without_a_pair_there_is_no_ratio(tmp_path):

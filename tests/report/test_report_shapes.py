@@ -139,7 +139,7 @@ def test_photographs_need_no_chamfer(tmp_path):
     assert line_of(result, HULL).tolist() == ["12.0", "0.500", "0.900", "0.800", "0 of 2", "500 ms", "none"]
     axis = result.figure.axes[0]
     assert axis.get_lines()[0].get_xdata().tolist() == [20.0, 26.0] and axis.get_xscale() == "linear"
-    assert result.verdict.endswith("is *23.0* (Newton, RGB), then 12.0 (Visual hull); n = 2 folders.")
+    assert result.verdict.endswith(": *23.0* (Newton, RGB) to 12.0 (Visual hull); n = 2 folders.")
 
 
 def test_photographs_without_masks_have_no_overlap(tmp_path):

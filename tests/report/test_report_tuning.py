@@ -97,8 +97,8 @@ def test_the_page_has_a_column_per_budget(whole):
     assert "n = 48 runs (12 shapes, 1 seed)" in result.caption  # six of each split
     assert "have not ended" not in told(result)
     assert "Validation runs: 6 per draw; test runs: 6 per draw" in told(result)
-    assert result.verdict.startswith("The best of 4 draws has *0.")
-    assert result.verdict.endswith("times the error of one draw; n = 6 test shapes.")
+    assert result.verdict.startswith("Error of the best of 4 draws over that of one draw: *0.649*")
+    assert result.verdict.endswith("n = 6 test shapes.")
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape_and_its_draw_ranks_behind(tmp_path):
