@@ -90,16 +90,18 @@ def explained(monkeypatch, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("argument", "words"),
+    ("arguments", "words"),
     [
-        ("renderer=dist,dvr", ("renderer has several values: add -m for a run of each, write renderer=[dist,dvr]",)),
-        ("renderer.steps=0", ("steps must be at least 1, not 0",)),
+        (["renderer=dist,dvr"], "renderer has several values: add -m for a run of each, write renderer=[dist,dvr]"),
+        (["renderer.steps=0"], "steps must be at least 1, not 0"),
+        (["-m", "index=0,-1"], "cell 2 of 2 (index=-1): index must be at least 0"),
+        (["memory_limit=-1"], "memory_limit must be positive"),
     ],
 )
-def test_the_command_says_so_in_a_line_and_leaves_nothing(bench, tmp_path, no_prior, argument, words):
-    code, out, err = bench(argument)
+def test_the_command_says_so_in_a_line_and_leaves_nothing(bench, tmp_path, no_prior, arguments, words):
+    code, out, err = bench(*arguments)
     assert (code, out) == (2, "")
-    assert_one_line(err, "error: ", *words)
+    assert_one_line(err, "error: ", words)
     assert not list((tmp_path / "r" / "runs").glob("*"))
 
 

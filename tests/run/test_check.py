@@ -11,12 +11,11 @@ from bench.run import process
 from bench.run.plan import check_plan, refusal
 from bench.run.process import Job
 from tests import tiny
-from tests.run.driving import command, errors
+from tests.run.driving import command
 
 SMALL = ("scale=smoke", "threads=1")
 CODE = """
-import os
-class {name}:
+class Mine:
     def __init__(self, *_, **__):
         {act}
     def render(self, field, rays): ...
@@ -59,7 +58,7 @@ def own(tmp_path, monkeypatch):
 
     def write(act: str) -> tuple[str, str]:
         module = f"acting_{abs(hash(act))}_{tmp_path.name}"
-        (tmp_path / f"{module}.py").write_text(CODE.format(name="Mine", act=act))
+        (tmp_path / f"{module}.py").write_text(CODE.format(act=act))
         return "renderer=custom", f"renderer._target_={module}.Mine"
 
     return write
@@ -102,14 +101,3 @@ def test_a_gpu_is_looked_for_where_the_runs_are(planned, monkeypatch):
     with pytest.raises(ValueError, match="PyTorch sees no GPU"):
         check_plan(plan, "joblib", set())
     check_plan(plan, "slurm", set())
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (("-m", "index=0,-1"), "cell 2 of 2 (index=-1): index must be at least 0"),
-    (("memory_limit=-1",), "memory_limit must be positive"),
-])  # fmt: skip
-def test_nothing_is_left_of_what_is_refused(tmp_path, arguments, words):
-    done = command(*arguments, "scale=smoke", f"results_dir={tmp_path / 'r'}")
-    assert (done.code, done.out) == (2, "")
-    assert words in done.err and len(errors(done.err)) == 1, done.err
-    assert not (tmp_path / "r").exists()

@@ -1,7 +1,6 @@
 """Runs from Python: `bench.run` and `bench.load`, as their examples show them."""
 
 import doctest
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -29,11 +28,6 @@ import sys, bench
 heavy = {"torch", "pandas", "numpy", "hydra", "matplotlib", "omegaconf"} & set(sys.modules)
 assert not heavy, heavy
 assert callable(bench.run) and callable(bench.run)
-"""
-SCRIPT = """
-import bench
-record = bench.run(task="completion", renderer="newton", scale="smoke", results_dir="two words", overrides={small})
-print(record.status, record.reused, record.folder.relative_to({folder!r}), flush=True)
 """
 
 
@@ -97,19 +91,3 @@ def test_the_lines_of_the_page_open_the_run(within):
 def test_importing_bench_imports_nothing_that_is_slow():
     done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_a_script_without_a_guard_makes_a_run_from_any_folder(tmp_path):
-    script = tmp_path / "script.py"
-    small = [override for override in SMALL if override != "isolation=off"]
-    script.write_text(SCRIPT.format(small=small, folder=str(tmp_path)))
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    said = [
-        subprocess.run(
-            [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-        ).stdout
-        for _ in range(2)
-    ]
-    assert [line.split()[:2] for line in said] == [["ok", "False"], ["ok", "True"]]
-    assert "two words/runs/completion-newton-sofa-" in said[0] and said[0].count("\n") == 1

@@ -1,6 +1,5 @@
 """A run that ends badly leaves a record that says how; it is stopped at its limit, and costs no other run."""
 
-import multiprocessing
 import signal
 import time
 from types import SimpleNamespace
@@ -8,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from bench.run import process
-from bench.run.process import RunLimits, Started, Step, _watch
-from tests.looped import each
+from bench.run.process import Step
 from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -56,34 +54,9 @@ def test_a_run_that_ends_badly_says_how(request, isolated, tmp_path, how):
     assert how != "raise" or "RuntimeError: it failed on request" in "\n".join(record["log"])
 
 
-@each("steps, when", [
-    ([], "while setting up"),
-    ([("training the prior", 50, 6500), ("training the prior", 100, 6500)], "while training the prior (100 of 6500)"),
-    ([("training the prior", 6500, 6500), ("optimising", 3, 20)], "while optimising (3 of 20)"),
-    ([("optimising", 20, 20)], "after optimising (20 of 20)"),
-])  # fmt: skip
-def test_a_limit_says_in_which_phase_it_was_reached(child, steps, when):
-    for limits, what in (
-        (RunLimits(seconds=0.01, memory=None), "more than time_limit=0.01 s, "),
-        (RunLimits(seconds=None, memory=1e-6), "more than 1e-06 GiB of memory (memory_limit), "),
-    ):
-        ours, childs = multiprocessing.Pipe()
-        for message in (Started(), *(Step(*step, loss=None) for step in steps)):
-            childs.send(message)
-        ending = _watch(child, ours, limits, lambda message: None)
-        assert ending is not None and ending.reason == what + when
-
-
-@pytest.fixture
-def child(monkeypatch):
-    """A process that does nothing; it is not killed at a limit."""
-    started = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
-    started.start()
-    kill = started.kill
-    monkeypatch.setattr(started, "kill", lambda: None)
-    yield started
-    kill()
-    started.join()
+def test_a_step_says_in_which_phase_a_limit_was_reached():
+    assert Step("training the prior", 100, 6500, None).when == "while training the prior (100 of 6500)"
+    assert Step("optimising", 20, 20, None).when == "after optimising (20 of 20)"
 
 
 @pytest.mark.parametrize(("how", "words"), [
