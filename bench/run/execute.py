@@ -1,7 +1,6 @@
 """Executes one run, in a process of its own or in the command's; every failure is recorded with its reason."""
 
 import fcntl
-import logging
 import os
 import signal
 import sys
@@ -16,7 +15,7 @@ import torch
 
 from bench.machine import environment
 from bench.progress import Report, notices_to
-from bench.records.record import Record, RunStatus
+from bench.records.record import Record, RunStatus, now
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import Cell, RunContext, cell_of
 from bench.solve.solve import Unsupported
@@ -61,7 +60,6 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         KeyboardInterrupt: where the run was stopped; the record has what is known.
     """
     folder, record = job.folder, job.record
-    log = _open_log(folder)
     before = environment.scheduled()
     try:
         cell = _built(record, progress)
@@ -76,7 +74,7 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
         record.status, record.reason = RunStatus.REFUSED, reason_of(error)
-        log.error(traceback.format_exc())
+        _note(folder, traceback.format_exc())
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, reason_of(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
@@ -85,12 +83,11 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
         record.status = RunStatus.OOM if out_of_memory else RunStatus.CRASHED
         record.reason = reason_of(error, folder)
-        log.error(traceback.format_exc())
+        _note(folder, traceback.format_exc())
     finally:
         record.environment["waited_share"] = environment.waited_share(before)
         record.notes += environment.doubts(record)
-        log.info("%s %s", record.status, record.reason)
-        _close_log(log)
+        _note(folder, f"{record.status} {record.reason}")
 
 
 def _built(record: Record, progress: Report) -> Cell:
@@ -108,9 +105,9 @@ class _Progress:
         self.channel, self.sent, self.phase = channel, 0.0, ""
 
     def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None:
-        now = time.perf_counter()
-        if now - self.sent > INTERVAL or done == total or phase != self.phase:
-            self.sent, self.phase = now, phase
+        moment = time.perf_counter()
+        if moment - self.sent > INTERVAL or done == total or phase != self.phase:
+            self.sent, self.phase = moment, phase
             self.channel.send(Step(phase, done, total, loss))
 
 
@@ -139,22 +136,7 @@ def _print_to(path: Path) -> None:
     os.close(log)
 
 
-class _LogFile(logging.FileHandler):
-    """A log file whose write errors, such as a full disk, are ignored."""
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        """Does nothing: the run's record has the reason of a failure."""
-
-
-def _open_log(folder: Path) -> logging.Logger:
-    log = logging.Logger(folder.name, logging.INFO)  # not registered: Hydra disables registered ones between jobs
-    handler = _LogFile(folder / "log.txt", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    log.addHandler(handler)
-    return log
-
-
-def _close_log(log: logging.Logger) -> None:
-    for handler in log.handlers:
-        with suppress(OSError):
-            handler.close()
+def _note(folder: Path, text: str) -> None:
+    """Adds a text to the run's log; on a full disk it is left out, since the record has the reason of a failure."""
+    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
+        log.write(f"{now()} {text}\n")

@@ -55,8 +55,12 @@ class RunInputs:
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     make_pixel_precise: Callable[[], Noted] | None = None
-    photographed: Photographed | None = None  # the dataset, where it has photographs and no true shape
     trained: int | None = None  # number of the scene's shape in the prior's training; None where it was not in it
+
+    @property
+    def photographed(self) -> Photographed | None:
+        """The dataset, where it has photographs and no true shape."""
+        return self.dataset if isinstance(self.dataset, Photographed) else None
 
     @cached_property
     def scene(self) -> Scene:
@@ -202,7 +206,6 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     task, dataset, evaluation, prior, models = parts("task", "dataset", "evaluation", "prior", "models")
     split, index, threads = *_place(config["split"], config["index"]), config["threads"]
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
-    photographed = dataset if isinstance(dataset, Photographed) else None
 
     def make_prior() -> Prior:
         with using_threads(threads or ALL_THREADS):  # training pays with more of them
@@ -211,7 +214,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     inputs = RunInputs(
         renderer=made,
         views=view,
-        scene_name=dataset.name if photographed else scene_name(dataset, split, index),
+        scene_name=dataset.name if isinstance(dataset, Photographed) else scene_name(dataset, split, index),
         make_scene=lambda: make_scene(dataset, view, split=split, index=index),
         make_prior=make_prior,
         evaluation=evaluation,
@@ -222,7 +225,6 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         dataset=dataset,
         notes=tuple(notes),
         make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
-        photographed=photographed,
         trained=index if split == Split.TRAIN and index < prior.shapes else None,
     )
     _check(task, inputs, index)
