@@ -41,7 +41,7 @@ def _report(given: dict[str, str]) -> int:
     to_frame(records).to_csv(table, index=False)
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
-    for path in (table, *papers, *write_sweeps(records, results_dir)):
+    for path in (table, *papers, *write_sweeps(records, results_dir, broken)):
         print(path)
     for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
         print(problem, file=sys.stderr)

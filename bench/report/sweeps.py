@@ -15,7 +15,7 @@ from bench.report.data.records import Record, RunKey, by_shape, definitions, err
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
 from bench.report.write.caption import OVER
-from bench.report.write.paper import SWEEPS, TABLE, studies
+from bench.report.write.paper import BROKEN, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, counted, text
 
@@ -43,9 +43,22 @@ class Sweep:
         return [*(name for name in SHOWN if name in found), *(name for name in found if name not in SHOWN)]
 
 
-def write_sweeps(known: list[Record], results_dir: Path) -> list[Path]:
-    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths."""
-    return [_write(sweep, results_dir / SWEEPS / sweep.name)[0] for sweep in read_sweeps(known, results_dir)]
+def write_sweeps(known: list[Record], results_dir: Path, problems: list[str] | None = None) -> list[Path]:
+    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths.
+
+    `problems` gets a line for each sweep that no table can be made of; without it, its error is raised.
+    """
+    by_folder, studied, written = {record["folder"]: record for record in known}, _studied(), []
+    for plan in read_plans(results_dir)[0]:
+        try:
+            if not any(one.id in by_folder for one in plan.cells) or plan.cells[0].config.get("experiment") in studied:
+                continue
+            written.append(_write(of_plan(plan, by_folder), results_dir / SWEEPS / plan.name)[0])
+        except BROKEN as error:
+            if problems is None:
+                raise
+            problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
+    return written
 
 
 def write_sweep(plan: Plan) -> Path | None:
@@ -58,14 +71,6 @@ def write_sweep(plan: Plan) -> Path | None:
         known[cell.id] = record or not_run(cell, plan)
     _write(of_plan(plan, known), plan.folder)
     return plan.folder / f"{TABLE}.md"
-
-
-def read_sweeps(known: list[Record], results_dir: Path) -> list[Sweep]:
-    """The sweeps of a results folder without a study."""
-    by_folder, studied = {record["folder"]: record for record in known}, _studied()
-    plans = [plan for plan in read_plans(results_dir)[0] if any(cell.id in by_folder for cell in plan.cells)]
-    sweeps = [of_plan(plan, by_folder) for plan in plans]
-    return [sweep for sweep in sweeps if sweep.runs.selection.experiment not in studied]
 
 
 def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:

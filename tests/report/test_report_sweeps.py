@@ -8,9 +8,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from bench.records.read import Plan, PlannedCell, read_records
+from bench.records.read import Plan, PlannedCell, read_plans, read_records
 from bench.report.__main__ import main as report
-from bench.report.sweeps import lines, read_sweeps, write_sweep, write_sweeps
+from bench.report.sweeps import lines, of_plan, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
@@ -156,8 +156,17 @@ def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):
     swept(tmp_path, cells)
     ran(tmp_path, cells[0], 0.001)
     write_run(tmp_path, "{", cells[1].id)
-    (sweep,) = read_sweeps(read_records(tmp_path)[0], tmp_path)
-    assert [(row["row"], row["runs"], row["failed"]) for row in lines(sweep)] == [("DIST", 2, 1)]
+    (plan,), known = read_plans(tmp_path)[0], {one["folder"]: one for one in read_records(tmp_path)[0]}
+    assert [(row["row"], row["runs"], row["failed"]) for row in lines(of_plan(plan, known))] == [("DIST", 2, 1)]
+
+
+def test_a_sweep_with_an_odd_record_costs_no_other_table(tmp_path, capsys):
+    for seed, name in enumerate(("odd", "sound")):
+        swept(tmp_path, [cell("dist", seed=seed)], name)
+        ran(tmp_path, cell("dist", seed=seed), 0.001, **({"environment": {"cpu": [1]}} if name == "odd" else {}))
+    assert report([f"results_dir={tmp_path}"]) == 1 and [found.name for found in find_sweeps(tmp_path)] == ["sound"]
+    told = capsys.readouterr()
+    assert "not made: sweeps/odd (TypeError: " in told.err and told.out.endswith("index.html\n")
 
 
 def costing(seconds: float) -> dict:
