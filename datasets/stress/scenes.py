@@ -31,6 +31,14 @@ GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its di
 GRAZING_SHIFT, GRAZING_ROLL = 0.1, 10.0  # of its camera: along the plane, in scene units; about its axis, in degrees
 SLIT_DEPTH, SLIT_SHARE = 0.1, 3.0  # of `gap`: how deep, and how many slits the picture is wide
 
+CUBE_VIEWS: dict[str, Callable[[float], dict[str, float]]] = {
+    # from a distance, with a field of view that keeps the size of its image
+    "far_camera": lambda distance: {"distance": distance, "field_of_view": 2 * degrees(atan(1.0 / distance))},
+    "wide_view": lambda angle: {"distance": 1.8, "field_of_view": angle},
+    "narrow_view": lambda angle: {"field_of_view": angle},
+    "cube": lambda setting: {},  # for a severity that is a renderer's setting
+}
+
 
 @dataclass(frozen=True)
 class Exam:
@@ -149,24 +157,9 @@ def near_camera(severity: float, draw: np.random.Generator, resolution: int) -> 
     return Exam(sphere.field, _turned(camera, down=aside * cos(way), right=aside * sin(way)), sphere)
 
 
-def far_camera(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube from a distance, with a field of view that keeps its image size."""
-    return _cube(draw, resolution, distance=severity, field_of_view=2 * degrees(atan(1.0 / severity)))
-
-
 def camera_inside(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     """A camera within a sphere, at a depth below its surface: no ray has a first hit."""
     return _seen(sphere_solid(0.5), draw, resolution, distance=0.5 - severity, field_of_view=60.0)
-
-
-def wide_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube from nearby, with a field of view in degrees."""
-    return _cube(draw, resolution, distance=1.8, field_of_view=severity)
-
-
-def narrow_view(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """A cube with a field of view in degrees: pixels become small."""
-    return _cube(draw, resolution, field_of_view=severity)
 
 
 def empty_scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
@@ -192,6 +185,11 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
     return scene
 
 
+def _cube_seen(view: Callable[[float], dict[str, float]]) -> Scene:
+    """The cube, with a view that depends on the severity."""
+    return lambda severity, draw, resolution: _cube(draw, resolution, **view(severity))
+
+
 def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
     """A smaller cube behind a sphere of a radius, up to 0.1, in which the field is NaN."""
     cube = box((0.42,) * 3)
@@ -205,18 +203,15 @@ def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> E
     return Exam(Shape(value, Kind.DISTANCE), exam.camera, exam.truth)
 
 
-def cube(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
-    """An undisturbed cube, for a severity that is a renderer's setting."""
-    return _cube(draw, resolution)
-
-
 SCENES: dict[str, Scene] = {
     scene.__name__: scene
     for scene in (
         thin_plate, wires, nested_shells, bumps, tiny_objects, gap, csg_difference, grazing_plane, near_camera,
-        far_camera, camera_inside, wide_view, narrow_view, empty_scene, nan_region, cube,
+        camera_inside, empty_scene, nan_region,
     )
-} | {name: _distorted(distortion) for name, distortion in distortions.DISTORTIONS.items()}  # fmt: skip
+}  # fmt: skip
+SCENES |= {name: _distorted(distortion) for name, distortion in distortions.DISTORTIONS.items()}
+SCENES |= {name: _cube_seen(view) for name, view in CUBE_VIEWS.items()}
 
 
 def _cube(draw: np.random.Generator, resolution: int, **view: float) -> Exam:
