@@ -1,9 +1,7 @@
 """Datasets of shapes, the exact truth of a shape, and a scene: one shape, one camera, and the camera's view of it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 from zlib import crc32
 
@@ -16,7 +14,6 @@ from datasets.mesh import Mesh
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.checks import BadInput
-from renderers.field import Field
 
 SPLIT_STRIDE = 1_000_000  # distance between the seeds of two splits, more than a split has shapes
 
@@ -179,14 +176,12 @@ class Scene:
         name: of the dataset and the shape.
         mesh: the true shape.
         view: its true images.
-        formula: gives the shape as a field, where it has a formula.
         measured: camera z that a scanner measured at the view's pixels, 0 where it measured none; None without one.
     """
 
     name: str
     mesh: Mesh
     view: View
-    formula: Callable[[], Field] | None = None
     measured: Float[Tensor, "height width"] | None = None
 
     def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
@@ -232,15 +227,6 @@ class Scanned(Protocol):
         ...
 
 
-@runtime_checkable
-class Formulas(Protocol):
-    """A dataset whose shapes are formulas."""
-
-    def formula(self, split: Split, index: int) -> Field:
-        """Shape number `index` of a split as a field."""
-        ...
-
-
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
     """The scene of shape number `index` of a split, with the camera of that number."""
     mesh = dataset.mesh(split, index)
@@ -251,9 +237,8 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
         repaired = f" (repaired: {'; '.join(mesh.repairs)})" if mesh.repairs else ""
         what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
         raise BadInput(f"{what}: widen view.field_of_view or distance")
-    formula = partial(dataset.formula, split, index) if isinstance(dataset, Formulas) else None
     measured = see(Truth(scanned.seen(index), closed=False), camera).depth if scanned else None
-    return Scene(scene_name(dataset, split, index), mesh, view, formula, measured)
+    return Scene(scene_name(dataset, split, index), mesh, view, measured)
 
 
 def scene_name(dataset: Dataset, split: Split, index: int) -> str:

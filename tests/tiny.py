@@ -14,7 +14,7 @@ from bench.setup.fields import FieldChoice
 from bench.setup.inputs import Cell, RunContext, RunInputs, cell_of
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
-from datasets.scene import Scene, View
+from datasets.scene import Scene, Truth, View, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
@@ -98,6 +98,12 @@ def ball_prior(radius: float = 0.5, scale: float = 1.0, width: int = 128) -> Pri
 def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, float] = (0.0, 0.0)) -> Camera:
     """A camera 2.5 from the origin, at which it looks, y up: at z = 2.5, or at these angles in degrees."""
     return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
+
+
+def scene_of(made: Any, camera: Camera) -> Scene:
+    """A mesh of trimesh, seen by a camera."""
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    return Scene("a shape", mesh, see(Truth(mesh), camera))
 
 
 def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed: Any) -> RunContext:

@@ -1,5 +1,6 @@
 """What is reconstructed: photographs, some of them held out, and the true surface where there is one."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -7,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from bench.setup.inputs import RunInputs
+from bench.setup.inputs import RunContext, RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
@@ -83,41 +84,57 @@ def visible(scene: Truth, shot: Shot, points: Float[np.ndarray, "n 3"]) -> Bool[
     return inside & (hits.distance > np.linalg.norm(points - centre, axis=1) - ON_SURFACE)
 
 
-def find_subject(
-    images: Photography, depths: Depths, inputs: RunInputs, *, longest: int, every: int, masks: bool
-) -> Subject:
-    """The photographs of a folder, or those that are taken of the scene's mesh.
+@dataclass(frozen=True)
+class PhotographTask(ABC):
+    """A task whose subject are photographs of a folder, or those that are taken of the scene's mesh.
 
     Args:
         images: settings of photographs that are taken.
-        depths: that are given.
-        inputs: of the run.
         longest: most pixels along the longer side of a photograph.
-        every: of so many photographs one is held out.
+        held_out: of so many photographs one is held out.
         masks: whether those that are given have their masks. The unit sphere may have been found by masks anyway, those
             of photographs that are held out not among them.
-
-    Raises:
-        BadInput: where photographs are missing, too few, or do not fit.
+        depths: that are given; photographs of one's own have none.
     """
-    if inputs.photographed is not None:
-        capture = inputs.photographed.capture(longest, every)
-        shots, truth, seed = capture.shots, None, inputs.seed
-        found = "; ".join([capture.summary, *capture.notes])
-    else:
-        scene = inputs.scene
-        camera = scene.view.camera.resized(longest, longest)
-        seed, truth = scene.seed(inputs.seed), scene.mesh
-        shots = tuple(images.take(Truth(truth), camera, seed=seed))
-        found = f"{len(shots)} rendered photographs of {longest} x {longest} pixels"
-    held_out, given = shots[::every], tuple(shot for place, shot in enumerate(shots) if place % every)
-    if len(given) < FEWEST:
-        raise BadInput(f"{len(shots)} photographs with every {every}th held out leave {len(given)}: give more")
-    given = tuple(depths.of(shot, (seed, place)) for place, shot in enumerate(given))
-    given = given if masks else tuple(replace(shot, mask=None) for shot in given)
-    return Subject(
-        given, held_out, truth, f"{found}; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
-    )
+
+    images: Photography
+    longest: int
+    held_out: int
+    masks: bool
+    depths: Depths
+
+    def __post_init__(self) -> None:
+        check_at_least("task.longest", self.longest, 8, "96 shows what there is")
+        check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
+
+    @abstractmethod
+    def execute(self, run: RunContext) -> None:
+        """Finds the shape of the photographs, and judges it by those that are held out."""
+
+    def subject(self, inputs: RunInputs) -> Subject:
+        """The photographs, and the true surface where there is one.
+
+        Raises:
+            BadInput: where photographs are missing, too few, or do not fit.
+        """
+        if inputs.photographed is not None:
+            capture = inputs.photographed.capture(self.longest, self.held_out)
+            shots, truth, seed = capture.shots, None, inputs.seed
+            found = "; ".join([capture.summary, *capture.notes])
+        else:
+            scene = inputs.scene
+            camera = scene.view.camera.resized(self.longest, self.longest)
+            seed, truth = scene.seed(inputs.seed), scene.mesh
+            shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
+            found = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
+        every = self.held_out
+        held_out, given = shots[::every], tuple(shot for place, shot in enumerate(shots) if place % every)
+        if len(given) < FEWEST:
+            raise BadInput(f"{len(shots)} photographs with every {every}th held out leave {len(given)}: give more")
+        given = tuple(self.depths.of(shot, (seed, place)) for place, shot in enumerate(given))
+        given = given if self.masks else tuple(replace(shot, mask=None) for shot in given)
+        found += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
+        return Subject(given, held_out, truth, found)
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:

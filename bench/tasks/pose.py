@@ -19,7 +19,7 @@ from bench.solve.solve import Unsupported, solve
 from datasets.scene import Scene, Truth, View, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
-from renderers.checks import BadInput, check_at_least, check_choice, check_positive
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
 from renderers.rendering import Observed, Renderer, at_iteration
@@ -109,7 +109,7 @@ class Pose(PoseTask):
         degrees, shift, starts, spread, success_degrees, success_distance: see `PoseTask`.
         trial: iterations of each start, where there are several; see `bench.solve.optimise.StartSettings`.
         shape: field of the known shape: "grid", distances of the mesh on a grid; "prior", the network at the scene's
-            code, which must be a training shape; "formula", that of a procedural family.
+            code, which must be a training shape.
         grid: samples per axis of the grid.
         depth_loss, depth_weight: over pixels that both hit; see `bench.tasks.completion.Completion`.
         silhouette: loss of the mask.
@@ -131,7 +131,7 @@ class Pose(PoseTask):
 
     def __post_init__(self) -> None:
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
-        check_choice("task.shape", self.shape, ("grid", "prior", "formula"))
+        check_choice("task.shape", self.shape, ("grid", "prior"))
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
         for name in ("depth_weight", "silhouette_weight", "normal_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
@@ -163,18 +163,10 @@ class Pose(PoseTask):
 
 
 def known_shape(settings: Pose, inputs: RunInputs) -> Field:
-    """The field of the scene's shape, of the kind that `settings.shape` names.
-
-    Raises:
-        BadInput: where the scene has no such field.
-    """
+    """The field of the scene's shape, of the kind that `settings.shape` names."""
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
-    if settings.shape == "formula":
-        if inputs.scene.formula is None:
-            raise BadInput(f"{inputs.scene.name} has no formula: set task.shape=grid")
-        return inputs.scene.formula()
     values = Truth(inputs.scene.mesh).distance_grid(settings.grid, REACH)
     return Grid(torch.from_numpy(values).to(inputs.device), REACH)
 

@@ -14,9 +14,8 @@ from bench.reconstruct.subject import (
     GIVEN,
     GUIDES,
     HULL,
-    Depths,
+    PhotographTask,
     Subject,
-    find_subject,
     given_distances,
     hull_distances,
 )
@@ -24,7 +23,6 @@ from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import check_field_gradient, check_kind, solve
-from datasets.photographs import Photography
 from renderers.checks import check_at_least, check_choice
 
 UNCOUNTED = {
@@ -34,15 +32,11 @@ UNCOUNTED = {
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(PhotographTask):
     """A field with colours, from a sphere, such that its renderings are the photographs.
 
     Args:
-        images: settings of photographs of a dataset of meshes; not read for photographs of one's own.
-        longest: most pixels along the longer side of a photograph.
-        held_out: of so many photographs one is held out.
-        masks: whether the given photographs have their masks, where there are any.
-        depths: that are given; photographs of one's own have none.
+        images, longest, held_out, masks, depths: see `PhotographTask`.
         guide: distances that a silhouette loss may use, such as `silhouette=occupancy` with `occupied_at: depth` (DVR,
             Sec. 3.4): "none", "given" depths, or where rays meet the visual "hull", and given depths before these.
         rays: pixels that are drawn in each iteration.
@@ -52,11 +46,6 @@ class Reconstruction:
         optimiser: iterations and learning rates.
     """
 
-    images: Photography
-    longest: int
-    held_out: int
-    masks: bool
-    depths: Depths
     guide: str
     rays: int
     appearance: Appearance
@@ -67,8 +56,7 @@ class Reconstruction:
     takes_field: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_at_least("task.longest", self.longest, 8, "96 shows what there is")
-        check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
+        super().__post_init__()
         check_choice("task.guide", self.guide, GUIDES)
         check_at_least("task.rays", self.rays, 4, "1024 work")
         if self.losses.colour_gradient and self.rays % 4:
@@ -85,9 +73,7 @@ class Reconstruction:
             check_kind(inputs.renderer, model.field)
         definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
-        subject = find_subject(
-            self.images, self.depths, inputs, longest=self.longest, every=self.held_out, masks=self.masks
-        )
+        subject = self.subject(inputs)
         run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
         if name != AUTO:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)

@@ -1,35 +1,24 @@
 """The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
-from bench.reconstruct.subject import NO_HULL, Depths, Subject, find_subject
+from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
 from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
-from datasets.photographs import Photography
 from renderers.checks import BadInput, check_at_least
 
 
 @dataclass(frozen=True)
-class _Photographs(ABC):
-    """What the photographs are; see `bench.tasks.reconstruction.Reconstruction`."""
-
-    images: Photography
-    longest: int
-    held_out: int
-    masks: bool
-    depths: Depths
-
-    def __post_init__(self) -> None:
-        check_at_least("task.longest", self.longest, 8, "96 shows what there is")
-        check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
+class _Surface(PhotographTask):
+    """A task that makes a surface in one go."""
 
     @abstractmethod
     def surface(self, subject: Subject) -> Mesh | None:
@@ -37,11 +26,9 @@ class _Photographs(ABC):
 
     def execute(self, run: RunContext) -> None:
         """Makes a surface of the given photographs, gives it their colours, and judges it by the others."""
-        inputs, record = run.inputs, run.record
+        record = run.record
         record.definitions = COLOURED_DEFINITIONS | COSTS
-        subject = find_subject(
-            self.images, self.depths, inputs, longest=self.longest, every=self.held_out, masks=self.masks
-        )
+        subject = self.subject(run.inputs)
         record.notes = [*record.notes, subject.found, "no renderer took part"]
         with run.on_clock():
             mesh = cut_off(self.surface(subject))
@@ -68,7 +55,7 @@ class Fusing:
 
 
 @dataclass(frozen=True)
-class Hull(_Photographs):
+class Hull(_Surface):
     """The visual hull of the masks (Laurentini 1994).
 
     Args:
@@ -89,7 +76,7 @@ class Hull(_Photographs):
 
 
 @dataclass(frozen=True)
-class Poisson(_Photographs):
+class Poisson(_Surface):
     """Given depths, fused by screened Poisson reconstruction.
 
     Args:
@@ -106,7 +93,7 @@ class Poisson(_Photographs):
 
 
 @dataclass(frozen=True)
-class Stereo(_Photographs):
+class Stereo(_Surface):
     """Points that neighbouring photographs agree on, fused by screened Poisson reconstruction.
 
     Args:

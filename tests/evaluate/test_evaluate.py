@@ -10,11 +10,9 @@ import trimesh
 from bench.config import load
 from bench.evaluate.evaluate import DEFINITIONS, evaluate, picture_view, render_view
 from bench.setup.inputs import RunInputs
-from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, see
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
-from tests.tiny import ball_prior, camera_of, run_of
+from tests.tiny import ball_prior, camera_of, run_of, scene_of
 
 RADIUS = 0.6
 
@@ -22,9 +20,8 @@ RADIUS = 0.6
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> RunInputs:
     """A sphere as the truth, judged with 3,000 samples."""
-    made = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    mesh, camera = Mesh(np.array(made.vertices), np.array(made.faces)), camera_of(24, angles=(30.0, 20.0))
-    scene = Scene("sphere", mesh, see(Truth(mesh), camera))
+    camera = camera_of(24, angles=(30.0, 20.0))
+    scene = scene_of(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS), camera)
     renderer = load("renderer", "naive", steps=40, epsilon=1e-4)
     found = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
     return replace(found, evaluation=replace(found.evaluation, grid=48, points=3000, fscore_threshold=0.05))

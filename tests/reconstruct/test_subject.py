@@ -13,10 +13,10 @@ from bench.reconstruct.subject import (
     ON_SURFACE,
     Depths,
     Subject,
-    find_subject,
     given_distances,
     hull_distances,
 )
+from bench.tasks.surfaces import Hull
 from datasets.mesh import Mesh
 from datasets.photographs import around
 from datasets.scene import Scene, Truth, sample_surface, see
@@ -44,7 +44,7 @@ def inputs(tmp_path):
 
 
 def found(inputs, depths: Depths = NO_DEPTHS, *, longest: int = 16, every: int = 4, masks: bool = True) -> Subject:
-    return find_subject(IMAGES, depths, inputs, longest=longest, every=every, masks=masks)
+    return Hull(IMAGES, longest, every, masks, depths, samples=8).subject(inputs)
 
 
 def test_every_nth_photograph_is_held_out(inputs):
@@ -66,8 +66,8 @@ def test_without_masks_those_held_out_keep_theirs(inputs):
 def test_too_few_photographs_are_told(inputs):
     few = replace(IMAGES, views=4)
     with pytest.raises(BadInput, match="4 photographs with every 2th held out leave 2: give more"):
-        find_subject(few, NO_DEPTHS, inputs, longest=16, every=2, masks=True)
-    assert len(find_subject(few, NO_DEPTHS, inputs, longest=16, every=4, masks=True).given) == 3
+        Hull(few, 16, 2, True, NO_DEPTHS, samples=8).subject(inputs)
+    assert len(Hull(few, 16, 4, True, NO_DEPTHS, samples=8).subject(inputs).given) == 3
 
 
 @each("points, count", [("dense", None), ("25%", None), ("30", 30)])

@@ -9,16 +9,15 @@ import trimesh
 from hydra import compose, initialize_config_dir
 
 from bench.config import CONF, build, load, register
-from bench.reconstruct.subject import Depths, find_subject
+from bench.reconstruct.subject import Depths
 from bench.setup.fields import FieldChoice
 from bench.single_view.training import Lessons
 from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
-from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene
 from renderers.fields.analytic import sphere
 from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
-from tests.tiny import CPU, ball_prior, camera_of, run_of, silent
+from tests.tiny import CPU, ball_prior, camera_of, run_of, scene_of, silent
 
 CASES = {
     "completion": ("task.points=50",),
@@ -33,9 +32,7 @@ ADAM = OptimiserSettings(iterations=3, learning_rate=0.01, schedule="cosine")
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A ball of radius 0.5, seen in 24 x 24 pixels."""
-    made = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
-    return Scene("ball", mesh, see(Truth(mesh), camera_of(24, angles=(30.0, 20.0))), lambda: sphere(0.5))
+    return scene_of(trimesh.creation.icosphere(subdivisions=3, radius=0.5), camera_of(24, angles=(30.0, 20.0)))
 
 
 @pytest.mark.parametrize(
@@ -62,8 +59,7 @@ def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, render
     task, tested = build(config.task, "task"), load("renderer", renderer)
     run = run_of(tmp_path, tested, ball_prior(), camera_of(24), make_scene=lambda: scene)
     run = replace(run, inputs=replace(run.inputs, field=FieldChoice("network_2x16", None)))
-    depths = Depths("20%", 0.01)
-    subject = find_subject(task.images, depths, run.inputs, longest=24, every=task.held_out, masks=True)
+    subject = replace(task, depths=Depths("20%", 0.01)).subject(run.inputs)
     check(task.problem(run.inputs.field.name, subject, run))
 
 

@@ -11,15 +11,14 @@ from bench.config import load
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
-from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
-from tests.tiny import CPU, ball_prior, camera_of
+from tests.tiny import CPU, ball_prior, camera_of, scene_of
 
 RENDERER = load("renderer", "dist")
-CAMERA = camera_of(24, angles=(0.0, 20.0))
+CAMERA = camera_of(16, angles=(0.0, 20.0))
 PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
     images=PLAINLY, focal=1.0, views_per_step=4, neighbour=1, visible=1e-3, photometric_weight=5.0,
@@ -31,9 +30,7 @@ SETTINGS = Multiview(
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A ball of radius 0.5, the prior's mean shape."""
-    made = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
-    return Scene("ball", mesh, see(Truth(mesh), CAMERA))
+    return scene_of(trimesh.creation.icosphere(subdivisions=4, radius=0.5), CAMERA)
 
 
 def problem_of(scene, **changed):
@@ -62,7 +59,7 @@ def test_views_move_on_and_are_spread_evenly(scene):
 def test_it_finds_the_ball(scene):
     problem = problem_of(scene)
     problem.code.data += torch.tensor([0.0, 0.05, 0.0, 0.15])  # higher and larger
-    optimise(problem, OptimiserSettings(45, 0.04, "cosine"), CPU, history=History(), on_step=lambda line: None)
+    optimise(problem, OptimiserSettings(30, 0.05, "cosine"), CPU, history=History(), on_step=lambda line: None)
     assert problem.code.detach().norm().item() < 0.01  # of 0.16
     assert problem.counts.value > 0
 
@@ -88,7 +85,7 @@ def test_a_misplaced_ball_is_put_back(scene):
     assert first[:3].norm().item() == pytest.approx(0.1)
     assert first[6].exp().item() == pytest.approx(1.1)
     problem.codes[0].requires_grad_(False)  # a ball that moves could be put back by its code as well
-    optimise(problem, OptimiserSettings(36, 0.015, "cosine"), CPU, history=History(), on_step=lambda line: None)
+    optimise(problem, OptimiserSettings(24, 0.02, "cosine"), CPU, history=History(), on_step=lambda line: None)
     assert problem.similarity[:3].norm() < 0.3 * first[:3].norm()
     assert problem.similarity[6].abs() < 0.3 * first[6]
     assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
@@ -127,17 +124,9 @@ def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
         given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
 
 
-@each(
-    "changed, message",
-    [
-        ({"neighbour": 8}, "neighbour=8 compares each of 8 views with itself"),
-        ({"scale": 1.5}, "scale must lie between 0.8 and 1.25"),
-        ({"shift": 0.5}, "shift be 0.2 at most"),
-        ({"starts": 10}, "iterations must be more than"),
-    ],
-)
-def test_what_cannot_be_is_told(changed, message):
-    with pytest.raises(ValueError, match=message):
+@each("changed", [{"neighbour": 8}, {"scale": 1.5}, {"shift": 0.5}, {"starts": 10}])
+def test_what_cannot_be_is_told(changed):
+    with pytest.raises(ValueError, match=r"neighbour=8 compares|scale must lie|shift be 0.2 at most|must be more than"):
         replace(SETTINGS, **changed)
 
 
@@ -160,15 +149,10 @@ def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
     expected = 2 * pixels[:, 0] + 3 * pixels[:, 1] + 1
     assert torch.allclose(colours[inside, 0], expected[inside], atol=1e-4)
     assert (colours[~inside] == 0).all()
+    assert not sample(image, torch.tensor([[float("nan"), 1.0]]))[1].any()
 
 
 def test_gradients_reach_the_pixels():
     image = torch.rand(5, 5, 2, generator=torch.Generator().manual_seed(1)).double()
     places = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], places)
-
-
-def test_not_a_number_is_outside():
-    colours, inside = sample(torch.ones(3, 3, 1), torch.tensor([[float("nan"), 1.0]]))
-    assert not inside.any()
-    assert colours.item() == 0

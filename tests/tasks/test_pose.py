@@ -14,19 +14,18 @@ from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import Unsupported
 from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
-from bench.tasks.pose_icp import PoseICP, world_points
-from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, see
+from bench.tasks.pose_icp import PoseICP
+from datasets.scene import Scene
 from renderers.fields.analytic import box
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of
+from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of, scene_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
 SETTINGS = Pose(
     degrees=12.0, shift=0.05, starts=1, spread=90.0, success_degrees=5.0, success_distance=0.05, trial=5,
-    shape="formula", grid=32, depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0,
+    shape="grid", grid=32, depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0,
     normal_weight=0.0,
     optimiser=OptimiserSettings(60, 0.02, "cosine"),
 )  # fmt: skip
@@ -41,9 +40,7 @@ DIST = load("renderer", "dist")
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A box with three unlike sides."""
-    made = trimesh.creation.box(2 * np.array(SIZES))
-    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
-    return Scene("box", mesh, see(Truth(mesh), CAMERA), lambda: box(SIZES))
+    return scene_of(trimesh.creation.box(2 * np.array(SIZES)), CAMERA)
 
 
 @pytest.fixture
@@ -57,15 +54,12 @@ def problem_of(scene, renderer=DIST, **changed) -> PoseProblem:
 
 
 @each("angle", [0.0, 1e-3, 17.0, 90.0, 179.0])
-def test_the_error_of_a_turn_is_its_angle(angle):
+def test_the_error_of_a_turn_is_its_angle_and_that_of_a_shift_its_length(angle):
     axis = torch.tensor([0.6, 0.0, 0.8])
     turned = CAMERA.with_object_moved(torch.cat([torch.zeros(3), radians(angle) * axis]))
     rotation, translation = pose_error(turned, CAMERA)
     assert rotation == pytest.approx(angle, abs=1e-3)
     assert translation == pytest.approx(0.0, abs=1e-6)  # about the object's origin
-
-
-def test_the_error_of_a_shift_is_its_length():
     moved = CAMERA.with_object_moved(torch.tensor([0.0, 0.3, 0.4, 0, 0, 0]))
     assert pose_error(moved, CAMERA) == pytest.approx((0.0, 0.5), abs=1e-3)
 
@@ -115,7 +109,7 @@ def test_gradients_of_the_loss_point_back(scene, name):
 
 
 def test_it_finds_the_pose_and_leaves_a_record(run):
-    SETTINGS.execute(run)
+    replace(SETTINGS, grid=64, optimiser=OptimiserSettings(40, 0.06, "cosine")).execute(run)
     record = run.record
     assert record.status is RunStatus.OK, record.reason
     assert record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
@@ -125,7 +119,7 @@ def test_it_finds_the_pose_and_leaves_a_record(run):
     assert set(record.metrics) <= set(record.definitions)
     assert record.evaluations["value"] > 0 and record.evaluations["gradient"] > 0
     lines = [json.loads(line) for line in (run.folder / "curve.jsonl").read_text().splitlines()]
-    assert len(lines) == 60
+    assert len(lines) == 40
     assert {"depth", "silhouette", "total"} <= set(lines[0])
     assert (run.folder / "strip.png").stat().st_size > 1000
 
@@ -141,22 +135,17 @@ def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
 
 def test_restarts_find_what_one_start_misses(scene):
     """Judged by the loss: a box looks the same from four sides."""
-    assert final_loss(scene, 2, starts=8, trial=6, iterations=140) < 0.1 < final_loss(scene, 2)
+    assert final_loss(scene, 2, starts=8, trial=4, iterations=90) < 0.1 < final_loss(scene, 2, iterations=40)
 
 
 def test_a_known_shape_is_the_scenes(run):
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
-    grid, formula, network = (
-        known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)(points)
-        for shape in ("grid", "formula", "prior")
+    grid, network = (
+        known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)(points) for shape in ("grid", "prior")
     )
     assert (grid - box(SIZES)(points)).abs().max() < 0.02
-    assert (formula - box(SIZES)(points)).abs().max() < 1e-6
     prior = run.inputs.prior
     assert torch.equal(network, prior.decoder.at(prior.codes[0])(points))
-    inputs = replace(run.inputs, make_scene=lambda: replace(run.inputs.scene, formula=None))
-    with pytest.raises(ValueError, match=r"box has no formula: set task\.shape=grid"):
-        known_shape(SETTINGS, inputs)
 
 
 def test_a_renderer_without_a_gradient_towards_rays_is_unsupported(run):
@@ -173,12 +162,6 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.metrics["rotation_error_deg"] < 4.0
     assert run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
-
-
-def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
-    points = world_points(scene.view, CAMERA)
-    assert len(points) == int(scene.view.mask.sum())
-    assert box(SIZES)(points).abs().max() < 1e-4
 
 
 def test_points_that_never_come_near_are_told(run):

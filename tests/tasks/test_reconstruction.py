@@ -149,18 +149,12 @@ def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
     run = run_in(tmp_path, scene, renderer="dvr", field="occupancy_16")
     for guide, known in (("none", None), ("hull", True), ("given", True)):
         settings = replace(SETTINGS, guide=guide, depths=Depths("dense", 0.0))
-        problem = settings.problem(run.inputs.field.name, _subject(settings, run), run)
+        problem = settings.problem(run.inputs.field.name, settings.subject(run.inputs), run)
         found = problem.stack.pixels.guide
         assert (found is None) == (known is None)
         assert found is None or 0.05 < found.isfinite().float().mean() < 0.6
     with pytest.raises(BadInput, match="the visual hull needs a mask"):
         executed(run, guide="hull", masks=False)
-
-
-def _subject(settings: Reconstruction, run: RunContext):
-    from bench.reconstruct.subject import find_subject
-
-    return find_subject(settings.images, settings.depths, run.inputs, longest=24, every=4, masks=True)
 
 
 def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
@@ -179,9 +173,7 @@ def test_a_field_without_colours_is_told(scene, tmp_path, field):
 
 @each("candidates", [("network_1x8", "occupancy_16"), ("sphere",)])
 def test_candidates_that_cannot_be_are_refused_before_photographs_are_taken(scene, tmp_path, monkeypatch, candidates):
-    monkeypatch.setattr(
-        "bench.tasks.reconstruction.find_subject", lambda *_, **__: pytest.fail("photographs were taken")
-    )
+    monkeypatch.setattr(Reconstruction, "subject", lambda *_: pytest.fail("photographs were taken"))
     with pytest.raises((BadInput, Unsupported), match=r"has no colours|needs a distance"):
         executed(run_in(tmp_path, scene, renderer="newton", field="auto"), **{"auto.candidates": candidates})
 
