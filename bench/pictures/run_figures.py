@@ -184,8 +184,8 @@ def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
     figure.savefig(folder / "ladder.png", dpi=110)
 
 
-def save_images(folder: Path, found: View, true: View, **more: np.ndarray) -> None:
-    """Writes `folder/images.npz`: normals of both [h, w, 3], hits of both and the depth error [h, w], and `more`."""
+def save_images(folder: Path, found: View, true: View) -> None:
+    """Writes `folder/images.npz`: normals of both [h, w, 3], hits of both and the depth error [h, w]."""
     arrays = {
         "normals": picture_normals(found).half(),
         "reference_normals": picture_normals(true).half(),
@@ -194,7 +194,7 @@ def save_images(folder: Path, found: View, true: View, **more: np.ndarray) -> No
         "depth_error": torch.where(found.mask & true.mask, (found.depth - true.depth).abs(), torch.nan),
     }
     plain = {name: array.numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **plain, **more)  # type: ignore[arg-type]
+    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 
 def save_gallery(

@@ -286,23 +286,20 @@ def _compared(
     numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
     if not valid.any():
         return numbers
-    for name, (found, true) in pairs.items():
-        numbers |= _compare(found[valid].flatten(0, -2), true[valid].flatten(0, -2), name)
+    for name, pair in pairs.items():
+        found, true = (gradients[valid].flatten(0, -2) for gradients in pair)
+        length = torch.linalg.vector_norm(true, dim=1)
+        error = torch.linalg.vector_norm(found - true, dim=1) / length
+        middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
+        numbers |= {
+            f"{name}_cosine": torch.cosine_similarity(found, true, dim=1).median().item(),
+            f"{name}_pooled_cosine": torch.cosine_similarity(found.flatten(), true.flatten(), dim=0).item(),
+            f"{name}_pooled_scale": ((found * true).sum() / true.square().sum()).item(),
+            f"{name}_scale": ((found * true).sum(1) / length.square()).median().item(),
+            f"{name}_median_error": middle,
+            f"{name}_p99_error": high,
+        }
     return numbers
-
-
-def _compare(found: Float[Tensor, "m n"], true: Float[Tensor, "m n"], name: str) -> dict[str, float]:
-    length = torch.linalg.vector_norm(true, dim=1)
-    error = torch.linalg.vector_norm(found - true, dim=1) / length
-    middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
-    return {
-        f"{name}_cosine": torch.cosine_similarity(found, true, dim=1).median().item(),
-        f"{name}_pooled_cosine": torch.cosine_similarity(found.flatten(), true.flatten(), dim=0).item(),
-        f"{name}_pooled_scale": ((found * true).sum() / true.square().sum()).item(),
-        f"{name}_scale": ((found * true).sum(1) / length.square()).median().item(),
-        f"{name}_median_error": middle,
-        f"{name}_p99_error": high,
-    }
 
 
 def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, " some"]]:

@@ -74,7 +74,7 @@ class PriorFit:
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
         found, true = picture_view(field, camera, inputs), see(Truth(inputs.scene.mesh), camera)
-        save_images(run.folder, found, true, gradient_length=lengths.cpu().numpy())
+        save_images(run.folder, found, true)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

@@ -105,17 +105,17 @@ def test_every_stress_has_the_same_trial_for_every_renderer(name):
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
     """The numbers of a trial that its success depends on."""
     renderer = load("renderer", "dvr" if stress.setting == "n_ray_samples" else "dist")
-    if stress.setting == "n_gradient_samples" or stress.measure == "fit":
-        tiny = replace(conditions(), fit=replace(FIT, resolution=12, iterations=2))
-        return stress.trial(renderer, level, repeat, tiny).numbers
-    numbers = stress.trial(renderer, level, repeat, conditions()).numbers
+    tiny = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
+    numbers = stress.trial(renderer, level, repeat, tiny).numbers
+    if stress.measure == "fit":
+        return numbers
     return {name: n for name, n in numbers.items() if name not in ("evaluations_per_ray", "hits")}
 
 
 @each("name", NAMES)
 def test_repeats_of_a_trial_have_other_outcomes_or_there_is_one_trial(name):
     stress = stress_named(name)
-    levels = np.linspace(1, 0, 11)
+    levels = np.linspace(1, 0, 6)
     differ = any(outcome_of(stress, level, 0) != outcome_of(stress, level, 1) for level in levels)
     assert differ == (stress.repeats is None)
 
@@ -125,22 +125,16 @@ MOVED = {"perturbed": 0.1, "quantised": 0.1, "coarse_floats": 3}
 
 @each("name, severity", MOVED.items())
 def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(name, severity):
-    exam = SCENES[name](severity, drawn(), 40)
+    exam = SCENES[name](severity, drawn(), 20)
+    assert judge_rendering(exam, load("renderer", "dvr", n_ray_samples=512), conditions()).success
     first, rays = truth(exam)[0], exam.camera.double().rays().flat()
-    steps = torch.linspace(1.4, 3.6, 2201, dtype=torch.float64)  # 0.001 apart
+    steps = torch.linspace(1.6, 3.2, 1601, dtype=torch.float64)  # 0.001 apart
     inside = torch.stack([exam.field(rays.at(step.expand(len(first.hit)))) <= 0 for step in steps], dim=1)
     hit, distance = inside.any(dim=1), steps[inside.to(torch.uint8).argmax(dim=1)]
     seen = ~first.inside
     assert (hit != first.hit)[seen].sum() <= 3  # thinner than the samples
     behind = (distance - first.distance)[seen & hit & first.hit]
-    assert behind.quantile(0.99) <= 0.00101 and behind.quantile(0.01) >= -1e-6
-
-
-@each("name", MOVED)
-def test_what_moves_the_surface_is_not_judged(name):
-    exam = SCENES[name](MOVED[name], drawn(), 32)
-    outcome = judge_rendering(exam, load("renderer", "dvr", n_ray_samples=512), conditions())
-    assert outcome.success, (outcome.failure, outcome.numbers)
+    assert behind.quantile(0.95) <= 0.00101 and behind.quantile(0.05) >= -1e-6
 
 
 def test_pixels_are_counted_by_kind_of_error():
@@ -175,12 +169,10 @@ def test_gradients_are_those_of_the_closed_form():
     assert biased.numbers["gradient_scale"] == pytest.approx(1.5 * np.sin(np.radians(30)), rel=0.05)  # alpha K cos
 
 
-def test_a_renderer_without_a_gradient_is_unsupported():
-    blind = Blind()
+@each("name", ["grazing_gradient", "depth_noise"])
+def test_a_renderer_without_a_gradient_is_unsupported(name):
     with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        stress_named("grazing_gradient").trial(blind, 0.0, 0, conditions())
-    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        stress_named("depth_noise").trial(blind, 0.0, 0, conditions())
+        stress_named(name).trial(Blind(), 0.0, 0, conditions())
 
 
 def test_a_severity_may_be_a_setting_of_the_renderer():
@@ -190,10 +182,6 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     assert stress_named("few_steps").stressed(load("renderer", "idr"), 0.3).steps == 1  # a renderer takes no 0
     with pytest.raises(Unsupported, match="DVR has no epsilon, or it is null: choose another"):
         epsilon.stressed(load("renderer", "dvr"), 0.01)
-    with pytest.raises(Unsupported, match="DVR has no n_gradient_samples"):
-        stress_named("gradient_samples").stressed(load("renderer", "dvr"), 3.0)
-    with pytest.raises(Unsupported, match="DIST has no n_ray_samples"):
-        stress_named("few_samples").stressed(load("renderer", "dist"), 3.0)
     with pytest.raises(Unsupported, match="Naive has no n_gradient_samples, or it is null"):  # its gradient is unrolled
         stress_named("gradient_samples").stressed(load("renderer", "naive"), 3.0)
     practical = load("renderer", "naive", gradient="practical", n_gradient_samples=1)
@@ -202,13 +190,13 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
 
 @each("scene", ["depth_noise", "wrong_pose"])
 def test_a_disturbed_fit_ends_further_off(scene):
-    renderer, few = load("renderer", "dist"), replace(conditions(), fit=replace(FIT, resolution=16, iterations=40))
-    outcomes = [
+    renderer, few = load("renderer", "dist"), replace(conditions(), fit=replace(FIT, resolution=12, iterations=30))
+    mild, severe = (
         judge_fit(scene, severity, drawn(), renderer=renderer, conditions=few)
         for severity in (1e-6, 0.5 if scene != "wrong_pose" else 60.0)
-    ]
-    assert outcomes[0].success
-    assert outcomes[1].numbers["surface_error"] > outcomes[0].numbers["surface_error"]
+    )
+    assert mild.success
+    assert severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
 def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
@@ -220,12 +208,9 @@ def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
     assert fits == [0.7, FIT.offset]
 
 
-def test_a_trial_that_takes_too_many_values_is_a_failure_of_that_kind():
+def test_the_values_of_a_trial_are_limited_those_of_a_fit_over_all_its_iterations():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
-
-
-def test_the_values_of_a_fit_are_limited_over_all_its_iterations():
     fit = replace(FIT, resolution=12, iterations=10)
 
     def spent(limits: Limits) -> float:
@@ -256,8 +241,6 @@ def test_sweeps_and_stresses_are_checked():
         Stress("nowhere", "rendering", "viewing", Sweep(1.0, 2.0, log=False, unit="m"))
     with pytest.raises(ValueError, match=r"task\.stress\.repeats must be 1 or null, not 3"):
         Stress("wires", "rendering", "viewing", Sweep(1.0, 2.0, log=False, unit="m"), repeats=3)
-    with pytest.raises(ValueError, match=r"task\.stress\.measure must be one of"):
-        Stress("wires", "speed", "viewing", Sweep(1.0, 2.0, log=False, unit="m"))
 
 
 DESK = SearchSettings(levels=33, repeats=5)
@@ -321,12 +304,9 @@ def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interv
     assert len(search.outcomes) <= search.most < levels + 1 == search.grid + 1
 
 
-@each("succeeds, level", [(True, 1 + 0.5 / 32), (False, -0.5 / 32)])
-def test_without_repeats_an_end_is_tried_once(succeeds, level):
-    search = bisected(lambda at: succeeds)
-    assert search.result().level == pytest.approx(level)
-    assert search.outcomes == {0: succeeds, 32: succeeds}
-
-
-def test_without_repeats_a_failure_at_the_mild_end_decides():
-    assert bisected(lambda level: level > 0.5).result().level < 0
+def test_without_repeats_an_end_is_tried_once():
+    for succeeds, level in ((True, 1 + 0.5 / 32), (False, -0.5 / 32)):
+        search = bisected(lambda at, succeeds=succeeds: succeeds)
+        assert search.result().level == pytest.approx(level)
+        assert search.outcomes == {0: succeeds, 32: succeeds}
+    assert bisected(lambda level: level > 0.5).result().level < 0  # a failure at the mild end decides

@@ -45,7 +45,7 @@ def run(folder, compose_config, *overrides: str) -> Record:
 
 def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     ladder = "models.candidates=[sphere,rounded_box]"
-    better = ("models.fit.iterations=20", "models.fit.warm_iterations=150")
+    better = ("models.fit.iterations=16", "models.fit.warm_iterations=120")
     small = ("task.checks.views=4", "task.checks.drawn=3", "task.checks.seeds=5", "evaluation.picture=24")
     record = run(tmp_path, compose_config, "task=capacity", "dataset=capsule", ladder, *small, *better)
     assert (record.status, record.reason) == ("ok", "")
@@ -68,9 +68,8 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert any(
         "needs rounded_box, 10 numbers, the smallest by stored numbers: held-out" in note for note in record.notes
     )
-    settings = [note for note in record.notes if note.startswith("pixel precision: renderer.")]
+    *settings, saved = (note for note in record.notes if note.startswith("pixel precision: "))
     assert [note.split()[2] for note in settings] == ["renderer.epsilon=auto", "renderer.steps=auto"]
-    saved = next(note for note in record.notes if note.startswith("pixel precision: error"))
     values = 100 * metrics["frugal.evaluations"] / metrics["rounded_box.evaluations"]
     assert saved.endswith(f", {values:.0f} % of the field values")
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
@@ -155,15 +154,8 @@ def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     assert (tmp_path / "mesh.ply").is_file()
 
 
-@pytest.mark.parametrize(
-    ("overrides", "status", "message"),
-    [
-        (("task=gradients", "+experiment=fitted", "field=auto"), "refused", "does not take field=auto: remove it"),
-        (("task=completion", "field=spere"), "refused", "unknown field 'spere': did you mean sphere"),
-        (("task=capacity", "task.frugal_rays=0"), "refused", "frugal_rays must be above 0"),
-    ],
-)  # fmt: skip
-def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path, overrides, status, message):
-    record = run(tmp_path, compose_config, *overrides)
-    assert record.status == status
-    assert message in record.reason
+def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path):
+    record = run(tmp_path, compose_config, "task=gradients", "+experiment=fitted", "field=auto")
+    assert record.status == "refused" and "does not take field=auto: remove it" in record.reason
+    with pytest.raises(ValueError, match="frugal_rays must be above 0"):
+        Capacity("depth", 10.0, Own(), 10.0, 0.0, CheckSettings(4, 2, 2))

@@ -93,30 +93,26 @@ def values(problem) -> dict[str, float]:
 
 
 def test_depth_is_compared_where_it_is_given_and_hit(problem_of):
+    """Depths differ by .1 and .3 where they are compared; along the rays that is 1 / COSINE as much."""
     terms = values(problem_of())
     assert terms["depth"] == pytest.approx(10.0 * (0.1 + 0.3) / 2, rel=1e-5)
     assert terms["code"] == 0.0
     assert terms["silhouette"] == pytest.approx(4.0 * SILHOUETTE)
     assert terms["total"] == pytest.approx(2.0 + 2.8, rel=1e-5)
-
-
-def test_depth_is_compared_at_the_given_points_only(problem_of):
-    problem = problem_of(points="1")
-    assert problem.observed.sum() == 1
-    expected = {(0, 0): 0.1, (0, 1): 0.3, (1, 0): 0.0}[tuple(problem.observed.nonzero()[0].tolist())]
-    assert values(problem)["depth"] == pytest.approx(10.0 * expected, rel=1e-4)
+    assert values(problem_of(depth_loss="points"))["depth"] == pytest.approx(10.0 * 0.2 / COSINE)
+    few = problem_of(points="1")
+    assert few.observed.sum() == 1
+    expected = {(0, 0): 0.1, (0, 1): 0.3, (1, 0): 0.0}[tuple(few.observed.nonzero()[0].tolist())]
+    assert values(few)["depth"] == pytest.approx(10.0 * expected, rel=1e-4)
 
 
 def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     """See tests/solve/test_observed_view.py for the term itself."""
-    assert "normals" not in values(problem_of())
     assert problem_of().compare.__self__.normals is None
     problem = problem_of(normal_weight=3.0)
-    assert 0 <= values(problem)["normals"] <= 2 * 3.0
-    given = problem.compare.__self__
+    terms, given = values(problem), problem.compare.__self__
     assert (given.normal_weight, given.normal_width) == (3.0, 0.02) and torch.equal(given.normals, scene.view.normals)
-    terms = problem.loss(0)
-    assert terms["total"].item() == pytest.approx(sum(terms[name].item() for name in terms if name != "total"))
+    assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
 
 
 def test_no_pixel_to_compare_costs_nothing(problem_of):
@@ -145,27 +141,19 @@ class Told(Fake):
         return rendering.closest.sum() * 0 + SILHOUETTE
 
 
-def test_given_distances_are_told_to_a_loss_that_takes_them(problem_of):
-    renderer = Told()
-    problem = problem_of(renderer, points="2")
+def test_the_mask_is_compared_where_it_is_given_by_the_loss_that_is_chosen(problem_of):
+    sparse, dense, other, told = Fake(), Fake(), Fake(), Told()
+    assert set(values(problem_of(sparse, points="3", mask=False))) == {"total", "depth", "code"}
+    assert sparse.asked is None
+    assert "silhouette" in values(problem_of(dense, points="dense", mask=False))  # which implies it
+    assert dense.asked.tolist() == MASK
+    chosen = values(problem_of(other, silhouette=load("silhouette", "hinge")))
+    assert other.asked is None and chosen["silhouette"] != pytest.approx(4.0 * SILHOUETTE)
+    problem = problem_of(told, points="2")
     values(problem)
-    given = renderer.asked.isfinite()
+    given = told.asked.isfinite()
     assert torch.equal(given, problem.observed) and given.sum() == 2
-    assert renderer.asked[given].tolist() == pytest.approx([2.0 / COSINE] * 2)
-
-
-def test_without_a_mask_there_is_no_silhouette_term(problem_of):
-    renderer = Fake()
-    terms = values(problem_of(renderer, points="3", mask=False))
-    assert set(terms) == {"total", "depth", "code"}
-    assert renderer.asked is None
-    assert terms["total"] == terms["depth"]
-
-
-def test_dense_depth_implies_the_mask(problem_of):
-    renderer = Fake()
-    assert "silhouette" in values(problem_of(renderer, points="dense", mask=False))
-    assert renderer.asked.tolist() == MASK
+    assert told.asked[given].tolist() == pytest.approx([2.0 / COSINE] * 2)
 
 
 def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
@@ -176,19 +164,6 @@ def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
     field = prior.decoder.at(code)(scene.view.camera.rays().at(torch.ones(2, 2)))
     (expected,) = torch.autograd.grad(field[0, 0] - field[0, 1], code)
     assert torch.allclose(problem.code.grad, 10.0 / 2 * COSINE * expected, rtol=1e-4, atol=1e-6)
-
-
-def test_the_depth_loss_is_of_depths_or_of_points(problem_of):
-    """Depths differ by .1 and .3 where they are compared; along the rays that is 1 / COSINE as much."""
-    assert problem_of().loss(0)["depth"].item() == pytest.approx(10.0 * 0.2)
-    assert problem_of(depth_loss="points").loss(0)["depth"].item() == pytest.approx(10.0 * 0.2 / COSINE)
-
-
-def test_the_mask_loss_is_the_one_that_is_chosen(problem_of):
-    renderer = Fake()
-    terms = problem_of(renderer, silhouette=load("silhouette", "hinge")).loss(0)
-    assert renderer.asked is None
-    assert terms["silhouette"].item() != pytest.approx(4.0 * SILHOUETTE)
 
 
 def test_evaluations_are_counted_and_judging_is_not(problem_of):
@@ -231,16 +206,10 @@ def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
     assert [at for what, at in renderer.log if what == "render"] == [0, 0, 1, 2]  # the first is the warm-up
 
 
-def test_a_renderer_without_a_gradient_towards_the_field_is_unsupported(problem_of):
-    blind = Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True))
+def test_a_renderer_without_a_gradient_or_for_another_kind_of_field_is_unsupported(problem_of):
     with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
-        problem_of(blind)
-
-
-@each("needs, names", [((Kind.LEVEL,), "level"), ((Kind.BOUND, Kind.LEVEL), "bound or level")])
-def test_a_renderer_that_needs_another_kind_of_field_is_unsupported(problem_of, needs, names):
-    picky = Fake(capabilities=Capabilities(needs, field_gradient=True, ray_gradient=True))
-    field = problem_of().field()
-    with pytest.raises(Unsupported, match=f"Fake needs a {names} field, not a distance field"):
-        check_kind(picky, field)
-    check_kind(Fake(), field)
+        problem_of(Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
+    picky = Fake(capabilities=Capabilities((Kind.BOUND, Kind.LEVEL), field_gradient=True, ray_gradient=True))
+    with pytest.raises(Unsupported, match="Fake needs a bound or level field, not a distance field"):
+        check_kind(picky, problem_of().field())
+    check_kind(Fake(), problem_of().field())

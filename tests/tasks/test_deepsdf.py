@@ -7,16 +7,17 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.shape_prior import Prior, sample_distances
+from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.deepsdf import DeepSDF
 from bench.tasks.prior_fit import PriorFit
-from datasets.mesh import Mesh
-from datasets.scene import Scene, View
-from tests.run.driving import command, record_of
-from tests.tiny import CPU, ball_prior, camera_of, plane_decoder
+from datasets.mesh import Mesh, extract
+from datasets.scene import Scene, Truth, View, see
+from tests.looped import each
+from tests.tiny import CPU, ball_prior, camera_of, plane_decoder, run_of
 
+PRIOR = ball_prior()
 RENDERER = load("renderer", "dist")  # neither task renders with it
 SETTINGS = DeepSDF(
     points="dense", offset=0.1, distance_weight=2.0, code=CodePenalty(0.5, "sum"),
@@ -75,38 +76,25 @@ def test_it_finds_the_plane_and_counts_its_samples(wall):
     assert problem.counts.value == 201 * 32  # the warm-up too
 
 
-def test_a_prior_that_can_show_a_shape_is_fitted_to_it(wall):
-    from datasets.mesh import extract
-
-    prior = ball_prior()
-    true = prior.decoder.at(prior.codes[0])
-    scene = replace(wall, mesh=extract(true, grid=32, reach=1.0))
-    problem = FIT.problem(scene, prior, RENDERER, seed=0, device=CPU)
-    optimise(problem, FIT.optimiser, CPU, history=History(), on_step=lambda line: None)
-    points, distances = sample_distances(scene.mesh, 1000, 5)
-    near = distances.abs() < 0.05
-    error = (problem.field()(points[near]) - distances[near]).abs().mean()
-    before = (prior.decoder.at(torch.zeros(4))(points[near]) - distances[near]).abs().mean()
-    assert error < 0.012
-    assert error < before / 4
+@pytest.fixture
+def ball(wall) -> Scene:
+    """The polyhedron of the first code of a prior of balls, seen in 24 x 24 pixels."""
+    mesh = extract(PRIOR.decoder.at(PRIOR.codes[0]), grid=32, reach=1.0)
+    return replace(wall, mesh=mesh, view=see(Truth(mesh), camera_of(24)))
 
 
-def test_both_run_from_the_command_line_and_fill_their_records(tmp_path):
-    small = ("scale=smoke", "evaluation.picture=24", "evaluation.grid=32", "evaluation.points=500", "isolation=off")
-    for task, more in (
-        ("deepsdf", ("task.points=50", "evaluation.picture=null")),
-        ("prior_fit", ("task.distances=2000",)),
-    ):
-        few = ("task.optimiser.iterations=30", "evaluation.every=null", "threads=1", f"results_dir={tmp_path / 'r'}")
-        code, out, err = command(f"task={task}", *small, *few, *more)
-        assert (code, err) == (0, "")
-        record = record_of(out)
-        assert record["metrics"]["chamfer_l2"] < record["metrics_start"]["chamfer_l2"]
-        assert set(record["metrics"]) <= set(record["definitions"])
-    folder = next((tmp_path / "r" / "runs").glob("prior_fit-*"))
-    assert 0 < record["metrics"]["floor_chamfer_l2"] < record["metrics"]["chamfer_l2"]
-    assert record["metrics"]["slope_median"] == pytest.approx(1.0, abs=0.25)
-    assert record["metrics"]["distance_error"] < 0.03
-    with np.load(folder / "images.npz") as images:
-        assert images["normals"].shape == (24, 24, 3)
-        assert np.median(images["gradient_length"]) == pytest.approx(record["metrics"]["slope_median"], rel=1e-3)
+@each("task", [replace(SETTINGS, code=CodePenalty(0.0, "sum"), optimiser=OptimiserSettings(60, 0.02, "cosine")), FIT])
+def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(ball, tmp_path_factory, task):
+    run = run_of(tmp_path_factory.mktemp("run"), RENDERER, PRIOR, ball.view.camera, make_scene=lambda: ball)
+    task.execute(replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=500))))
+    record, images = run.record, run.folder / "images.npz"
+    assert (record.status, record.reason) == ("ok", "")
+    assert record.metrics["chamfer_l2"] < 0.5 * record.metrics_start["chamfer_l2"]
+    assert set(record.metrics) <= set(record.definitions)
+    assert images.is_file() == (task is FIT)
+    if task is FIT:
+        assert 0 < record.metrics["floor_chamfer_l2"] < record.metrics_start["chamfer_l2"]
+        assert record.metrics["slope_median"] == pytest.approx(1.0, abs=0.25)
+        assert record.metrics["distance_error"] < 0.012
+        with np.load(images) as arrays:
+            assert arrays["normals"].shape == (8, 8, 3)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from bench.config import load
 from bench.machine.limits import Limits
@@ -121,9 +120,10 @@ def test_a_guard_moves_its_breakdown(tmp_path, guard, stress):
 def test_success_that_rises_with_severity_is_noted(tmp_path):
     stress = stress_named("gap")
     turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
+    few = SearchSettings(levels=5, repeats=2)
     for asked, doubted in ((stress, False), (turned, True)):
         run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
-        Stability(asked, SEARCH, SEARCH, CRITERIA, SHORT, 48, Limits(1e8, 8)).execute(run)
+        Stability(asked, few, few, CRITERIA, SHORT, 32, Limits(1e8, 8)).execute(run)
         assert any(note.startswith("success does not fall with severity") for note in run.record.notes) is doubted
 
 
@@ -148,11 +148,8 @@ def test_a_missing_setting_is_an_error_before_the_first_trial(tmp_path):
 def test_a_task_without_a_stress_names_the_remedy():
     with pytest.raises(ValueError, match="set stress=thin_plate"):
         Stability(None, SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(1e8, 8))
-    with pytest.raises(ValueError, match=r"task\.resolution must be at least 8, not 4"):
-        replace(Stability(stress_named("gap"), SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(1e8, 8)), resolution=4)
 
 
 def test_a_fit_is_searched_with_its_own_settings(tmp_path):
-    torch.manual_seed(0)
     metrics = run(tmp_path, "missing_depth", load("renderer", "dist"))
     assert metrics["grid_trials"] == 10 and metrics["trials"] <= 5
