@@ -55,7 +55,11 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     """The ratios of a step at the largest size that ended ok."""
     known = [line for line in lines if line["status"] == "ok" and line.get("step_ratio") is not None]
     size = max((line["size"] for line in known), default=0)
-    ratios = {line["renderer"]: line["step_ratio"] for line in known if line["size"] == size and not line["first"]}
+    ratios = {
+        f"{line['renderer']}, {format.plural(line['threads'], 'thread')}": line["step_ratio"]
+        for line in known
+        if line["size"] == size and not line["first"]
+    }
     first = next((line["renderer"] for line in known if line["first"]), "")
     return format.ends(f"A step at {size} × {size} pixels over that of {first}", ratios, "one shape")
 

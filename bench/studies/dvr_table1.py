@@ -63,8 +63,9 @@ def make(runs: Runs) -> Result:
 
 def _verdict(family: str, lines: list[dict]) -> str:
     """The trainings of a family by their Chamfer-L1."""
-    errors = medians.whole([line for line in lines if line["method"] in TRAINED], "chamfer_l1")
-    n = format.plural(max(line["runs"] for line in lines), "shape")
+    trained = [line for line in lines if line["method"] in TRAINED]
+    n = format.plural(max((len(line["interval"].points) for line in trained), default=0), "shape")
+    errors = medians.whole(trained, "chamfer_l1")
     return format.ends(f"Median Chamfer-L1 × 1000 of {family}", errors, n, show=table.thousandfold)
 
 

@@ -105,7 +105,8 @@ def _by_blur(runs: Runs) -> pd.DataFrame:
 def _verdict(data: pd.DataFrame) -> str:
     """The least pooled cosine of each renderer in the bands of hits."""
     hits = data[data["band"].isin(ANGLES)]
-    least = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False).min()
+    cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
+    least = cosines.min(min_count=len(ANGLES))  # unknown where a band is
     said = f"Least pooled cosine in any band of hits, {(least >= 0.99).sum()} of {len(least)} of 0.99 or more"
     return format.ends(said, least.to_dict(), "one shape", show=_cosine, most=True)
 

@@ -45,8 +45,9 @@ def make(runs: Runs) -> Result:
 def _verdict(lines: list[dict[str, Any]]) -> str:
     """The ratios of a family's networks to the first row; one of 0, where that row failed, says nothing."""
     taught = [line for line in lines if line["preset"] not in single_view.BASELINES]
-    ratios = {line["method"]: line[FIRST].value for line in taught if line.get(FIRST) and line[FIRST].value > 0}
-    n = format.plural(max(line["runs"] for line in lines), "unseen shape")
+    known = {line["method"]: line[FIRST] for line in taught if line.get(FIRST) and line[FIRST].value > 0}
+    n = format.plural(max((len(ratio.points) for ratio in known.values()), default=0), "unseen shape")
+    ratios = {name: ratio.value for name, ratio in known.items()}
     return format.ends(f"Chamfer-L1 over that of Newton's network, {lines[0]['family']}", ratios, n)
 
 

@@ -1,6 +1,7 @@
 """Tables and figures of one rendering, its pictures and its gradients, from run folders whose numbers are known."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 
@@ -100,11 +101,11 @@ def timed(results, size: int, threads: int, factor: float = 0.5, **changed) -> N
 
 
 def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp_path):
-    for size, threads, factor in ((256, 1, 0.6), (128, 2, 0.5), (128, 1, 0.75)):
+    for size, threads, factor in ((256, 1, 0.6), (256, 2, 0.9), (128, 2, 0.5), (128, 1, 0.75)):
         timed(tmp_path, size, threads, factor)
     timed(tmp_path, 512, 1, metrics={}, status="timeout", reason="dvr: more than 9 field values")
     page = made(tmp_path, "benchmark")
-    ratios = {128: {1: 0.75, 2: 0.5}, 256: {1: 0.6}}
+    ratios = {128: {1: 0.75, 2: 0.5}, 256: {1: 0.6, 2: 0.9}}
     lines = [(size, n, each) for size, own in ratios.items() for n, ratio in own.items() for each in (1.0, ratio)]
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
     assert set(page.data["renderer"][1:6:2]) == {"newton"}
@@ -115,7 +116,8 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
     assert (
         "medians of 5 rounds" in told(page) and "timeout" in told(page) and "thread" not in page.shown().caption[-40:]
     )
-    assert page.verdict == "A step at 256 × 256 pixels over that of dist: *0.600* (newton); n = one shape."
+    said = "A step at 256 × 256 pixels over that of dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
+    assert page.verdict == f"{said}; n = one shape."
 
 
 def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
@@ -132,6 +134,12 @@ def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
     assert page.table.loc[0, ["Code pooled cosine", "Code scale", "Pixels"]].tolist() == ["0.99000", "1.00", "100"]
     assert "A pooled number compares the gradients of all pixels of a band" in told(page)
     assert page.verdict.startswith("Least pooled cosine in any band of hits, 0 of 3 of 0.99 or more: *0.97000* (dist)")
+
+
+def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
+    known = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
+    data = pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"])
+    assert ", 1 of 2 of 0.99 or more: *0.99500* (a); " in gradients._verdict(data)
 
 
 def test_gradients_figure_plots_the_numbers_of_its_csv(tmp_path):
