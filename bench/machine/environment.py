@@ -36,11 +36,6 @@ def pick_device(wanted: str) -> torch.device:
     return torch.device("cuda" if wanted == "cuda" or (wanted == "auto" and torch.cuda.is_available()) else "cpu")
 
 
-def device_name(device: torch.device) -> str:
-    """The name of a GPU, or cpu, as records have it under `environment.device`."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
-
-
 def describe(device: torch.device) -> dict[str, Any]:
     """The environment as plain data for the record."""
     return {
@@ -56,7 +51,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
-        "device": device_name(device),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
         "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if multiplies_faster(device) else None,

@@ -20,6 +20,7 @@ from bench.evaluate.evaluate import picture_view, unseen
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
+from bench.records.read import NO_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Truth, View, see
@@ -29,18 +30,6 @@ from renderers.field import Field
 LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes to the right, up, towards the camera
 BEHIND = 160.0  # degrees about the vertical axis from the given camera to the one behind
 BEHIND_ELEVATION = 25.0  # degrees
-TERMS = {
-    "total": "#222222",
-    "depth": "#1f77b4",
-    "photometric": "#1f77b4",
-    "silhouette": "#d62728",
-    "normals": "#2ca02c",
-    "code": "#7f7f7f",
-    "colour": "#9467bd",
-    "colour_gradient": "#e377c2",
-    "smoothness": "#17becf",
-    "eikonal": "#bcbd22",
-}
 MOST_PHOTOGRAPHS = 4  # shown, in two rows
 GIVEN_INCHES = 2.0  # width of the axes with what is given
 
@@ -116,10 +105,10 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
-        for name, colour in TERMS.items():
+        for name in dict.fromkeys(name for line in curve for name in line if name not in NO_TERMS):
             known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
             if known:
-                axis.semilogy(*zip(*known, strict=True), label=name, color=colour, lw=1.4)
+                axis.semilogy(*zip(*known, strict=True), label=name, lw=1.4)
         axis.set_xlabel(label)
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_ylabel("weighted loss")

@@ -101,17 +101,9 @@ def identify(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) 
     return Identity({name: str(choice) for name, choice in named.items()}, values)
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A run's folder, locked by this process; `finished` is the record in it where that run is to be reused."""
-
-    folder: Path
-    finished: dict[str, Any] | None
-
-
 @contextmanager
-def claimed(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterator[Claim]:
-    """Locks the folder of a run, after waiting for any other process that holds it.
+def claimed(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterator[tuple[Path, dict[str, Any] | None]]:
+    """Locks the folder of a run, after waiting for any other process that holds it; gives it and the record to reuse.
 
     A finished run of the same code is kept, to be reused; any other run is moved to `results_dir/earlier`.
 
@@ -132,7 +124,7 @@ def claimed(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterator[Cla
             folder.mkdir(parents=True)
             _reserve(folder)
         try:
-            yield Claim(folder, record)
+            yield folder, record
         finally:
             release(folder)
 

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
-from bench.records.folder import Claim, Identity, claimed, release, reusable
+from bench.records.folder import Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
 from bench.run.command import unwritten
@@ -108,11 +108,10 @@ def run(identity: Identity) -> tuple[Path, Record]:
         OSError: where the results folder cannot be written.
         Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
-    with claimed(Path(identity.config["results_dir"]), identity, identity.config["rerun"]) as claim:
-        if claim.finished is not None:
-            return claim.folder, _reuse(claim.folder, claim.finished)
-        record = _new_record(identity, claim)
-        return claim.folder, _run_anew(Job(claim.folder, record))
+    with claimed(Path(identity.config["results_dir"]), identity, identity.config["rerun"]) as (folder, finished):
+        if finished is not None:
+            return folder, _reuse(folder, finished)
+        return folder, _run_anew(Job(folder, _new_record(identity, folder)))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
@@ -201,9 +200,9 @@ def _export(tracker: Tracker, folder: Path, record: Record) -> None:
         record.write(folder)
 
 
-def _new_record(identity: Identity, claim: Claim) -> Record:
+def _new_record(identity: Identity, folder: Path) -> Record:
     return Record(
-        claim.folder.name,
+        folder.name,
         **identity.choices,
         seed=identity.config["seed"],
         config=identity.config,

@@ -234,16 +234,11 @@ def front(points: Sequence[Point], *, seed: int, draws: int = 2000) -> list[floa
     All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front. One
     run of each gives no probability: nan.
     """
-    if points and not several(points[0][0]):
+    if points and len(flat(points[0][0])) < 2:
         return [math.nan] * len(points)
     _, drawn, _ = _resample([groups for point in points for groups in point], median, seed, draws, fewest=1)
     costs, errors = drawn[0::2].T, drawn[1::2].T
     return (~dominated(costs, errors) & np.isfinite(costs) & np.isfinite(errors)).mean(axis=0).tolist()
-
-
-def several(groups: Groups) -> bool:
-    """Whether there is more than one run: from one alone no probability and no rank is given."""
-    return len(flat(groups)) > 1
 
 
 def flat(groups: Groups) -> np.ndarray:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.names import flat
-from bench.records.read import curve_lines
+from bench.records.read import NO_TERMS, curve_lines
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import number
 from bench.report.site.files import ALT, Folder
@@ -17,7 +17,6 @@ PHASES = {
     "backward": "optimisation: backward",
     "evaluation": "evaluation and pictures",
 }
-NOT_LINES = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "chamfer_l2")
 MOST_LINES = 8  # terms of a loss
 TOP = ("label", "field", "split", "index", "seed", "device", "threads", "experiment", "draw")
 
@@ -65,10 +64,10 @@ def curve(folder: Folder) -> dict[str, Any] | None:
     sound = [line for line in lines or [] if number(line.get("iteration")) is not None]
     if not sound:
         return None
-    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in NOT_LINES]
+    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in NO_TERMS]
     terms = [key for key in terms if any(number(line.get(key)) is not None for line in sound)][:MOST_LINES]
     kept = [sound[place] for place in _kept(sound)]
-    names = [*NOT_LINES, *terms]
+    names = [*NO_TERMS, *terms]
     return {"terms": terms, **{name: [_short(number(line.get(name))) for line in kept] for name in names}}
 
 

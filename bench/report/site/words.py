@@ -111,7 +111,9 @@ def asked(record: Record) -> str:
 def command(record: Record, results_dir: Path) -> str:
     """The command that makes the run again, for a shell."""
     folder = [] if results_dir.as_posix() == RESULTS else [f"results_dir={results_dir.as_posix()}"]
-    return shlex.join(["python", "-m", "bench", *_overrides(record), *folder])
+    overrides = map(str, record.get("overrides") or [])
+    kept = [text for text in overrides if text.partition("=")[0] not in LEFT_OUT]
+    return shlex.join(["python", "-m", "bench", *kept, *folder])
 
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
@@ -138,7 +140,3 @@ def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
 def _quoted(text: str) -> str:
     """A text as Python reads it, in double quotes where that is the same."""
     return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)
-
-
-def _overrides(record: Record) -> list[str]:
-    return [text for text in map(str, record.get("overrides") or []) if text.partition("=")[0] not in LEFT_OUT]
