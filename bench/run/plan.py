@@ -39,7 +39,7 @@ def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> s
             cell_of(config, built)
     except (ValueError, OSError) as error:
         return reason_of(error)
-    except Exception:  # noqa: BLE001 - of a class of the user's; the run records it
+    except (Exception, SystemExit):  # noqa: BLE001 - of a class of the user's; the run records it
         return ""
     return ""
 

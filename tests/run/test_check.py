@@ -66,7 +66,10 @@ def own(tmp_path, monkeypatch):
 
 def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plain, own, capsys):
     lacks = "renderer Mine lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
-    for act, words in (("raise RuntimeError", ""), ("raise ValueError('no')", "no"), ("print('made')", lacks)):
+    for act, words in (
+        *(("raise RuntimeError", ""), ("raise SystemExit(3)", ""), ("raise ValueError('no')", "no")),
+        ("print('made')", lacks),
+    ):
         assert refusal(plain(*own(act))) == words
     assert capsys.readouterr().out == ""
 
