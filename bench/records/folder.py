@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -48,10 +48,12 @@ class Identity:
         choices: names of the chosen YAMLs of task, renderer, dataset and method; a stress takes the dataset's place,
             and the method is empty where none is chosen.
         config: the resolved configuration, as plain data.
+        overrides: of the command line.
     """
 
     choices: dict[str, str]
     config: dict[str, Any]
+    overrides: list[str] = field(default_factory=list)
 
     @cached_property
     def config_hash(self) -> str:
@@ -98,7 +100,7 @@ def identify(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) 
     named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": seen}
     named["method"] = choices.get("method") or ""
     check(values, overrides)
-    return Identity({name: str(choice) for name, choice in named.items()}, values)
+    return Identity({name: str(choice) for name, choice in named.items()}, values, list(overrides))
 
 
 @contextmanager

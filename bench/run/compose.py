@@ -119,21 +119,22 @@ def make_plan(config: DictConfig, swept: list[list[str]]) -> Plan:
             differing = " ".join(override for override in overrides if override not in common)
             where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""
             raise ValueError(f"{where}{error}; nothing was run") from error
-        cells.append(planned(identity, overrides))
+        cells.append(planned(identity))
     first = cells[0].config
     name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
     return Plan(name, Path(first["results_dir"]), cells)
 
 
-def planned(identity: Identity, overrides: list[str]) -> PlannedCell:
+def planned(identity: Identity) -> PlannedCell:
     """The cell of a sweep that is a run."""
-    seed, config = identity.config["seed"], identity.config
-    return PlannedCell(identity.name, overrides, **identity.choices, seed=seed, config=config)
+    config = identity.config
+    return PlannedCell(identity.name, identity.overrides, **identity.choices, seed=config["seed"], config=config)
 
 
 def identity_of(cell: PlannedCell) -> Identity:
     """The identity of a planned cell's run."""
-    return Identity({name: getattr(cell, name) for name in ("task", "renderer", "dataset", "method")}, cell.config)
+    choices = {name: getattr(cell, name) for name in ("task", "renderer", "dataset", "method")}
+    return Identity(choices, cell.config, cell.overrides)
 
 
 def combinations(texts: list[str]) -> list[list[str]]:

@@ -97,7 +97,7 @@ def _check(identity: Identity) -> None:
     if not reused and (reason := refusal(config)):
         raise ValueError(reason)
     if config["plan"]:
-        cell = planned(identity, [])
+        cell = planned(identity)
         show_plan(Plan("", results_dir, [cell]), {cell.id} if reused else set(), 1)
 
 
@@ -111,7 +111,7 @@ def run(identity: Identity) -> tuple[Path, Record]:
     with claimed(Path(identity.config["results_dir"]), identity, identity.config["rerun"]) as (folder, finished):
         if finished is not None:
             return folder, _reuse(folder, finished)
-        return folder, _run_anew(Job(folder, _new_record(identity, folder)))
+        return folder, _run_anew(Job(folder, _new_record(identity)))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
@@ -200,15 +200,15 @@ def _export(tracker: Tracker, folder: Path, record: Record) -> None:
         record.write(folder)
 
 
-def _new_record(identity: Identity, folder: Path) -> Record:
+def _new_record(identity: Identity) -> Record:
     return Record(
-        folder.name,
+        identity.name,
         **identity.choices,
         seed=identity.config["seed"],
         config=identity.config,
         config_hash=identity.config_hash,
         code=identity.code,
-        overrides=list(HydraConfig.get().overrides.task),
+        overrides=identity.overrides,
     )
 
 
