@@ -75,7 +75,7 @@ def test_what_is_there_is_reused_and_tells_of_like_runs(results):
 @pytest.mark.parametrize("arguments", [
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
-    ("-m", "renderer=dist,dvr", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
+    ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
 ])  # fmt: skip
 def test_a_cell_is_what_hydra_makes_of_it(results, monkeypatch, arguments):
     quick = planned(results, *arguments)
