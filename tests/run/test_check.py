@@ -31,8 +31,9 @@ def plain(compose_config):
 
 def test_a_task_on_a_fitted_network_is_refused_without_one(plain):
     for task in (("task=gradients",), ("task=pose", "task.shape=prior")):
-        cells = [plain(*task), plain("+experiment=fitted", *task)]
-        assert [reason[-24:] for reason in map(refusal, cells)] == ["to: add +experiment=fitted"[-24:], ""]
+        cells = [plain(*task), plain("+experiment=fitted", *task), plain("+experiment=fitted", *task, "index=1")]
+        refused = [reason.endswith("fitted to: add +experiment=fitted") for reason in map(refusal, cells)]
+        assert refused == [True, False, True]
 
 
 def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
