@@ -1,4 +1,4 @@
-"""plan=true lists what would run, with the time that finished runs took, and leaves nothing behind."""
+"""What is planned is checked before anything runs; plan=true lists it, and leaves nothing behind."""
 
 import sys
 from dataclasses import asdict
@@ -7,14 +7,24 @@ from pathlib import Path
 import pytest
 
 from bench.prior import main as prior_main
+from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
 from bench.run import run as run_module
-from bench.run.plan import kind, times
+from bench.run.plan import check_plan, kind, refusal, times
 from bench.train import main as train_main
+from tests import tiny
 from tests.run.driving import command
 
 SWEEP = ("-m", "scale=smoke", "isolation=off", "threads=1", "renderer=dist,dvr", "seed=0,1")
+SMALL = ("scale=smoke", "threads=1")
+CODE = """
+class Mine:
+    def __init__(self, *_, **__):
+        {act}
+    def render(self, field, rays): ...
+    def silhouette_loss(self, field, rays, rendering, mask): ...
+"""
 
 
 @pytest.fixture
@@ -25,7 +35,7 @@ def results(tmp_path, monkeypatch) -> Path:
     return tmp_path / "r"
 
 
-def planned(results: Path, *arguments: str) -> list[sweep.PlannedCell]:
+def planned(results: Path, *arguments: str) -> list[PlannedCell]:
     plans = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep, "show_plan", lambda plan, *_: plans.append(plan))
@@ -33,7 +43,7 @@ def planned(results: Path, *arguments: str) -> list[sweep.PlannedCell]:
     return plans[0].cells
 
 
-def write(results: Path, cell: sweep.PlannedCell, seconds: float) -> None:
+def write(results: Path, cell: PlannedCell, seconds: float) -> None:
     names = ("id", "task", "renderer", "dataset", "seed", "config")
     record = Record(**{name: value for name, value in asdict(cell).items() if name in names}, status=RunStatus.OK)
     record.ended, record.seconds = record.started, {"total": seconds}
@@ -145,3 +155,65 @@ def test_a_training_is_not_planned_and_refuses_what_is_invalid(tmp_path, main):
     ):
         done = command("+method=single_view", "scale=smoke", *wrong, f"results_dir={tmp_path / 'r'}", main=main)
         assert (done.code, done.out) == (2, "") and words in done.err and len(done.err.splitlines()) == 1
+
+
+@pytest.fixture
+def plain(compose_config):
+    """A configuration as plain data, from overrides."""
+    return lambda *overrides: tiny.plain(compose_config(*SMALL, *overrides))
+
+
+def test_a_task_on_a_fitted_network_is_refused_without_one(plain):
+    for task in (("task=gradients",), ("task=pose", "task.shape=prior")):
+        cells = [plain(*task), plain("+experiment=fitted", *task), plain("+experiment=fitted", *task, "index=1")]
+        refused = [reason.endswith("fitted to: add +experiment=fitted") for reason in map(refusal, cells)]
+        assert refused == [True, False, True]
+
+
+def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
+    for options, experiment in (([], "fig10_start"), ([], "[fitted,gradients]"), (["-m"], "fig10_start")):
+        done = command(*options, f"+experiment={experiment}", "plan=true", *SMALL, f"results_dir={tmp_path}")
+        assert done.code == 0 and ("this is one run; with -m" in done.err) is (not options)
+
+
+def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plain, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(tmp_path)
+    lacks = "renderer Mine lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
+    acts = {"raise RuntimeError": "", "raise SystemExit(3)": "", "raise ValueError('no')": "no", "print('made')": lacks}
+    for number, (act, words) in enumerate(acts.items()):
+        module = f"acting_{number}_{tmp_path.name}"
+        (tmp_path / f"{module}.py").write_text(CODE.format(act=act))
+        assert refusal(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
+    assert capsys.readouterr().out == ""
+
+
+@pytest.fixture
+def plan_of(plain, tmp_path):
+    """A plan of one cell for each list of overrides."""
+
+    def plan(*cells: tuple[str, ...]) -> Plan:
+        made = []
+        for number, overrides in enumerate(cells):
+            config = plain(*overrides, "isolation=off")
+            made.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
+        return Plan("p", Path(tmp_path), made)
+
+    return plan
+
+
+def test_a_sweep_is_told_which_cell_cannot_be(plan_of):
+    plan = plan_of(("seed=0", "renderer.steps=9"), ("seed=0", "renderer.steps=0"), ("seed=0", "renderer.steps=-1"))
+    with pytest.raises(ValueError, match=r"^cell 2 of 3 \(renderer.steps=0\): steps must be at least 1, not 0: .*"
+                       r"; 2 of 3 cells are invalid; nothing was run$"):  # fmt: skip
+        check_plan(plan, "basic", set())
+    check_plan(plan, "basic", {"c-1", "c-2"})  # what is there already is not checked
+    with pytest.raises(ValueError, match=r"^steps must be"):  # all of them: no cell is worth naming
+        check_plan(plan_of(("renderer.steps=0", "seed=0"), ("renderer.steps=0", "seed=1")), "basic", set())
+
+
+def test_a_gpu_is_looked_for_where_the_runs_are(plan_of, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    plan = plan_of(("device=cuda",))
+    with pytest.raises(ValueError, match="PyTorch sees no GPU"):
+        check_plan(plan, "joblib", set())
+    check_plan(plan, "slurm", set())

@@ -2,12 +2,14 @@
 
 import signal
 import time
+from multiprocessing import Pipe
 from types import SimpleNamespace
 
 import pytest
 
+from bench.records.record import Record
 from bench.run import process
-from bench.run.process import Step
+from bench.run.process import Job, Step
 from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -79,3 +81,12 @@ def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
         assert at_work(tmp_path)
         assert forked.send(signal.SIGKILL).code == -signal.SIGKILL
     wait_for(lambda: not at_work(tmp_path))
+
+
+def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is_ready(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(process, "import_module", done.append)
+    monkeypatch.setattr("bench.run.execute.main", lambda *_: done.append("main"))
+    job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
+    process._enter(job, *Pipe())
+    assert done == [*process.preloaded(), "main"] and "open3d" in done
