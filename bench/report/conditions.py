@@ -78,7 +78,7 @@ def draw(
     for (name, own), (place, one) in product(of_family.items(), enumerate(conditions)):
         of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["method"], line["preset"]))
         drawn = [chart.curve(*row, [x["at"] for x in of], [x["error"] for x in of]) for row, of in of_row.items()]
-        if success is not None:
+        if success is not None and drawn:
             drawn.append(chart.level("success: below", [x["at"] for x in own if x["place"] == place], success))
         panels.append(chart.panel_data(name, one.label, label, drawn))
     return chart.draw(panels, 2.1 * len(of_family) + 0.5, len(of_family), legend=3, sharey="row")

@@ -199,6 +199,12 @@ def test_six_shapes_have_an_interval_that_does_not_count_their_views(tmp_path):
     assert [ends.min(), ends.max()] == pytest.approx([100 * low, 100 * high], rel=1e-4)
 
 
+def test_a_single_run_of_one_condition_has_a_page(tmp_path):
+    found(tmp_path, "fig12", "DIST", 0.5, shift=0.2, degrees=0.0, scale=1.0, similarity=True)
+    result = made(tmp_path, fig12)
+    assert [len(axis.lines) for axis in result.figure.axes] == [3, 0, 0] and len(result.table) == 1
+
+
 def test_few_shapes_are_drawn_as_points_and_six_as_a_band(tmp_path):
     for index in range(5):
         for focal in (0.5, 1.0):
