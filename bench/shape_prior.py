@@ -287,23 +287,16 @@ def save_whole(tensors: dict[str, Tensor], path: Path) -> None:
     scratch.replace(path)
 
 
-def load_whole(path: Path) -> dict[str, Tensor] | None:
-    """The tensors of a file; None where there is none, or it was cut short, so that it is made again."""
-    try:
-        return load_file(path) if path.exists() else None
-    except (SafetensorError, OSError):
-        return None
-
-
 def kept(folder: Path, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
     """The tensors of NAME.safetensors in a folder; made and stored there by one process where there are none."""
     path = folder / f"{name}.safetensors"
     with file_lock(folder, name):
-        tensors = load_whole(path)
-        if tensors is None:
+        try:
+            return load_file(path)
+        except (SafetensorError, OSError):  # there is none, or it was cut short
             tensors = make()
             save_whole(tensors, path)
-    return tensors
+            return tensors
 
 
 def probe(dataset: Dataset) -> list[float]:

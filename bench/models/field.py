@@ -1,9 +1,7 @@
 """The field of an unknown shape, where it is no code of a prior: the candidate that early growth ends on."""
 
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
-
-import torch
+from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
 from bench.models.candidates import by_size
@@ -15,9 +13,7 @@ from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
-from bench.solve.solve import COSTS, InverseTask, check_field_gradient, draw, note_costs, note_result
-from datasets.scene import Scene
-from renderers.rendering import Renderer
+from bench.solve.solve import COSTS, draw, note_costs, note_result
 
 SIZES = (
     "the numbers of its field that the optimiser may change; those that a file must hold so that it can be evaluated, "
@@ -37,36 +33,29 @@ ENDED = {
 }
 
 
-@runtime_checkable
-class ShapeTask(InverseTask, Protocol):
-    """A task whose unknown is a shape: a prior's code, or any field fitted for the task's iterations."""
+def solve_by_growth(observations: RayObservations, given: Given, run: RunContext, *, iterations: int) -> None:
+    """Fits the shape of a run by early growth, or with the one field that was requested.
 
-    def observations(
-        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[RayObservations, Given]:
-        """The observations that a field is fitted to, some of them held out, and what pictures show of them."""
-        ...
-
-
-def solve_by_growth(task: ShapeTask, run: RunContext) -> None:
-    """Executes a task whose unknown is a shape by early growth, or with the one field that was requested.
+    Args:
+        observations: that a field is fitted to, some of them held out.
+        given: what pictures show of them.
+        run: its record and folder are filled.
+        iterations: of a whole fit.
 
     Raises:
-        Unsupported: where the renderer cannot do what the task or its field needs.
+        Unsupported: where the renderer cannot do what the field needs.
     """
     inputs, record, choice = run.inputs, run.record, run.inputs.field
-    check_field_gradient(inputs.renderer)
     record.definitions = DEFINITIONS | COSTS | ENDED
-    observations, given = task.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
     lines: list[dict[str, Any]] = []
     with curve_file(run.folder) as write_line:
 
         def on_line(name: str, line: dict[str, Any]) -> None:
             lines.append({**line, "candidate": name})
             write_line(lines[-1])
-            run.progress(f"fitting {name}", line["iteration"] + 1, task.optimiser.iterations, line["total"])
+            run.progress(f"fitting {name}", line["iteration"] + 1, iterations, line["total"])
 
-        settings = replace(choice.models.fit, iterations=task.optimiser.iterations)
+        settings = replace(choice.models.fit, iterations=iterations)
         fitter = Fitter(observations, settings, inputs.seed, inputs.device, on_line)
         growth = grow(fitter, by_size(choice.candidates, choice.models.size), choice.models.growth)
     note_fits(record, growth.tried, fitter)

@@ -101,50 +101,37 @@ class RayObservations:
         return given.rays[chosen].at(distance).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class Holdout:
-    """Which rays are held out.
-
-    Args:
-        share: of the rays with a known depth and of the others, from 0 to 1.
-        whole: groups that are held out as a whole.
-        footprint: half a pixel, in scene units.
-        seed: of the draw.
-    """
-
-    share: float
-    whole: tuple[int, ...]
-    footprint: float
-    seed: int
-
-
-def hold_out(view: GivenView, group: Int[Tensor, " n"], split: Holdout, *, rays: int) -> RayObservations:
-    """Holds out whole groups, and a share of the rays of the others.
+def hold_out(
+    view: GivenView, group: Int[Tensor, " n"], *, share: float, whole: tuple[int, ...], footprint: float, seed: int
+) -> RayObservations:
+    """Holds out whole groups, and a share of the rays of the others; an iteration draws as many rays as there are.
 
     Args:
         view: of rays in one row.
         group: which view, or part of one, a ray belongs to, from 0.
-        split: which rays are held out.
-        rays: number drawn in an iteration.
+        share: of the rays with a known depth and of the others, from 0 to 1.
+        whole: groups that are held out as a whole.
+        footprint: half a pixel, in scene units.
+        seed: of the draw.
 
     Raises:
         BadInput: where too few depths are given to hold some out.
     """
-    draw = torch.Generator().manual_seed(split.seed)
-    out = torch.isin(group, torch.tensor(split.whole))
+    draw = torch.Generator().manual_seed(seed)
+    out = torch.isin(group, torch.tensor(whole))
     for kind in (view.observed.cpu(), ~view.observed.cpu()):
         places = (kind & ~out).nonzero().squeeze(-1)
-        count = round(split.share * len(places))
+        count = round(share * len(places))
         out[places[torch.randperm(len(places), generator=draw)[:count]]] = True
     out = out.to(view.observed.device)
     given = view.some((~out).nonzero().squeeze(-1))
-    held_out = held(view, out, group, split.footprint)
+    held_out = held(view, out, group, footprint)
     if len(held_out.group[held_out.observed].unique()) < 2:
         raise BadInput(
             f"a field without a prior is evaluated on held-out depths, and {int(view.observed.sum())} depths are too "
             "few to hold some out: give more (task.points=100), or set field=prior"
         )
-    return RayObservations(given, held_out, rays, split.seed)
+    return RayObservations(given, held_out, len(group), seed)
 
 
 @dataclass(frozen=True)
@@ -177,8 +164,10 @@ class Views:
         settings = self.settings
         turn = float(np.random.default_rng([seed, 2]).uniform(0, 360))
         cameras = [*self._spread(settings.fitted, turn), *self._spread(settings.held_out, turn + GOLDEN / 2)]
-        held = tuple(range(settings.fitted, len(cameras)))
-        return hold_out(*self._seen(cameras), Holdout(settings.share, held, self.footprint, seed), rays=settings.rays)
+        whole = tuple(range(settings.fitted, len(cameras)))
+        view, group = self._seen(cameras)
+        held = hold_out(view, group, share=settings.share, whole=whole, footprint=self.footprint, seed=seed)
+        return replace(held, rays=settings.rays)
 
     def further(self, count: int, seed: int) -> HeldOut:
         """`count` further views at random, which no choice has used."""

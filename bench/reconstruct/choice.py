@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,14 +13,15 @@ from bench.models.growth import Trials, climb
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
 from bench.models.observations import TILES, tiles
-from bench.reconstruct.pixels import Pixels, Stack
+from bench.reconstruct.pixels import Stack
+from bench.reconstruct.problem import Learnt, ReconstructionProblem
 from bench.reconstruct.subject import Subject
 from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.fields import PRIOR, parsed
 from bench.setup.inputs import RunContext
-from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
+from bench.solve.optimise import History, OptimiserSettings, optimise
 from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_positive, check_share
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
@@ -37,10 +38,6 @@ DEFINITIONS = {
     "fields_tried": "candidates that were tried",
     "seconds.trials": "the loops of the trials of field=auto; their evaluations are not among those of the loop",
 }
-
-
-Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid
-"""Modules whose `field` is a Coloured at their current parameters."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +78,7 @@ class Appearance:
         raise BadInput(f"field={name} has no colours: {FORMS}")
 
 
-@runtime_checkable
-class Learning(Objective, Protocol):
-    """The problem of a candidate; see `bench.reconstruct.problem.ReconstructionProblem`."""
-
-    def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
-        """The error of each pixel's colours, at the current parameters."""
-        ...
-
-
-Make = Callable[[str, Subject], Learning]
+Make = Callable[[str, Subject], ReconstructionProblem]
 
 
 @dataclass(frozen=True)
@@ -119,7 +107,8 @@ class AutoField:
     ) -> "Choice":
         """Tries candidates from the smallest on, and keeps the one that `bench.models.growth.climb` ends on.
 
-        Errors are of photographs that are given, but not to the trials; groups are tiles of these.
+        Errors are of photographs that are given, but not to the trials; groups are tiles of these. A trial whose loss
+        fails has no error.
 
         Args:
             make: the problem of a candidate and photographs.
@@ -129,12 +118,23 @@ class AutoField:
             run: whose progress is reported.
         """
         aside, rest = subject.given[::ASIDE], [shot for place, shot in enumerate(subject.given) if place % ASIDE]
-        part = replace(subject, given=tuple(rest))
+        part, device = replace(subject, given=tuple(rest)), run.inputs.device
         brief = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
 
         def trial(name: str, trials: Trials) -> Evidence:
             torch.manual_seed(run.inputs.seed)  # each begins as it would alone
-            return _tried(name, sizes[name], make(name, part), aside, brief, run)
+            problem, history = make(name, part), History()
+
+            def on_step(line: dict[str, Any]) -> None:
+                run.progress(f"trying {name}", line["iteration"] + 1, brief.iterations, line["total"])
+
+            optimise(problem, brief, device, history=history, on_step=on_step)
+            found = Evidence(name, Size(sizes[name], sizes[name]), status=history.status)
+            found.seconds = history.seconds["forward"] + history.seconds["backward"]
+            found.evaluations = history.counts.value
+            if history.status is RunStatus.OK:
+                found.error = tiled(problem.colour_errors(Stack.of(aside, None, device).pixels).cpu(), aside)
+            return found
 
         ordered = sorted(self.candidates, key=lambda name: sizes[name])
         return Choice(climb(ordered, trial, patience=self.patience), len(aside))
@@ -173,23 +173,6 @@ class Choice:
         """The metrics of `DEFINITIONS`, for a run whose loop took so many seconds."""
         overhead = {"field_overhead": 1 + self.seconds / max(loop, 1e-9), "fields_tried": len(self.trials.tried)}
         return self.kept.field() | overhead
-
-
-def _tried(
-    name: str, free: int, problem: Learning, aside: Sequence[Shot], brief: OptimiserSettings, run: RunContext
-) -> Evidence:
-    """A candidate's trial; one whose loss fails has no error."""
-    history = History()
-
-    def on_step(line: dict[str, Any]) -> None:
-        run.progress(f"trying {name}", line["iteration"] + 1, brief.iterations, line["total"])
-
-    optimise(problem, brief, run.inputs.device, history=history, on_step=on_step)
-    seconds, values = history.seconds["forward"] + history.seconds["backward"], history.counts.value
-    found = Evidence(name, Size(free, free), seconds=seconds, evaluations=values, status=history.status)
-    if history.status is RunStatus.OK:
-        found.error = tiled(problem.colour_errors(Stack.of(aside, None, run.inputs.device).pixels).cpu(), aside)
-    return found
 
 
 def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:

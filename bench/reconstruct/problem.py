@@ -12,7 +12,6 @@ from torch import Tensor
 from bench.evaluate.colours import colours_at
 from bench.evaluate.evaluate import Evaluation, surface_of
 from bench.pictures.filmstrip import Shown
-from bench.reconstruct.choice import Learnt
 from bench.reconstruct.judge import field_scores, judge, mesh_views, surface_scores
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.pictures import draw_reconstruction
@@ -24,10 +23,11 @@ from datasets.scene import View
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Counts, Field, Meter
-from renderers.fields.coloured import Coloured
+from renderers.fields.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
 from renderers.rendering import Renderer, at_iteration
 
 COMPARED = 4096  # pixels of which the objective before and after is made
+Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `field` is a Coloured
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Images of many shapes from random views, with masks and depths: made once for a dataset, then read from a file."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ POINTS = 8192  # of known occupancy per shape: half in the cube, half near the s
 NEAR = 0.05  # scene units: standard deviation of the latter from the surface
 NEAR_HULL = 0.07  # the same, from points in the visual hull
 CUBE = 1.0  # half the side of the cube
+OF_VIEWS = ("motions", "colours", "masks", "depths")
+PARTS = (*OF_VIEWS, "points", "inside")  # of `ImagesOf`, stacked over shapes in a file
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class ImagesOf:
     """Images of one shape.
 
     Args:
-        cameras: of each image.
+        intrinsics, motions: of the cameras, `Camera.intrinsics` of all and `Camera.world_to_camera` of each.
         colours: 0 to 255.
         masks: true on the shape.
         depths: camera z, in scene units; 0 on the background.
@@ -41,12 +43,19 @@ class ImagesOf:
         inside: whether each lies in the shape.
     """
 
-    cameras: tuple[Camera, ...]
+    intrinsics: Float[Tensor, "3 3"]
+    motions: Float[Tensor, "views 4 4"]
     colours: UInt8[Tensor, "views height width 3"]
     masks: Bool[Tensor, "views height width"]
     depths: Float[Tensor, "views height width"]
     points: Float[Tensor, "points 3"]
     inside: Bool[Tensor, " points"]
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of each image."""
+        height, width = self.masks.shape[1:]
+        return tuple(Camera(self.intrinsics, motion, height, width) for motion in self.motions)
 
     def image(self, view: int) -> Float[Tensor, "4 height width"]:
         """An image as encoders take it; see `as_input`."""
@@ -54,14 +63,7 @@ class ImagesOf:
 
     def first(self, views: int) -> "ImagesOf":
         """The first images; the points stay."""
-        kept = slice(views)
-        return replace(
-            self,
-            cameras=self.cameras[kept],
-            colours=self.colours[kept],
-            masks=self.masks[kept],
-            depths=self.depths[kept],
-        )
+        return replace(self, **{name: getattr(self, name)[:views] for name in OF_VIEWS})
 
     def shots(self) -> tuple[Shot, ...]:
         """The images as photographs."""
@@ -131,9 +133,12 @@ class Imaging:
                 progress("rendering images", index, count)
                 made.append(self.of_shape(dataset, split, index))
             progress("rendering images", count, count)
-            return _packed(made)
+            parts = {name: torch.stack([getattr(one, name) for one in made]) for name in PARTS}
+            return parts | {"intrinsics": made[0].intrinsics}
 
-        return _unpacked(kept(cache, f"images-{dataset.name}-{split}-{key}", make))
+        tensors = kept(cache, f"images-{dataset.name}-{split}-{key}", make)
+        parts = zip(*(tensors[name] for name in PARTS), strict=True)
+        return [ImagesOf(tensors["intrinsics"], *one) for one in parts]
 
     def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:
         """The images of one shape, from cameras and with a texture of its own."""
@@ -143,7 +148,8 @@ class Imaging:
         shots = self.photography.take_from(truth, cameras, seed=seed)
         points = _points(mesh, seed)
         return ImagesOf(
-            tuple(cameras),
+            cameras[0].intrinsics,
+            torch.stack([camera.world_to_camera for camera in cameras]),
             torch.stack([(255 * shot.colours).round().to(torch.uint8) for shot in shots]),
             torch.stack([shot.mask for shot in shots if shot.mask is not None]),
             torch.stack([shot.depth for shot in shots if shot.depth is not None]),
@@ -157,20 +163,3 @@ def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:
     draw = np.random.default_rng([seed, 3])
     near = sample_surface(mesh, POINTS // 2, seed)[0] + NEAR * draw.standard_normal((POINTS // 2, 3))
     return np.concatenate([draw.uniform(-CUBE, CUBE, (POINTS - len(near), 3)), near])
-
-
-def _packed(made: Sequence[ImagesOf]) -> dict[str, Tensor]:
-    names = ("colours", "masks", "depths", "points", "inside")
-    tensors = {name: torch.stack([getattr(one, name) for one in made]) for name in names}
-    tensors["motions"] = torch.stack([torch.stack([c.world_to_camera for c in one.cameras]) for one in made])
-    return tensors | {"intrinsics": made[0].cameras[0].intrinsics}
-
-
-def _unpacked(tensors: dict[str, Tensor]) -> list[ImagesOf]:
-    parts = [tensors[name] for name in ("motions", "colours", "masks", "depths", "points", "inside")]
-    found = []
-    for motions, colours, *others in zip(*parts, strict=True):
-        height, width = colours.shape[1:3]
-        cameras = tuple(Camera(tensors["intrinsics"], motion, height, width) for motion in motions)
-        found.append(ImagesOf(cameras, colours, *others))
-    return found

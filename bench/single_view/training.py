@@ -2,10 +2,11 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
+from pickle import UnpicklingError
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +15,6 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from bench.progress import Report, notice
 from bench.reconstruct.losses import Losses
-from bench.shape_prior import load_whole, save_whole
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.solve.optimise import OptimiserSettings
@@ -214,31 +214,19 @@ class Lessons:
 
 
 def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> None:
-    tensors = {f"weights.{name}": tensor for name, tensor in model.state_dict().items()}
-    for place, moments in optimiser.state_dict()["state"].items():
-        tensors |= {f"adam.{place}.{name}": tensor for name, tensor in moments.items()}
-    tensors["losses"] = torch.tensor(course.losses, dtype=torch.float64, device="cpu")
-    spent = (course.seconds, course.counts.value, course.counts.gradient, course.counts.coarse)
-    tensors["spent"] = torch.tensor(spent, dtype=torch.float64, device="cpu")
-    save_whole(tensors, path)
+    scratch = path.with_suffix(".partial")
+    torch.save({"weights": model.state_dict(), "adam": optimiser.state_dict(), "course": asdict(course)}, scratch)
+    scratch.replace(path)
 
 
 def _restored(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> int:
-    """Fills model, optimiser and course from a kept state, if there is one; gives the number of its steps."""
-    tensors = load_whole(path)
-    if tensors is None:
+    """Fills model, optimiser and course from a kept state, if there is a whole one; gives the number of its steps."""
+    try:
+        state = torch.load(path, weights_only=True)
+    except (OSError, EOFError, RuntimeError, UnpicklingError):  # none, or one that was cut short
         return 0
-    weights, adam = (
-        {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
-        for start in ("weights.", "adam.")
-    )
-    model.load_state_dict(weights)
-    moments: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in adam.items():
-        place, _, part = name.partition(".")
-        moments.setdefault(int(place), {})[part] = tensor
-    optimiser.load_state_dict({**optimiser.state_dict(), "state": moments})
-    course.losses = tensors["losses"].tolist()
-    course.seconds, *counted = tensors["spent"].tolist()
-    course.counts.value, course.counts.gradient, course.counts.coarse = map(int, counted)
+    model.load_state_dict(state["weights"])
+    optimiser.load_state_dict(state["adam"])
+    course.losses, course.seconds = state["course"]["losses"], state["course"]["seconds"]
+    course.counts = Counts(**state["course"]["counts"])
     return len(course.losses)

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bench.models.field import solve_by_growth
-from bench.models.observations import Holdout, RayObservations, hold_out, tiles, together
+from bench.models.observations import RayObservations, hold_out, tiles, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
@@ -74,8 +74,13 @@ class Completion:
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
         run.record.notes = [*run.record.notes, *run.inputs.scene.on_depths]
-        solve = solve_task if run.inputs.field.of_prior else solve_by_growth
-        solve(self, run)
+        inputs = run.inputs
+        if inputs.field.of_prior:
+            solve_task(self, run)
+            return
+        check_field_gradient(inputs.renderer)
+        observations, given = self.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
+        solve_by_growth(observations, given, run, iterations=self.optimiser.iterations)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -92,8 +97,8 @@ class Completion:
         view, observed = self._given(scene, renderer, seed=seed, device=device)
         camera = scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
-        split = Holdout(HELD_OUT, (), half_pixel, seed)
-        held = hold_out(together([view]), tiles(*observed.shape), split, rays=observed.numel())
+        group = tiles(*observed.shape)
+        held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
         return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
     def _given(

@@ -15,7 +15,7 @@ from bench.models.fit import SCREENING, Fitter, _slope_error, scattered
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
-from bench.models.observations import FREE, Holdout, Views, hold_out, together
+from bench.models.observations import FREE, Views, hold_out, together
 from bench.models.study import choose
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
@@ -209,7 +209,7 @@ def test_held_out_rays_are_not_given():
     views = [see(shape_of("box"), SAMPLER.camera(angle, 20.0)) for angle in (0.0, 90.0, 180.0)]
     given = [GivenView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
     group = torch.arange(3).repeat_interleave(24 * 24)
-    found = hold_out(together(given), group, Holdout(0.25, (2,), 0.02, 0), rays=64)
+    found = hold_out(together(given), group, share=0.25, whole=(2,), footprint=0.02, seed=0)
     pixels = 24 * 24
     assert len(found.held_out.distance) == pytest.approx(pixels + 0.25 * 2 * pixels, abs=2)
     everything = torch.cat([found.given.rays.directions, found.held_out.rays.directions])
@@ -385,7 +385,7 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
     few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
     given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
     with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
-        hold_out(together([given]), torch.arange(24 * 24) // 96, Holdout(0.2, (), 0.02, 0), rays=64)
+        hold_out(together([given]), torch.arange(24 * 24) // 96, share=0.2, whole=(), footprint=0.02, seed=0)
 
 
 def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
