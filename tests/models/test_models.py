@@ -84,6 +84,10 @@ def evidence_of(name: str, size: int | Size, error: HeldOutError | None) -> Evid
     return Evidence(name, size, 10, error, status, "" if error else "it rose")
 
 
+def test_the_papers_network_has_1_8_million_numbers():
+    assert candidate(PAPERS).stored == 1_839_614
+
+
 @each("name", SIZES)
 def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
     ball = Model("sphere", [torch.zeros(1, requires_grad=True)], lambda free: sphere(0.5), 0.1, metric=True)
@@ -98,29 +102,19 @@ def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
         assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters)
 
 
-def test_the_papers_network_has_1_8_million():
-    papers = candidate(PAPERS)
-    assert papers.stored == 1_839_614
-    assert papers.flops == pytest.approx(2 * papers.stored, rel=0.01)
-
-
 @each(
     "changed, message",
     [
         ({"candidates": ("unoin_3",)}, "did you mean union_3"),
         ({"candidates": ("union_1",)}, "union_2 is the smallest"),
-        ({"candidates": ("network_4",)}, "unknown field"),
         ({"candidates": ("grid_4",)}, "between 8 and 256"),
         ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
         ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
-        ({"views": {"share": 1.0}}, "between 0 and 1"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changed, message):
+    parts = {"candidates": ("sphere",), "size": "stored", "fit": FIT, "growth": GROWTH, "views": VIEWS}
     with pytest.raises(ValueError, match=message):
-        parts = {"candidates": ("sphere",), "size": "stored", "fit": FIT, "growth": GROWTH, "views": VIEWS}
-        if "views" in changed:
-            changed = {"views": replace(VIEWS, **changed["views"])}
         ModelSettings(**parts | changed)
 
 
@@ -187,8 +181,6 @@ def test_the_error_is_the_surface_offset_along_its_normal():
     assert alone / either == pytest.approx(2 * 0.15 / radius, rel=0.5)
     smaller = observations.error(sphere(0.6 - 0.3 * footprint, (0.1, 0.0, -0.1))).sums.sum(0)
     assert smaller[2] / smaller[3] == pytest.approx(alone / either, rel=0.5)
-    exact = observations.error(sphere(0.6, (0.1, 0.0, -0.1)))
-    assert exact.mean < 0.2 * footprint
     nothing = observations.error(sphere(0.01, (0.0, 0.0, 0.9)))
     assert nothing.mean == pytest.approx(MISSED * footprint, rel=1e-3)
 
@@ -259,10 +251,8 @@ def test_a_fit_goes_on_from_a_warm_start_and_is_counted():
     assert fitted.evidence.iterations == 30
     assert fitted.evidence.evaluations > before[1] + 30 * 256
     assert fitted.evidence.flops > 55 * fitted.evidence.evaluations
-    assert [checkpoint["evaluations"] for checkpoint in fitted.evidence.checkpoints] == sorted(
-        {checkpoint["evaluations"] for checkpoint in fitted.evidence.checkpoints}
-    )
-    assert len(fitted.evidence.checkpoints) == 4  # after the warm start, 4, 16 and 30 iterations
+    spent = [checkpoint["evaluations"] for checkpoint in fitted.evidence.checkpoints]
+    assert spent == sorted(spent) and len(set(spent)) == 4  # after the warm start, 4, 16 and 30 iterations
 
 
 def test_a_network_takes_over_the_field_before_it():
@@ -287,16 +277,17 @@ def test_growth_ends_on_a_sufficient_candidate():
     assert boxed.summary("auto")[0].startswith("field=auto: sphere -> box, 9 numbers, held-out error 0.0")
 
 
-def test_growth_ends_with_patience_and_budget():
+def test_growth_ends_with_its_budget():
     fitter = fitter_of("capsule", warm_iterations=20, iterations=10, warm_points=64)
     candidates = [candidate(name) for name in ("sphere", "box", "box", "box", "rounded_box")]
-    asked = replace(GROWTH, patience=9, budget=100.0)
-    patient = grow(fitter, candidates, replace(asked, patience=1))
-    assert [evidence.candidate for evidence in patient.tried] == ["sphere", "box", "box"]
-    assert grow(fitter, candidates, asked).fitted.evidence.candidate == "rounded_box"
     two_more = 2.5 * cost(candidate("box"), 3, fitter) / cost(candidate("box"), 10, fitter)
-    tight = grow(fitter, candidates, replace(asked, budget=1 + two_more))
-    assert len(tight.tried) == 3
+    tight = grow(fitter, candidates, replace(GROWTH, patience=9, budget=1 + two_more))
+    assert [evidence.candidate for evidence in tight.tried] == ["sphere", "box", "box"]
+    small, large = candidates[0], candidate("network_8x256")
+    assert cost(large, 3, fitter) > cost(small, 10, fitter) and cost(small, 3, fitter) < 0.5 * cost(large, 10, fitter)
+    found = grow(fitter, [small, large], replace(GROWTH, budget=1.5))
+    assert [evidence.candidate for evidence in found.tried] == ["sphere"]
+    assert "larger ones would exceed models.growth.budget" in found.summary("auto")[0]
 
 
 def test_the_slope_error_is_that_of_the_length_of_the_gradient():
@@ -311,15 +302,6 @@ def test_each_of_several_starts_is_tried_before_the_best_one_goes_on(monkeypatch
     fitter_of("box", warm_iterations=80).begin(candidate("union_3"), None, evaluate=False)
     assert len(spent) > 3
     assert spent == [80 // SCREENING] * (len(spent) - 1) + [80]
-
-
-def test_a_candidate_that_would_cost_more_than_the_budget_is_not_tried():
-    fitter = fitter_of("box", warm_iterations=20, iterations=10)
-    small, large = candidate("sphere"), candidate("network_8x256")
-    assert cost(large, 3, fitter) > cost(small, 10, fitter) and cost(small, 3, fitter) < 0.5 * cost(large, 10, fitter)
-    found = grow(fitter, [small, large], replace(GROWTH, budget=1.5))
-    assert [evidence.candidate for evidence in found.tried] == ["sphere"]
-    assert "larger ones would exceed models.growth.budget" in found.summary("auto")[0]
 
 
 @each("spread, better", [(0.002, True), (-0.002, False)])
@@ -430,12 +412,9 @@ def test_sizes_in_words():
     assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204)
 
 
-def test_candidates_are_tried_in_the_order_of_the_measure(compose_config):
+def test_candidates_are_tried_in_the_order_of_the_measure():
     names = ("sphere", "ellipsoid", "box", "network_2x64", "grid_32", "network_4x64", "network_4x128")
     by_stored = (*names[:4], "network_4x64", "grid_32", "network_4x128")
     assert [one.name for one in by_size(names, "free")] == list(names)
     for measure in ("stored", "bytes"):
         assert [one.name for one in by_size(names, measure)] == list(by_stored)
-    shipped = tuple(compose_config("scale=desk").models.candidates)
-    free = [candidate(name).stored for name in shipped if not name.startswith("grid_")]
-    assert free == sorted(free)  # all numbers of the others are free

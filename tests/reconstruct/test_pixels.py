@@ -42,10 +42,8 @@ def test_pixels_stand_in_one_row_with_their_own_rays():
         assert torch.equal(stack.pixels.rays.directions[place], rays.directions[row, column])
         assert torch.equal(stack.pixels.rays.origins[place], rays.origins[row, column])
         assert stack.pixels.mask is not None and stack.pixels.mask[place] == ((row + column) % 3 == 0)
-        depth = stack.pixels.at_one[place] * stack.pixels.rays.directions[place]
         forward = shot.camera.world_to_camera[2, :3]
         assert stack.pixels.at_one[place].item() == pytest.approx((rays.directions[row, column] @ forward).item())
-        assert depth.isfinite().all()
 
 
 def test_patches_are_neighbours_in_one_photograph():
@@ -86,10 +84,6 @@ def test_given_depths_are_distances_along_rays_and_nan_elsewhere():
     true = torch.cat([shape.distance(camera.double().rays()).flatten() for camera in cameras]).float()
     assert stack.pixels.distance is not None and 20 < int(true.isfinite().sum()) < len(true)
     torch.testing.assert_close(stack.pixels.distance, true, rtol=0, atol=1e-5, equal_nan=True)
-    torch.testing.assert_close(
-        stack.pixels.rays.at(true)[true.isfinite()].sub(shape.centre).norm(dim=-1).float(),
-        torch.full((int(true.isfinite().sum()),), 0.6), rtol=0, atol=1e-5,
-    )  # fmt: skip
     assert stack.pixels.normals is not None and stack.pixels.normals.shape == (len(true), 3)
     alone = Stack.of([shots[0], replace(shots[1], depth=None)], None, CPU).pixels.distance
     assert alone is not None and alone[12 * 20 :].isnan().all() and alone[: 12 * 20].isfinite().any()

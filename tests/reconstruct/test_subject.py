@@ -55,12 +55,9 @@ def test_every_nth_photograph_is_held_out(inputs):
     assert "9 rendered photographs of 16 x 16 pixels" in subject.found
     assert subject.found.endswith(f"{len(subject.held_out)} of them are held out")
     assert all(shot.colours.shape == (16, 16, 3) for shot in subject.given)
-
-
-def test_without_masks_those_held_out_keep_theirs(inputs):
-    subject = found(inputs, masks=False)
-    assert all(shot.mask is None for shot in subject.given)
-    assert all(shot.mask is not None for shot in subject.held_out)
+    blind = found(inputs, masks=False)
+    assert all(shot.mask is None for shot in blind.given)
+    assert all(shot.mask is not None for shot in blind.held_out)
 
 
 def test_too_few_photographs_are_told(inputs):

@@ -1,4 +1,4 @@
-"""Surfaces without a renderer, on spheres and triangles in closed form: points, Poisson, colours, pictures."""
+"""Surfaces without a renderer, on spheres in closed form: points, Poisson, colours."""
 
 from dataclasses import replace
 
@@ -9,8 +9,7 @@ import torch
 from bench.evaluate.colours import GREY
 from bench.reconstruct import surfaces
 from bench.reconstruct.stereo import Cloud
-from bench.reconstruct.surfaces import fused, given_clouds, painter, poisson, with_colours
-from datasets.mesh import Mesh
+from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
 from tests.looped import each
 from tests.reconstruct.test_judge import CENTRE
 from tests.reconstruct.test_judge import painted as coloured_ball
@@ -120,29 +119,3 @@ def test_a_photograph_that_a_vertex_faces_counts_most():
     other = np.argmax(mesh.vertices @ aside.camera.center.numpy())
     assert 0.9 < colours[nearest, 0] < 1 and 0 < colours[other, 0] < 0.1
     assert colours[middle, 0] == pytest.approx(0.5, abs=0.1)
-
-
-TRIANGLE = Mesh(np.array([[-0.7, -0.5, 0.1], [0.6, -0.4, -0.2], [0.1, 0.6, 0.3]]), np.array([[0, 1, 2]]))
-PAINT = np.array([[1.0, 0.1, 0.0], [0.2, 0.9, 0.3], [0.0, 0.2, 0.8]])
-
-
-def weights_of(mesh: Mesh, camera) -> np.ndarray:
-    """The weights of a triangle's corners where rays meet its plane, [height, width, 3]."""
-    rays = camera.double().rays()
-    origin, towards = rays.origins.numpy()[..., None], rays.directions.numpy()
-    steps = np.stack([*(mesh.vertices[1:] - mesh.vertices[0])], axis=1)
-    left = np.concatenate([np.broadcast_to(steps, (*towards.shape[:2], 3, 2)), -towards[..., None]], axis=-1)
-    along = np.linalg.solve(left, origin - mesh.vertices[0][:, None])[..., :2, 0]
-    return np.concatenate([1 - along.sum(axis=-1, keepdims=True), along], axis=-1)
-
-
-def test_a_triangle_is_painted_with_the_colours_between_its_corners():
-    mesh, camera = replace(TRIANGLE, colours=PAINT), camera_of(33, angles=(20.0, 10.0)).resized(29, 33)
-    weights = weights_of(mesh, camera)
-    inside, outside = weights.min(axis=-1) > 1e-4, weights.min(axis=-1) < -1e-4
-    assert inside.sum() > 60 and outside.sum() > 200
-    view, image = painter(mesh)(camera)
-    assert image.shape == (29, 33, 3) and image.dtype == torch.float32
-    assert view.mask.numpy()[inside].all() and not view.mask.numpy()[outside].any()
-    np.testing.assert_allclose(image.numpy()[inside], (weights @ PAINT)[inside], atol=1e-4)
-    assert (image.numpy()[outside] == 0).all()

@@ -185,9 +185,7 @@ def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_p
     with pytest.raises(Stopped):
         trained(images, renderer, state, progress=stop)
     begun = []
-    again, more = trained(
-        images, renderer, state, progress=lambda phase, done, total, loss=None: begun.append(done)
-    )  # fmt: skip
+    again, more = trained(images, renderer, state, progress=lambda phase, done, *told: begun.append(done))
     assert begun[0] == 5  # states are kept after the progress of every second step is told
     assert torch.equal(weights(again), weights(whole))
     assert more.losses == course.losses
@@ -198,22 +196,26 @@ def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_p
     assert torch.equal(weights(trained(images, renderer, state)[0]), weights(whole))
 
 
-def test_a_step_that_is_no_number_keeps_the_last_state(images, renderer, tmp_path, monkeypatch):
+def recipe(renderer, **changed) -> Recipe:
+    settings = replace(SETTINGS, steps=3, **changed)
+    return Recipe(Balls(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
+
+
+def test_a_step_that_is_no_number_keeps_the_last_state_and_has_a_record(renderer, tmp_path, monkeypatch):
     give = Lessons.give
 
     def spoilt(self, model, step, counts):
         loss = give(self, model, step, counts)
-        return float("nan") if step == 5 else loss
+        return float("nan") if step == 2 else loss
 
     monkeypatch.setattr(Lessons, "give", spoilt)
-    with pytest.raises(Failed, match=r"number at step 5; the state after 4 steps is in .*: lower task\.training"):
-        trained(images, renderer, tmp_path / "s.state")
-    assert (tmp_path / "s.state").exists()
-
-
-def recipe(renderer, **changed) -> Recipe:
-    settings = replace(SETTINGS, steps=3, **changed)
-    return Recipe(Balls(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
+    made = recipe(renderer)
+    with pytest.raises(Failed, match=r"number at step 2; the state after 2 steps is in .*: lower task\.training"):
+        made.make(tmp_path, CPU, silent)
+    assert list(tmp_path.glob("single_view-*.state")) and made.find(tmp_path) is None
+    (path,) = tmp_path.glob("single_view-*.json")
+    record = json.loads(path.read_text())
+    assert record["status"] == "nan" and "not a number at step 2" in record["reason"]
 
 
 def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path, monkeypatch):
@@ -255,20 +257,6 @@ def test_neither_training_nor_loading_changes_later_draws(renderer, tmp_path):
     assert drawn == [torch.rand(1).item()] * 2
 
 
-def test_one_that_fails_has_a_record(renderer, tmp_path, monkeypatch):
-    def failing(*arguments):
-        raise Failed(7, 4, tmp_path / "x.state")
-
-    monkeypatch.setattr("bench.single_view.store.Lessons.train", failing)
-    made = recipe(renderer)
-    with pytest.raises(Failed):
-        made.make(tmp_path, CPU, silent)
-    (path,) = tmp_path.glob("single_view-*.json")
-    record = json.loads(path.read_text())
-    assert record["status"] == "nan" and "not a number at step 7" in record["reason"]
-    assert made.find(tmp_path) is None
-
-
 def test_a_damaged_network_is_told(renderer, tmp_path):
     made = recipe(renderer)
     path = made.make(tmp_path, CPU, silent)
@@ -300,7 +288,6 @@ def test_the_overlap_is_that_of_volumes(images):
     [
         (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
         (NETWORK, {"reads": "density"}, "task.network.reads must be one of occupancy, distance"),
-        (SETTINGS, {"steps": 0}, "task.training.steps"),
         (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
         (VOLUME, {"occupancy": 0.0}, "supervision has no term after the hull's steps: give a weight"),
     ],
