@@ -70,7 +70,8 @@ def _verdict(lines: list[Line]) -> str:
     """The times of the settings that reach the target on most shapes."""
     reached = {line["setting"]: line["time"] for line in lines if math.isfinite(line["time"])}
     what = f"Median time to an error of {SCALE * TARGET:g} (Chamfer × 1000)"
-    runs = f"{min(line['runs'] for line in lines)} runs each, and {len(reached)} of {len(lines)} settings reach it"
+    n = min(line["runs"] for line in lines)
+    runs = f"{n} runs each, and {len(reached)} of {len(lines)} settings reach it in most"
     return format.ends(what, reached, runs, show=format.seconds)
 
 

@@ -139,7 +139,7 @@ def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
     assert table.loc["bad"].tolist() == ["3", "0", "∞", "0.775"]  # the last is the rank correlation of loss and error
     assert table.loc["broken"].tolist() == ["3", "1", "∞", "–"]  # failed runs did not, whatever they scored
-    assert page.verdict.endswith("*3.00 s* (good); n = 3 runs each, and 1 of 4 settings reach it.")
+    assert page.verdict.endswith("*3.00 s* (good); n = 3 runs each, and 1 of 4 settings reach it in most.")
 
 
 def test_the_verdict_says_the_median_of_the_table(tmp_path):
