@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import started
+from bench.records.record import as_number, started
 from datasets.extras import install
 
 LISTS = ("metrics", "metrics_start", "evaluations", "seconds")
@@ -114,5 +114,5 @@ def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:
 
 
 def _finite(found: dict[str, Any]) -> dict[str, float]:
-    numbers = {name: value for name, value in found.items() if isinstance(value, int | float)}
-    return {name: float(x) for name, x in numbers.items() if not isinstance(x, bool) and math.isfinite(x)}
+    numbers = {name: as_number(value) for name, value in found.items()}
+    return {name: float(x) for name, x in numbers.items() if x is not None and math.isfinite(x)}

@@ -144,8 +144,13 @@ class MemoryPeak:
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
             return True
-        _give_back_free_memory()
-        return _reset_high_water()
+        with suppress(OSError, AttributeError):  # glibc only: freed memory goes back, so that later allocations show
+            ctypes.CDLL(None).malloc_trim(0)
+        try:
+            Path("/proc/self/clear_refs").write_text("5")
+        except OSError:
+            return False
+        return True
 
 
 def scheduled() -> tuple[int, int] | None:
@@ -187,19 +192,6 @@ def doubts(record: Record) -> list[str]:
             f"than it can do; the clock did not wait for the device"
         )
     return lines
-
-
-def _give_back_free_memory() -> None:
-    with suppress(OSError, AttributeError):  # glibc only
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def _reset_high_water() -> bool:
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return False
-    return True
 
 
 def _resident(field: str) -> int | None:

@@ -292,6 +292,17 @@ def plain(value: Any) -> Any:
     return value
 
 
+def as_number(value: Any) -> int | float | None:
+    """The value, if it is a number that fits into a float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        float(value)
+    except OverflowError:
+        return None
+    return value
+
+
 def decoded(value: Any) -> Any:
     """The same data with the strings "inf", "-inf" and "nan" as floats: the inverse of `plain`."""
     if isinstance(value, dict):

@@ -2,13 +2,13 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import spearmanr
 
 from bench.records.read import curve_lines as lines
+from bench.records.record import as_number
 from bench.report.data.records import SCALE, Record, measured
 from bench.report.data.runs import Runs
 
@@ -19,8 +19,8 @@ COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
 def read(folder: Path) -> tuple[pd.DataFrame, str]:
     """A row for each line of `curve.jsonl`, with `COLUMNS` as floats, nan for missing; and a warning, or ""."""
     found = lines(folder)
-    sound = [line for line in found or [] if isinstance(line.get("iteration"), int | float)]
-    known = [[_number(line.get(name)) for name in COLUMNS] for line in sound]
+    sound = [line for line in found or [] if as_number(line.get("iteration")) is not None]
+    known = [[as_number(line.get(name)) for name in COLUMNS] for line in sound]
     if found is None:
         warning = "no curve.jsonl"
     elif len(known) < len(found):
@@ -80,7 +80,3 @@ def spearman(points: pd.DataFrame, first: str = "loss", second: str = "error") -
     """The rank correlation of two columns; None for fewer than three points, or where a column does not vary."""
     varied = len(points) > 2 and all(points[column].nunique() > 1 for column in (first, second))
     return float(spearmanr(points[first], points[second]).statistic) if varied else None
-
-
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan

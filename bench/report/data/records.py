@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bench.records.record import row_name
+from bench.records.record import as_number, row_name
 
 SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
@@ -64,8 +64,7 @@ def index(record: Record) -> Any:
 
 def measured(record: Record, name: str) -> int | float | None:
     """The metric of that name; None where there is no such number."""
-    value = record["metrics"].get(name)
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+    return as_number(record["metrics"].get(name))
 
 
 def error(record: Record, name: str) -> float:

@@ -1,13 +1,12 @@
 """The list of all runs as columns, which the page filters, sorts and searches."""
 
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 from bench.records.format import plural
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.names import in_order, settings_of, told_apart
-from bench.records.record import NEUTRAL_KEYS, digest, plain, row_name, started
+from bench.records.record import NEUTRAL_KEYS, as_number, digest, plain, row_name, started
 from bench.report.data.records import (
     OURS,
     Record,
@@ -32,9 +31,8 @@ IN_COLUMNS = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "lab
 TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
 
 
-def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
+def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
     """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
-    folders = [Folder(results_dir, record["folder"]) for record in records]
     texts = {name: [of(record) for record in records] for name, of in TEXTS.items()}
     texts |= {"name": names(records), "thumb": [one.thumb() for one in folders]}
     return {
@@ -44,7 +42,7 @@ def columns(records: list[Record], results_dir: Path) -> dict[str, Any]:
         "key": [folder.key for folder in folders],
         "reason": [_reason(record) for record in records],
         "texts": {name: _coded(values) for name, values in texts.items()},
-        "numbers": {name: [_rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
+        "numbers": {name: [rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
         "metrics": _metrics(records),
         "reused": [place for place, record in enumerate(records) if record["reused"]],
         "tasks": _tasks(records),
@@ -89,17 +87,6 @@ def machine(record: Record) -> str:
     return f"{label}, {plural(threads, 'thread')}" if label and threads else ""
 
 
-def number(value: Any) -> int | float | None:
-    """The value, if it is a number that fits into a float."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        float(value)
-    except OverflowError:
-        return None
-    return value
-
-
 NUMBERS = {
     "seed": lambda record: record["seed"],
     "started": lambda record: int(started(record).timestamp()),
@@ -126,7 +113,7 @@ def _metrics(records: list[Record]) -> dict[str, Any]:
     found = {}
     for key, metric in METRICS.items():
         after, before = (
-            [_rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
+            [rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
         )
         if any(value is not None for value in after):
             start = before if any(value is not None for value in before) else None
@@ -138,7 +125,7 @@ def _tasks(records: list[Record]) -> list[dict[str, Any]]:
     """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
     known: dict[str, set[str]] = {}
     for record in records:
-        measured = {key for key in METRICS if number(record["metrics"].get(key)) is not None}
+        measured = {key for key in METRICS if as_number(record["metrics"].get(key)) is not None}
         known.setdefault(record["task"], set()).update(measured)
     found = []
     for task, count in Counter(record["task"] for record in records).most_common():
@@ -169,9 +156,9 @@ def _reason(record: Record) -> str:
     return (reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + " …") or "no reason recorded"
 
 
-def _rounded(value: Any) -> int | float | str | None:
+def rounded(value: Any) -> int | float | str | None:
     """A number with few digits; one that is not finite as a word, as the page's scripts have it."""
-    known = number(value)
+    known = as_number(value)
     return plain(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
 
 

@@ -5,8 +5,9 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import NO_TERMS, curve_lines
+from bench.records.record import as_number
 from bench.report.data.records import Record, definition
-from bench.report.site.columns import number
+from bench.report.site.columns import rounded
 from bench.report.site.files import ALT, Folder
 from bench.report.site.words import STATUSES, asked, command, lines_open
 
@@ -61,20 +62,20 @@ def text(value: Any) -> str:
 def curve(folder: Folder) -> dict[str, Any] | None:
     """The lines of `curve.jsonl` as columns, thinned; None without one."""
     lines = curve_lines(folder.path) if folder.has("curve.jsonl") else None
-    sound = [line for line in lines or [] if number(line.get("iteration")) is not None]
+    sound = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
     if not sound:
         return None
     terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in NO_TERMS]
-    terms = [key for key in terms if any(number(line.get(key)) is not None for line in sound)][:MOST_LINES]
+    terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in sound)][:MOST_LINES]
     kept = [sound[place] for place in _kept(sound)]
     names = [*NO_TERMS, *terms]
-    return {"terms": terms, **{name: [_short(number(line.get(name))) for line in kept] for name in names}}
+    return {"terms": terms, **{name: [rounded(line.get(name)) for line in kept] for name in names}}
 
 
 def _kept(lines: list[dict[str, Any]]) -> list[int]:
     step = max(1, -(-len(lines) // MOST_POINTS))
     every = {0, len(lines) - 1, *range(0, len(lines), step)}
-    checkpoints = [place for place, line in enumerate(lines) if number(line.get("chamfer_l2")) is not None]
+    checkpoints = [place for place, line in enumerate(lines) if as_number(line.get("chamfer_l2")) is not None]
     thinned = checkpoints[:: max(1, -(-len(checkpoints) // MOST_POINTS))]
     return sorted(every | set(thinned) | set(checkpoints[-1:]))
 
@@ -93,14 +94,14 @@ def _metrics(record: Record) -> list[list[Any]]:
 
 
 def _value(value: Any) -> int | float | str | None:
-    known = number(value)
+    known = as_number(value)
     return known if known is not None or value is None else text(value)
 
 
 def _costs(record: Record) -> dict[str, Any]:
     seconds, evaluations = record["seconds"], record["evaluations"]
-    total = number(seconds.get("total"))
-    phases = [[label, number(seconds.get(key)), key in ("forward", "backward")] for key, label in PHASES.items()]
+    total = as_number(seconds.get("total"))
+    phases = [[label, as_number(seconds.get(key)), key in ("forward", "backward")] for key, label in PHASES.items()]
     known = [phase for phase in phases if phase[1] is not None]
     rest = None if total is None else total - sum(phase[1] for phase in known)
     if rest is not None and known and rest > 0:
@@ -108,12 +109,8 @@ def _costs(record: Record) -> dict[str, Any]:
     return {
         "phases": known,
         "total": total,
-        "evaluations": [[name, number(evaluations.get(name))] for name in evaluations],
-        "flops": number(record["flops"]),
-        "gemm_fraction": number(record["gemm_fraction"]),
-        "peak_memory_bytes": number(record["peak_memory_bytes"]),
+        "evaluations": [[name, as_number(evaluations.get(name))] for name in evaluations],
+        "flops": as_number(record["flops"]),
+        "gemm_fraction": as_number(record["gemm_fraction"]),
+        "peak_memory_bytes": as_number(record["peak_memory_bytes"]),
     }
-
-
-def _short(value: int | float | None) -> int | float | None:
-    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -60,7 +60,7 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
         _write_all(data, "run", ((folder.key, detail(record, folder, results_dir)) for folder, record in runs))
         _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
         _write_all(data, "paper", wholes.items())
-        lists = {"about": {"problems": problems}, "papers": entries, "runs": columns(records, results_dir)}
+        lists = {"about": {"problems": problems}, "papers": entries, "runs": columns(records, folders)}
         for name, content in lists.items():
             write_script(data, "list", name, content)
         write_text(page, shell())
