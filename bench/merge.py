@@ -6,14 +6,14 @@ again.
 """
 
 import argparse
-import shutil
+import json
 import sys
 from pathlib import Path
 from typing import Any
 
 from bench.records.folder import content_of, put_into, set_aside
 from bench.records.read import check_links, run_folders
-from bench.records.record import file_lock, leads_out, link_out, read_record
+from bench.records.record import file_lock, leads_out, link_out, read_record, write_text
 from bench.report.write.html import write_index
 
 UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above
@@ -46,8 +46,21 @@ def merge(sources: list[Path], into: Path) -> list[str]:
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
             if not leads_out(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
-                shutil.copy(plan, into / "sweeps" / plan.parent.name)
+                _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
     return lines
+
+
+def _keep_later(place: Path, path: Path) -> None:
+    """Writes a record or a plan to where another request of the same run or sweep is, if it was requested later."""
+    if not place.exists() or _asked(path) > _asked(place):
+        write_text(place, path.read_text("utf-8", "replace"))
+
+
+def _asked(path: Path) -> str:
+    try:
+        return str(json.loads(path.read_text(encoding="utf-8"))["asked"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
 
 
 def _join(folder: Path, into: Path) -> str:
@@ -59,6 +72,7 @@ def _join(folder: Path, into: Path) -> str:
             return ""
         (mine, kept), (theirs, other) = _ranked(place), _ranked(folder)
         if mine[-1] == theirs[-1]:  # the same run
+            _keep_later(place / "record.json", folder / "record.json")
             return ""
         if theirs > mine:
             kept, other = other, kept

@@ -20,7 +20,8 @@ def write_run(
 ) -> Path:
     folder = results / "runs" / cell
     folder.mkdir(parents=True)
-    record = Record(cell, "completion", "dist", "sofa", 0, {"seed": 0}, started=started, asked=started, **changed)
+    changed = {"started": started, "asked": started} | changed
+    record = Record(cell, "completion", "dist", "sofa", 0, {"seed": 0}, **changed)
     record.status = RunStatus(status)
     record.write(folder)
     (folder / "curve.jsonl").write_text(f'{{"iteration": 0, "total": {len(started)}}}\n')
@@ -103,6 +104,18 @@ def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "d")
     statuses = {record["id"]: record["status"] for record in read_records(tmp_path / "d")[0]}
     assert statuses == {CELLS[0]: "ok", CELLS[1]: "ok", CELLS[2]: "not_run"}
+
+
+def test_of_two_requests_of_one_run_or_sweep_the_later_one_is_kept(tmp_path):
+    for name, day in (("a", 1), ("b", 2)):
+        asked = f"2026-02-0{day}T00:00:00+00:00"
+        write_run(tmp_path / name, CELLS[0], asked=asked)
+        cell = PlannedCell(CELLS[0], [], "completion", "dist", "sofa", 0, {"seed": 0})
+        Plan("table-1", tmp_path / name, [cell], asked).write()
+    for into, order in (("ab", "ab"), ("ba", "ba")):
+        merge([tmp_path / name for name in order], tmp_path / into)
+        found = [*(tmp_path / into).glob("*/*/record.json"), *(tmp_path / into).glob("*/*/plan.json")]
+        assert [json.loads(path.read_text())["asked"] for path in found] == ["2026-02-02T00:00:00+00:00"] * 2
 
 
 def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path):
