@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from bench.config import load
 from bench.records.record import RunStatus
@@ -19,11 +20,14 @@ from datasets.mesh import Mesh, extract
 from datasets.scene import Surface, Truth, View, sample_surface, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
-from renderers.field import Field, autograd_normals
+from renderers.field import Field, autograd_gradients, autograd_normals
 from renderers.fields.analytic import Shape, sphere
+from renderers.fields.coloured import Coloured
 from renderers.rendering import Renderer
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
+GREY = 0.5  # of a mesh without colours
+CHUNK = 16_384  # points whose colours are asked for at once
 REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
 OF_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
 IMAGE = {
@@ -213,6 +217,49 @@ def _view(renderer: Renderer, field: Field, camera: Camera, device: torch.device
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
     return View(camera, depth, normals.cpu(), rendering.hit.cpu())
+
+
+def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[Tensor, "height width 3"]:
+    """The field's colours where a view meets a surface; black elsewhere."""
+    image = torch.zeros(*view.mask.shape, 3)
+    rays = view.camera.rays()[view.mask]
+    points = rays.at(view.camera.distance(view.depth)[view.mask])
+    image[view.mask] = colours_at(field, points, rays.directions, device)
+    return image
+
+
+def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "height width 3"]:
+    """The colours of a mesh's vertices, interpolated over its faces; grey without colours, black outside of it.
+
+    Args:
+        mesh: with or without colours.
+        truth: of the same mesh.
+        camera: that sees it.
+    """
+    colours = np.full_like(mesh.vertices, GREY) if mesh.colours is None else mesh.colours
+    rays = camera.rays()
+    weights, corners = truth.corners(rays.flat().origins.double().numpy(), rays.flat().directions.double().numpy())
+    return np.einsum("nk,nkd->nd", weights, colours[corners]).reshape(*rays.shape, 3).clip(0, 1)
+
+
+def vertex_colours(field: Coloured, mesh: Mesh, device: torch.device) -> Float[np.ndarray, "v 3"]:
+    """The colours of a mesh's vertices, each seen from straight above."""
+    return colours_at(field, torch.from_numpy(mesh.vertices).float(), None, device).numpy()
+
+
+def colours_at(
+    field: Coloured, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"] | None, device: torch.device
+) -> Float[Tensor, "n 3"]:
+    """The colours of points of the surface, on the CPU; without directions each is seen from straight above."""
+    found = [points.new_zeros(0, 3)]
+    for start in range(0, len(points), CHUNK):
+        some = points[start : start + CHUNK].to(device)
+        slopes = autograd_gradients(field, some)
+        above = -torch.nn.functional.normalize(slopes, dim=-1)
+        towards = above if directions is None else directions[start : start + CHUNK].to(device)
+        with torch.no_grad():
+            found.append(field.colours(some, slopes, towards).cpu())
+    return torch.cat(found)
 
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.colours import coloured_image
-from bench.evaluate.evaluate import picture_view
+from bench.evaluate.evaluate import coloured_image, picture_view
 from bench.pictures.run_figures import normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from bench.setup.inputs import RunInputs

@@ -10,17 +10,18 @@ from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from bench.evaluate.colours import coloured_image, vertex_colours
 from bench.evaluate.evaluate import (
     DEFINITIONS,
     OWN,
     WORST_SURFACE,
     Evaluation,
+    coloured_image,
     mask_iou,
     render_view,
     surface_metrics,
     surface_of,
     unseen,
+    vertex_colours,
 )
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter

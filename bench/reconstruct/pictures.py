@@ -12,8 +12,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from bench.evaluate.colours import coloured_image
-from bench.evaluate.evaluate import picture_view
+from bench.evaluate.evaluate import coloured_image, picture_view
 from bench.pictures.run_figures import draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.judge import judge_mesh, judged_pixels

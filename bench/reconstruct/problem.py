@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.colours import colours_at
-from bench.evaluate.evaluate import Evaluation, surface_of
+from bench.evaluate.evaluate import Evaluation, colours_at, surface_of
 from bench.pictures.filmstrip import Shown
 from bench.reconstruct.judge import field_scores, judge, mesh_views, surface_scores
 from bench.reconstruct.losses import Losses

@@ -14,7 +14,7 @@ from bench.solve.solve import Unsupported
 from bench.stress.fit import FITS, judge_fit
 from bench.stress.judge import judge_gradient, judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
-from datasets.stress import SCENES
+from datasets.stress.scenes import SCENES
 from renderers.checks import check_choice
 from renderers.rendering import Renderer
 
@@ -56,7 +56,7 @@ class Stress:
     """One axis of the stress atlas.
 
     Args:
-        scene: a name of `datasets.stress.SCENES`; for measure=fit, one of `bench.stress.fit.FITS`.
+        scene: a name of `datasets.stress.scenes.SCENES`; for measure=fit, one of `bench.stress.fit.FITS`.
         measure: what is tested: "rendering", its "gradient", or the result of a "fit".
         group: of axes in the atlas.
         sweep: the range of severities.

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Criteria, Failure, Outcome
-from datasets.stress import Exam, FirstHit
-from datasets.stress.solids import incidence_cosines
+from datasets.stress.scenes import Exam
+from datasets.stress.solids import FirstHit, incidence_cosines
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Meter

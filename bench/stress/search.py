@@ -141,8 +141,6 @@ class Bisection:
         for end in (0, last):
             if end not in self.outcomes:
                 return end
-        if not self.outcomes[0] or self.outcomes[last]:
-            return None
         success, failure = self._around()
         return (success + failure) // 2 if failure - success > 1 else None
 

@@ -1,6 +1,6 @@
 """Model selection: fields from four parameters to the papers' network are fitted to views of a shape, one is chosen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
@@ -13,11 +13,11 @@ from bench.models.observations import Views
 from bench.models.study import CheckSettings, Choice, check, choose, fit_all, refit
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import draw_candidates
-from bench.records.record import RunStatus, curve_file
+from bench.records.record import curve_file
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
-from bench.solve.solve import COSTS, check_field_gradient
+from bench.solve.solve import COSTS, check_field_gradient, note_result
 from datasets.scene import Truth
 from renderers.checks import check_choice, check_positive, check_share
 from renderers.rendering import final_notes
@@ -112,15 +112,11 @@ class Capacity:
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
             metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
         result = evaluate(chosen.model.frozen(), inputs)
-        record.metrics = result.metrics | {"footprint": views.footprint} | metrics
-        record.status, record.reason = RunStatus.OK, ""
-        if result.mesh is None:
-            record.status, record.reason = RunStatus.EMPTY, "the recommended field has no surface in the unit sphere"
-        else:
-            result.mesh.save(run.folder / "mesh.ply")
+        metrics = result.metrics | {"footprint": views.footprint} | metrics
         saving = pixel_precision_summary(frugal, chosen.evidence)
         precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, saving]]
-        record.notes = [*record.notes, summary(choice, growth), *final_notes(chosen.renderer), *precision_notes]
+        notes = summary(choice, growth), *final_notes(chosen.renderer), *precision_notes
+        note_result(run, replace(result, metrics=metrics, notes=notes))
         filmstrip.save(
             run.folder, f"{record.title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name
         )
@@ -130,18 +126,15 @@ class Capacity:
 
 def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     """A fit's error and costs as metrics NAME.…; for a failed fit, its reason."""
-    known = {**sizes(evidence.size), "flops_per_query": evidence.flops_per_query}
+    known = {measure: evidence.size.by(measure) for measure in SIZE_WORDS}
+    if evidence.size.sparse_bytes is not None:
+        known["sparse_bytes"] = evidence.size.sparse_bytes
+    known["flops_per_query"] = evidence.flops_per_query
     spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops")}
     error = evidence.error
     failure = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
     errors = {} if error is None else {"error": error.mean, "standard_error": error.standard_error}
     return {f"{name}.{key}": value for key, value in {**known, **spent, **errors, **failure}.items()}
-
-
-def sizes(size: Size) -> dict[str, int]:
-    """The free and stored numbers and the bytes by their names in a record; of a grid also those of a sparse file."""
-    sparse = {} if size.sparse_bytes is None else {"sparse_bytes": size.sparse_bytes}
-    return {**{measure: size.by(measure) for measure in SIZE_WORDS}, **sparse}
 
 
 def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str, Any]:

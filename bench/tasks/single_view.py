@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.colours import vertex_colours
-from bench.evaluate.evaluate import OWN, Evaluation, surface_of
+from bench.evaluate.evaluate import OWN, Evaluation, surface_of, vertex_colours
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
 from bench.reconstruct.subject import Subject

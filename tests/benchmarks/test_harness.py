@@ -25,29 +25,19 @@ def seconds_of(results: Path) -> list[dict[str, float]]:
 
 def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
     """Cells that take 10 s by themselves, in a sweep: what the sweep takes beyond them, a cell."""
-    cells, pause = 4, 1.0
-    arguments = (
-        *FAILING,
-        *CELL[2:],
-        "task.optimiser.iterations=8",
-        f"+renderer.pause={pause}",
-        "seed=0,1,2,3",
-        "isolation=off",
-    )
-    walls = {}
+    cells = 4
+    arguments = (*FAILING, *CELL[2:], "task.optimiser.iterations=8", "+renderer.pause=1.0", "seed=0,1,2,3")
+    inside, outside = {}, {}
     for isolation in ("off", "process"):
-        command = [sys.executable, "-m", "bench", "-m", *arguments[:-1], f"isolation={isolation}"]
         results = tmp_path / isolation
+        command = [sys.executable, "-m", "bench", "-m", *arguments, f"isolation={isolation}", f"results_dir={results}"]
         started = time.perf_counter()
-        subprocess.run([*command, f"results_dir={results}"], cwd=ROOT, check=False, capture_output=True)
-        walls[isolation] = time.perf_counter() - started, seconds_of(results)
-    inside = {name: sum(s["total"] for s in found) / cells for name, (_, found) in walls.items()}
-    outside = {name: (wall - sum(s["total"] for s in found)) / cells for name, (wall, found) in walls.items()}
+        subprocess.run(command, cwd=ROOT, check=False, capture_output=True)
+        spent = sum(seconds["total"] for seconds in seconds_of(results))
+        inside[isolation] = spent / cells
+        outside[isolation] = (time.perf_counter() - started - spent) / cells
     with capsys.disabled():
-        print(f"\na cell: {inside['off']:.2f} s in the driver's process, {inside['process']:.2f} s in its own")
-        print(
-            f"beside its cells a sweep of {cells} takes, for each: {outside['process']:.2f} s ({outside['off']:.2f} s)"
-        )
+        print(f"\na cell takes {inside} s, and beside its cells a sweep of {cells} takes {outside} s for each")
     assert inside["process"] - inside["off"] < 0.01 * inside["off"] + 0.5
     assert outside["process"] < 0.01 * inside["off"] + 0.5 + 2.0 / cells  # 2 s to start the program
 

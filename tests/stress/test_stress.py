@@ -19,7 +19,7 @@ from bench.stress.judge import judge_gradient, judge_rendering, truth
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
 from bench.tables import choice, names
-from datasets.stress import SCENES
+from datasets.stress.scenes import SCENES
 from datasets.stress.solids import box, half_space, rod, sphere_solid
 from renderers import reference
 from renderers.camera import Rays

@@ -23,7 +23,7 @@ from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 from tests.looped import each
-from tests.tiny import PEAK, ball_prior, camera_of, run_of
+from tests.tiny import PEAK, Blind, ball_prior, camera_of, run_of
 
 SETTINGS = Ablation(repeats=2, limits=Limits(values=1e6, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
@@ -93,10 +93,8 @@ def by_hand(renderer: Renderer, *, gradient: bool) -> Meter:
     return meter
 
 
-@pytest.mark.parametrize("name", ["dist", "dvr"])
-def test_counts_are_those_of_a_meter(name, tmp_path):
-    renderer = load("renderer", name)
-    record = measured(tmp_path, renderer).record  # counts are of one of its two repeats
+def test_counts_are_those_of_a_meter(dist):
+    renderer, record = load("renderer", "dist"), dist.record  # counts are of one of its two repeats
     forward, step = by_hand(renderer, gradient=False), by_hand(renderer, gradient=True)
     assert record.metrics["queries"] == forward.counts.value > 0
     assert record.metrics["step_queries"] == record.evaluations["value"] == step.counts.value > 0
@@ -243,13 +241,12 @@ def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
 @each("smallest", [SIZE // SMALLER + 1, 1])
 def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
     costly = Costly(above=0, values=1000)
-    run = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(900, 8), smallest=smallest))
-    assert run.record.status is RunStatus.TIMEOUT
-    assert run.record.reason == "more than 900 field values in a step at 16 x 16; it finishes at no smaller size"
-    assert run.record.metrics == {}
+    record = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(900, 8), smallest=smallest)).record
+    assert record.reason == "more than 900 field values in a step at 16 x 16; it finishes at no smaller size"
+    assert (record.status, record.metrics) == (RunStatus.TIMEOUT, {})
 
 
-@pytest.mark.parametrize(("values", "times"), [(0, 5), (1000, 1)])
+@each("values, times", [(0, 5), (1000, 1)])
 def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, values, times):
     costly = Costly(above=WARM_UP**2, values=values)
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
@@ -259,9 +256,8 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
 
 
 def test_renderers_that_cannot_are_unsupported(tmp_path):
-    blind = Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True))
-    with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
-        measured(tmp_path, blind)
+    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
+        measured(tmp_path, Blind())
     picky = Fake(capabilities=Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True))
     with pytest.raises(Unsupported, match="Fake needs a level field, not a distance field"):
         measured(tmp_path, picky)

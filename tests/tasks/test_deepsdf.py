@@ -10,6 +10,7 @@ from bench.config import load
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.tasks import prior_fit
 from bench.tasks.deepsdf import DeepSDF
 from bench.tasks.prior_fit import PriorFit
 from datasets.mesh import Mesh, extract
@@ -84,7 +85,12 @@ def ball(wall) -> Scene:
 
 
 @each("task", [replace(SETTINGS, code=CodePenalty(0.0, "sum"), optimiser=OptimiserSettings(60, 0.02, "cosine")), FIT])
-def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(ball, tmp_path_factory, task):
+def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(
+    ball, tmp_path_factory, monkeypatch, task
+):
+    asked = []
+    gradients = prior_fit.autograd_gradients
+    monkeypatch.setattr(prior_fit, "autograd_gradients", lambda f, points: asked.append(points) or gradients(f, points))
     run = run_of(tmp_path_factory.mktemp("run"), RENDERER, PRIOR, ball.view.camera, make_scene=lambda: ball)
     task.execute(replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=500))))
     record, images = run.record, run.folder / "images.npz"
@@ -96,5 +102,6 @@ def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(
         assert 0 < record.metrics["floor_chamfer_l2"] < record.metrics_start["chamfer_l2"]
         assert record.metrics["slope_median"] == pytest.approx(1.0, abs=0.25)
         assert record.metrics["distance_error"] < 0.012
+        assert Truth(ball.mesh).distance(asked[0].numpy()).max() < prior_fit.NEAR + 1e-4
         with np.load(images) as arrays:
             assert arrays["normals"].shape == (8, 8, 3)

@@ -14,7 +14,7 @@ from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import Unsupported
 from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
-from bench.tasks.pose_icp import PoseICP
+from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.scene import Scene
 from renderers.fields.analytic import box
 from renderers.silhouette import Own
@@ -162,6 +162,12 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.metrics["rotation_error_deg"] < 4.0
     assert run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
+
+
+def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
+    points = world_points(scene.view, CAMERA)
+    assert len(points) == int(scene.view.mask.sum())
+    assert box(SIZES)(points).abs().max() < 1e-4
 
 
 def test_points_that_never_come_near_are_told(run):
