@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,47 +22,35 @@ OUTLINE = "#e5007d"
 NAMED = 5  # photographs that fit worst
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How the visual hull fits the masks.
+def hull_fit(capture: Capture) -> tuple[list[Bool[np.ndarray, "height width"]], list[float]]:
+    """The silhouettes of the visual hull, and their intersection over union with the mask of each photograph."""
+    silhouettes = [seen.numpy() for seen in hull_views(capture.shots, hull_mesh(capture.shots, SAMPLES))]
+    pairs = zip(silhouettes, capture.shots, strict=True)
+    return silhouettes, [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in pairs]
 
-    Args:
-        silhouettes: of the hull, for each photograph.
-        overlaps: intersection over union with its mask.
-    """
 
-    silhouettes: list[Bool[np.ndarray, "height width"]]
-    overlaps: list[float]
-
-    @staticmethod
-    def of(capture: Capture) -> "Fit":
-        """The fit of all photographs, which have masks."""
-        silhouettes = [seen.numpy() for seen in hull_views(capture.shots, hull_mesh(capture.shots, SAMPLES))]
-        pairs = zip(silhouettes, capture.shots, strict=True)
-        return Fit(silhouettes, [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in pairs])
-
-    def lines(self, capture: Capture) -> list[str]:
-        """The fit in words."""
-        middle, order = float(np.median(self.overlaps)), np.argsort(self.overlaps)
-        found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD:.0%} and more is good)"]
-        worst = [place for place in order[:NAMED] if self.overlaps[place] < DOUBTFUL]
-        if worst:
-            named = ", ".join(f"{capture.shots[place].name} {self.overlaps[place]:.0%}" for place in worst)
-            found.append(f"note: least in {named}: look at their masks and cameras")
-        if middle < DOUBTFUL:
-            found.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
-        return found
+def told(overlaps: list[float], capture: Capture) -> list[str]:
+    """The fit of the visual hull in words."""
+    middle, order = float(np.median(overlaps)), np.argsort(overlaps)
+    found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD:.0%} and more is good)"]
+    worst = [place for place in order[:NAMED] if overlaps[place] < DOUBTFUL]
+    if worst:
+        named = ", ".join(f"{capture.shots[place].name} {overlaps[place]:.0%}" for place in worst)
+        found.append(f"note: least in {named}: look at their masks and cameras")
+    if middle < DOUBTFUL:
+        found.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
+    return found
 
 
 @rc_context(SCREEN)
-def draw(capture: Capture, fit: Fit | None) -> Figure:
+def draw(capture: Capture, silhouettes: list[Bool[np.ndarray, "height width"]], overlaps: list[float]) -> Figure:
     """Photographs, evenly spaced and the one that fits worst, with the unit sphere; the hull over the masks below."""
     chosen = np.linspace(0, len(capture.shots) - 1, min(MOST, len(capture.shots))).round().astype(int)
-    if fit is not None and (worst := int(np.argmin(fit.overlaps))) not in chosen:
+    if overlaps and (worst := int(np.argmin(overlaps))) not in chosen:
         chosen[np.abs(chosen - worst).argmin()] = worst
     shots = [capture.shots[place] for place in chosen]
-    figure = Figure(figsize=(1.6 * len(shots), 2.0 if fit is None else 3.6), layout="constrained")
-    axes = figure.subplots(1 if fit is None else 2, len(shots), squeeze=False)
+    figure = Figure(figsize=(1.6 * len(shots), 3.6 if overlaps else 2.0), layout="constrained")
+    axes = figure.subplots(2 if overlaps else 1, len(shots), squeeze=False)
     figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs; the line is the unit sphere")
     for axis, shot in zip(axes[0], shots, strict=True):
         bare(axis).imshow(shot.colours.numpy())
@@ -71,11 +58,11 @@ def draw(capture: Capture, fit: Fit | None) -> Figure:
         within = sphere_span(shot.camera.rays())[2].numpy()
         if within.any() and not within.all():
             axis.contour(within, [0.5], colors=OUTLINE, linewidths=0.8)
-    if fit is not None:
+    if overlaps:
         for axis, place in zip(axes[1], chosen, strict=True):
-            picture = silhouette_image(fit.silhouettes[place], np.asarray(capture.shots[place].mask))
+            picture = silhouette_image(silhouettes[place], np.asarray(capture.shots[place].mask))
             bare(axis).imshow(picture, interpolation="nearest")
-            axis.set_title(f"overlap {fit.overlaps[place]:.0%}")
+            axis.set_title(f"overlap {overlaps[place]:.0%}")
         axes[1, 0].set_ylabel("hull and mask")
         figure.supxlabel("grey both, red mask without hull, blue hull without mask")
     return figure
@@ -94,16 +81,16 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
         capture = read_capture(given.folder, longest=given.longest, masks=not given.without_masks, axes=given.axes)
-        fit = Fit.of(capture) if capture.masks else None
-        draw(capture, fit).savefig(into, dpi=110)
+        silhouettes, overlaps = hull_fit(capture) if capture.masks else ([], [])
+        draw(capture, silhouettes, overlaps).savefig(into, dpi=110)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(capture.summary)
     for note in capture.notes:
         print(f"note: {note}")
-    if fit is not None:
-        print("\n".join(fit.lines(capture)))
+    if overlaps:
+        print("\n".join(told(overlaps, capture)))
     print(into)
     return 0
 

@@ -37,14 +37,9 @@ RADIUS = 1.1  # scene units, of the sphere that holds the others: rays start on 
 
 @dataclass(eq=False)
 class Fitted:
-    """A candidate during its fit.
+    """A candidate during its fit: the model that it began with, its current field, and its result and cost so far.
 
-    Args:
-        candidate: the candidate.
-        previous: the model that it began with, if any.
-        model: its current field.
-        renderer: through which it is fitted, with its own measured thickness where it follows the shape.
-        evidence: its result and cost so far.
+    It is fitted through a renderer with its own measured thickness where that follows the shape.
     """
 
     candidate: Candidate
@@ -61,23 +56,14 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Fitter:
-    """Fits candidates to the same observations.
-
-    Args:
-        observations: given and held-out rays.
-        settings: of the fits.
-        seed: of all random draws.
-        device: of the fits.
-        on_line: called after each iteration with the candidate's name and a line of the curve.
-        part: of the run that the lines belong to.
-    """
+    """Fits candidates to the same observations; `on_line` gets a candidate's name and each line of its curve."""
 
     observations: RayObservations
     settings: FitSettings
     seed: int
     device: torch.device
     on_line: Callable[[str, dict[str, Any]], None]
-    part: str = "growth"
+    part: str = "growth"  # of the run that the lines belong to
     spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by phase
 
     def begin(self, candidate: Candidate, previous: Model | None, *, evaluate: bool = True) -> Fitted:
@@ -90,7 +76,7 @@ class Fitter:
         seen = Seen(points.cpu(), previous, self.seed, self.device)
         models = candidate.starts(seen)
         placing = time.perf_counter() - started
-        target = previous.frozen() if candidate.follows and previous is not None else None
+        target = None if previous is None or not candidate.follows else Meter(previous.frozen(), seen.counts)
         known, count = (points, self.observations.free, target), self.settings.warm_points
         starts = [
             (self._fitted(candidate, model, previous), WarmStart(model, *known, count, self.seed)) for model in models
@@ -105,9 +91,8 @@ class Fitter:
             setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in spent))
         fitted.evidence.seconds += placing
         if previous is not None:
-            counted = [seen.counts, *(start.target_counts for _, start in starts)]
-            fitted.evidence.evaluations += sum(counts.value for counts in counted)
-            fitted.evidence.flops += sum(counts.flops(previous.frozen()) or 0 for counts in counted)
+            fitted.evidence.evaluations += seen.counts.value
+            fitted.evidence.flops += seen.counts.flops(previous.frozen()) or 0
         if evaluate:
             self._evaluate(fitted)
         return fitted
@@ -232,7 +217,6 @@ class WarmStart:
     count: int
     seed: int
     counts: Counts = field(default_factory=Counts)
-    target_counts: Counts = field(default_factory=Counts)  # of evaluations of the target
     phase: ClassVar[str] = "warm start"
 
     @torch.no_grad()
@@ -254,7 +238,7 @@ class WarmStart:
         if self.target is not None:
             points = scattered(self.surface, self.count, draw)
             with torch.no_grad():
-                wanted = Meter(self.target, self.target_counts)(points)
+                wanted = self.target(points)
             return near_surface_first((shape(points) - wanted).abs(), wanted, SURFACE_WIDTH).mean()
         off = shape(_some(self.surface, self.count, draw)).abs().mean()
         inside = (-shape(_some(self.free, self.count, draw))).clamp_min(0).mean()

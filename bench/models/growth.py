@@ -66,9 +66,8 @@ class Growth:
     """The result of early growth.
 
     Args:
-        fitted: the final candidate, fitted completely.
         first, initial_error: the field of the first candidate after its warm start, and its held-out error.
-        tried: every candidate that was tried, in order, as far as it was fitted.
+        tried: every candidate, in order, as far as it was fitted.
         footprint: half a pixel, in scene units, under which growth ends.
         end: why no larger candidate was tried, where the error is above the footprint.
         fields: of the candidates that were kept, by name, in order; the last one after its whole fit.
@@ -107,11 +106,6 @@ def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) 
 
     Growth ends where the error is below the footprint or patience ends; candidates whose trial would exceed the budget
     are skipped.
-
-    Args:
-        fitter: fits the candidates.
-        candidates: the smallest first.
-        settings: of trials, patience and budget.
     """
     whole, footprint = fitter.settings.iterations, fitter.observations.footprint
     short = min(max(ceil(settings.trial * whole), MIN_TRIAL), ceil(whole / 4))

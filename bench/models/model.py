@@ -43,7 +43,6 @@ class Size:
         return getattr(self, measure)
 
     def __str__(self) -> str:
-        """The numbers in words."""
         return f"{self.stored:,} numbers" + (f", {self.free:,} of them free" if self.free < self.stored else "")
 
 
@@ -53,8 +52,7 @@ class Model:
 
     Args:
         candidate: its name.
-        parameters: that are fitted.
-        make: gives the field of such parameters.
+        make: gives the field of parameters.
         learning_rate: of Adam, for these parameters.
         metric: whether the values are distances or bounds by construction; else an eikonal term keeps them so.
         held: number of stored values in addition to the parameters.
@@ -134,7 +132,6 @@ class Evidence:
 
     Args:
         candidate: its name.
-        size: its free and its stored numbers.
         flops_per_query: floating-point operations per value.
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.

@@ -31,8 +31,6 @@ class RayObservations:
     """Rays of one or more views in one row: some are held out, and an iteration draws from the others.
 
     Args:
-        given: all rays that are not held out.
-        held_out: the other rays.
         rays: number drawn in an iteration.
         seed: of the draws, which are the same for every candidate.
     """
@@ -136,16 +134,7 @@ def hold_out(
 
 @dataclass(frozen=True)
 class Views:
-    """Makes views of a shape from all around.
-
-    Args:
-        truth: of the shape.
-        sampler: the distance, field of view and resolution of the cameras.
-        settings: numbers of views and rays.
-        weights: of a view's loss.
-        renderer: compares fields with the views.
-        device: of the rays.
-    """
+    """Makes views of a shape from all around, by cameras at the distance and field of view of `sampler`."""
 
     truth: Truth
     sampler: ViewSampler

@@ -19,8 +19,7 @@ class CheckSettings:
 
     Args:
         views: number of further views.
-        seeds: number of random draws from them.
-        drawn: views in each draw.
+        seeds: number of random draws of `drawn` of them.
     """
 
     views: int
@@ -65,11 +64,7 @@ def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSetti
 def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: float) -> Evidence:
     """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
 
-    Args:
-        chosen: the candidate.
-        fitter: that fitted it.
-        renderer: at pixel precision; the fit is evaluated as all others are.
-        fewest_rays: share of the rays that it begins with.
+    The renderer is at pixel precision; the fit begins with a share of the rays, and is evaluated as all others are.
     """
     settings = replace(fitter.settings, fewest_rays=fewest_rays)
     frugal = replace(
@@ -108,10 +103,7 @@ def shares(
 def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
     """The smallest candidate within one standard error of the best (Breiman et al. 1984), or under the footprint.
 
-    Args:
-        evidence: of all candidates.
-        footprint: half a pixel (DIST, Eq. 10), in scene units.
-        measure: of size, see `models.size`.
+    The footprint is half a pixel (DIST, Eq. 10), in scene units; size is by a measure of `models.size`.
 
     Raises:
         ValueError: where all fits failed.

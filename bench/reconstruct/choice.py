@@ -115,7 +115,6 @@ class AutoField:
             sizes: the free numbers of each candidate.
             subject: all photographs; those that are held out are not used.
             settings: of the whole run.
-            run: whose progress is reported.
         """
         aside, rest = subject.given[::ASIDE], [shot for place, shot in enumerate(subject.given) if place % ASIDE]
         part, device = replace(subject, given=tuple(rest)), run.inputs.device

@@ -134,7 +134,8 @@ def _against(view: View, image: Float[Tensor, "height width 3"], shot: Shot) -> 
     judged, known = judged_pixels(shot)
     found, true = (image * judged[..., None]).numpy(), (shot.colours * known[..., None]).numpy()
     error = float(((found - true) ** 2).sum()) / max(3 * int(judged.sum()), 1)
-    similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=_window(true.shape))
+    window = min(7, (min(true.shape[:2]) - 1) // 2 * 2 + 1)  # in tiny images an odd number below 7
+    similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=window)
     overlap = nan if shot.mask is None else mask_iou(view.mask.numpy(), shot.mask.numpy())
     return {"psnr": -10 * log10(error) if error else inf, "ssim": float(similar), "mask_iou": overlap}
 
@@ -145,8 +146,3 @@ def judged_pixels(shot: Shot) -> tuple[Bool[Tensor, "height width"], Bool[Tensor
         return torch.ones_like(shot.mask), shot.mask
     meets = sphere_span(shot.camera.rays())[2]
     return meets, meets
-
-
-def _window(shape: tuple[int, ...]) -> int:
-    """Side of the window of structural similarity: 7 pixels, an odd number below that in tiny images."""
-    return min(7, (min(shape[:2]) - 1) // 2 * 2 + 1)

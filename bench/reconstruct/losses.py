@@ -56,13 +56,13 @@ class Losses:
             check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
 
     def __call__(self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels) -> Terms:
-        """The weighted terms.
+        """The weighted terms and their sum, `total`.
 
         Args:
             renderer: at the current iteration.
             shape: with gradients towards its parameters.
             metered: the same, counted.
-            pixels: that are compared; for `colour_gradient` in groups of four, see `Pixels.drawn`.
+            pixels: that are compared; for `colour_gradient` in groups of four, see `Stack.drawn`.
         """
         rendering = rendered(renderer, metered, pixels.rays)
         inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask

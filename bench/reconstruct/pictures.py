@@ -72,16 +72,7 @@ def note_surface(
 def draw_picture(
     folder: Path, mesh: Mesh, given: Float[Tensor, "4 height width"], camera: Camera, size: int, title: str
 ) -> None:
-    """Writes summary.png: a picture of one's own, and the shape from the view that is most alike and from others.
-
-    Args:
-        folder: of the run.
-        mesh: the shape, with colours.
-        given: the picture as the encoder is given it.
-        camera: the view that is most alike.
-        size: pixels of a rendering.
-        title: of the picture.
-    """
+    """Writes summary.png: a picture as the encoder is given it, and a mesh from the most alike and from other views."""
     seen = painter(mesh)
     camera = camera.resized(size, size)
     views = [seen(turned(camera, angle)) for angle in (0.0, np.pi / 2, np.pi)]

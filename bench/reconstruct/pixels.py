@@ -58,13 +58,7 @@ class Stack:
 
     @staticmethod
     def of(shots: Sequence[Shot], guide: Sequence[Float[Tensor, "_ _"]] | None, device: torch.device) -> "Stack":
-        """The pixels of photographs that are alike in what is known of them.
-
-        Args:
-            shots: the photographs.
-            guide: distances of each, for `Pixels.guide`.
-            device: of all tensors.
-        """
+        """The pixels of photographs that are alike in what is known of them; `guide` has the distances of each."""
         ones = [shot.camera.depth(torch.ones(shot.colours.shape[:2])) for shot in shots]
         rays = [shot.camera.rays().flat() for shot in shots]
         together = Rays(torch.cat([one.origins for one in rays]), torch.cat([one.directions for one in rays]))

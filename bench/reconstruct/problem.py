@@ -31,25 +31,14 @@ Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `f
 
 @dataclass
 class ReconstructionProblem:
-    """The problem of learning a field with colours.
-
-    Args:
-        subject: the photographs.
-        stack: all given pixels.
-        model: that is learnt.
-        losses: of its renderings.
-        renderer: that is under test.
-        rays: that are drawn in each iteration.
-        iterations: their number.
-        seed: of what is drawn.
-    """
+    """The problem of learning a field with colours, from pixels that are drawn anew in each of `iterations`."""
 
     subject: Subject
     stack: Stack
     model: Learnt
     losses: Losses
     renderer: Renderer
-    rays: int
+    rays_per_iteration: int
     iterations: int
     seed: int
     counts: Counts = field(default_factory=Counts)
@@ -58,11 +47,6 @@ class ReconstructionProblem:
     def parameters(self) -> list[Tensor]:
         """The parameters of the field and its colours."""
         return list(self.model.parameters())
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """The drawn pixels."""
-        return self.rays
 
     @property
     def tracked(self) -> tuple[str, ...]:
@@ -113,7 +97,8 @@ class ReconstructionProblem:
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum, over pixels that are drawn anew in each iteration."""
         patches = self.losses.colour_gradient > 0
-        pixels = self.stack.drawn(self.rays, patches=patches, seed=self.seed * self.iterations + iteration)
+        seed = self.seed * self.iterations + iteration
+        pixels = self.stack.drawn(self.rays_per_iteration, patches=patches, seed=seed)
         shape = self.model.field
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
 

@@ -142,13 +142,10 @@ def _zero_based(camera: Camera) -> Float[np.ndarray, "3 3"]:
 
 def _within(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Points in the unit sphere that no mask excludes."""
-    inside = np.linalg.norm(points, axis=1) < 1
+    places, inside = torch.from_numpy(points).float(), torch.from_numpy(np.linalg.norm(points, axis=1) < 1)
     for shot in shots:
         if shot.mask is not None:
-            pixels, depth = shot.camera.project(torch.from_numpy(points).float())
-            column, row = pixels.floor().long().unbind(-1)
-            there = (depth > 0) & (column >= 0) & (row >= 0) & (column < shot.camera.width) & (row < shot.camera.height)
-            outside = there.clone()
-            outside[there] = ~shot.mask[row[there], column[there]]
-            inside &= ~outside.numpy()
-    return inside
+            shown, (height, width) = shot.camera.shows(places), shot.mask.shape
+            columns, rows = shot.camera.project(places[shown])[0].long().unbind(-1)
+            inside[shown] &= shot.mask[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
+    return inside.numpy()

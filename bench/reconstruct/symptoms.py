@@ -64,10 +64,7 @@ def roughness(surface: Surface) -> float | None:
 def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict[str, float]:
     """The metric of `WEIGHT`; none of a renderer that sees hits alone, and none where no ray hits.
 
-    Args:
-        field: that is rendered.
-        views: of its mesh, by exact first hits.
-        inputs: with the renderer.
+    The views are of the field's mesh, by exact first hits.
     """
     shares: list[Float[torch.Tensor, " rays"]] = []
     for view in views:

@@ -39,14 +39,8 @@ class Recipe:
     """What determines a network.
 
     Args:
-        dataset: of its shapes.
         shapes: number of training shapes.
         views: images of each that are used, the first of those that are rendered.
-        imaging: of their images.
-        network: its sizes.
-        supervision: what it may know.
-        training: of it.
-        renderer: through which it is trained.
         settings: all of these as plain data, without what changes no weight.
     """
 

@@ -107,15 +107,7 @@ class Failed(ValueError):
 
 @dataclass(frozen=True)
 class Lessons:
-    """A training: the images of the training shapes, what it may know of them, and how they are compared.
-
-    Args:
-        images: of the training shapes.
-        supervision: what it may know.
-        renderer: through which shapes are compared with images.
-        settings: of the training.
-        device: of the training.
-    """
+    """A training: the images of the training shapes, what it may know of them, and how they are compared."""
 
     images: Sequence[ImagesOf]
     supervision: Supervision

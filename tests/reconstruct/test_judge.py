@@ -48,12 +48,6 @@ def inputs(tmp_path):
     return replace(inputs, evaluation=replace(inputs.evaluation, grid=48, points=2000))
 
 
-def without_masks(subject: Subject) -> Subject:
-    """The same in front of black, which is known no more."""
-    black = [replace(shot, colours=shot.colours * shot.mask[..., None], mask=None) for shot in subject.held_out]
-    return replace(subject, held_out=tuple(black))
-
-
 def test_the_truth_scores_high(subject, inputs):
     found = judge(painted(), subject, inputs)
     assert found.failure is None and set(found.metrics) == OF_HITS
@@ -82,16 +76,6 @@ def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
     expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])  # of three colours one is wrong
     assert metrics["own_psnr"] == pytest.approx(expected, abs=0.01)
     assert metrics["own_ssim"] < 0.999 and metrics["own_mask_iou"] == 1.0
-
-
-def test_without_masks_psnr_is_over_what_lies_in_the_unit_sphere_and_there_is_no_overlap(subject, inputs):
-    metrics = judge(painted(red=0.2), without_masks(subject), inputs).metrics
-    shares = [shot.mask.sum() / sphere_span(shot.camera.rays())[2].sum() for shot in subject.held_out]
-    assert metrics["own_psnr"] == pytest.approx(np.mean([-10 * log10(0.2**2 * s / 3) for s in shares]), abs=0.01)
-    assert not {*MASK_IOU, *(OWN + name for name in MASK_IOU)} & set(metrics)
-    assert set(metrics) == OF_HITS - {*MASK_IOU, *(OWN + name for name in MASK_IOU)}
-    exact = judge(painted(), without_masks(subject), inputs).metrics
-    assert exact["own_psnr"] > 60
 
 
 def test_the_seen_part_is_judged_alone(subject, inputs):

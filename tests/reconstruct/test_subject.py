@@ -19,7 +19,7 @@ from bench.reconstruct.subject import (
 from bench.tasks.surfaces import Hull
 from datasets.mesh import Mesh
 from datasets.photographs import around
-from datasets.scene import Scene, Truth, sample_surface, see
+from datasets.scene import Scene, Truth, see
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
@@ -96,24 +96,6 @@ def test_depths_have_noise_of_the_standard_deviation():
 def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
     shots = tuple(shot_of(ball(), camera) for camera in cameras)
     return Subject(shots, (), surface, "").seen(surface, points)
-
-
-def test_of_a_sphere_the_side_towards_the_cameras_is_seen():
-    surface = icosphere(0.6)
-    points, _ = sample_surface(surface, 3000, 0)
-    cameras = [camera_of(16), camera_of(16, angles=(120.0, 30.0))]
-    expected, near = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-    for camera in cameras:
-        centre = camera.center.numpy().astype(float)
-        height = points @ centre / np.linalg.norm(centre)
-        rim = 0.6**2 / np.linalg.norm(centre)  # of the part that is seen
-        expected |= height > rim
-        near |= np.abs(height - rim) < 0.1  # where a point lies behind the first hit by less than `ON_SURFACE`
-    found = seen_by(*cameras, surface=surface, points=points)
-    assert near.mean() < 0.5 and 0.2 < expected.mean() < 0.8
-    assert np.array_equal(found[~near], expected[~near])
-    alone = seen_by(cameras[0], surface=surface, points=points)
-    assert alone.sum() < found.sum() and not (alone & ~found).any()
 
 
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():

@@ -197,7 +197,7 @@ def test_one_that_was_stopped_ends_with_the_same_weights(images, renderer, tmp_p
 
 
 def recipe(renderer, **changed) -> Recipe:
-    settings = replace(SETTINGS, steps=3, **changed)
+    settings = replace(SETTINGS, steps=4, **changed)
     return Recipe(Balls(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
 
 
@@ -206,16 +206,16 @@ def test_a_step_that_is_no_number_keeps_the_last_state_and_has_a_record(renderer
 
     def spoilt(self, model, step, counts):
         loss = give(self, model, step, counts)
-        return float("nan") if step == 2 else loss
+        return float("nan") if step == 3 else loss
 
     monkeypatch.setattr(Lessons, "give", spoilt)
     made = recipe(renderer)
-    with pytest.raises(Failed, match=r"number at step 2; the state after 2 steps is in .*: lower task\.training"):
+    with pytest.raises(Failed, match=r"number at step 3; the state after 2 steps is in .*: lower task\.training"):
         made.make(tmp_path, CPU, silent)
     assert list(tmp_path.glob("single_view-*.state")) and made.find(tmp_path) is None
     (path,) = tmp_path.glob("single_view-*.json")
     record = json.loads(path.read_text())
-    assert record["status"] == "nan" and "not a number at step 2" in record["reason"]
+    assert record["status"] == "nan" and "not a number at step 3" in record["reason"]
 
 
 def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path, monkeypatch):
