@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from bench.evaluate.evaluate import mask_iou
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from datasets.captures.capture import AXES, Capture, read_capture
 from datasets.captures.hull import hull_mesh, hull_views
+from datasets.own_photographs import AXES, Capture, read_capture
 from renderers.camera import sphere_span
 
 MOST = 8  # photographs in the picture

@@ -23,7 +23,6 @@ READ_ERRORS = (  # what trimesh raises on broken files; it has no exception of i
     RuntimeError, TypeError, ValueError, struct.error,
 )  # fmt: skip
 GREY = 0.7  # of parts without colours, beside parts that have some
-UNUSED = 0.1  # share of the vertices that no face uses: in a whole .obj next to none, in one without its end many
 
 
 def find_meshes(path: str | Path) -> list[Path]:
@@ -77,8 +76,6 @@ def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = No
 def read_mesh(path: str | Path) -> Mesh:
     """All triangles of a file, placed by its scene's transforms, open or closed and not repaired, with their colours.
 
-    Its `repairs` have a warning where the file may be truncated.
-
     Raises:
         ValueError: the file is missing, empty, truncated or broken, or holds no surface.
     """
@@ -94,39 +91,19 @@ def read_mesh(path: str | Path) -> Mesh:
 
 def check_counts(path: Path, vertices: int, faces: int) -> None:
     """Refuses an .off or a .ply that holds less than its header claims: trimesh reads what is left of a cut file."""
-    if path.suffix.lower() not in (".off", ".ply"):
+    suffix = path.suffix.lower()
+    if suffix not in (".off", ".ply"):
         return
     header = path.read_bytes().partition(b"end_header")[0].decode("ascii", "replace")
-    claims = {"vertices": 0, "faces": 0}
-    if path.suffix.lower() == ".off":
-        numbers = re.findall(r"\d+", re.sub("#.*", "", header))
-        claims = {"vertices": int(numbers[0]), "faces": int(numbers[1])}
-    elif path.suffix.lower() == ".ply":
+    if suffix == ".off":
+        claims = [int(number) for number in re.findall(r"\d+", re.sub("#.*", "", header))[:2]]
+    else:
         found = dict(re.findall(r"element (vertex|face) (\d+)", header))
-        claims = {"vertices": int(found.get("vertex", 0)), "faces": int(found.get("face", 0))}
-    if vertices < claims["vertices"] or faces < claims["faces"]:
-        claimed = f"its header claims {claims['vertices']} vertices and {claims['faces']} faces"
-        what = f"must be a whole {path.suffix.lower()} file, but it is truncated: {claimed}"
+        claims = [int(found.get(name, 0)) for name in ("vertex", "face")]
+    if vertices < claims[0] or faces < claims[1]:
+        claimed = f"its header claims {claims[0]} vertices and {claims[1]} faces"
+        what = f"must be a whole {suffix} file, but it is truncated: {claimed}"
         raise ValueError(f"{what}, and it holds {vertices} and {faces}; export or copy it again")
-
-
-def _doubts(path: Path) -> tuple[str, ...]:
-    """A warning where many vertices of an .obj are in no face: it has no header that would count its faces."""
-    if path.suffix.lower() != ".obj":
-        return ()
-    text = path.read_bytes().decode("ascii", "replace")
-    vertices, named = 0, set()
-    for line in re.sub(r"\\\r?\n", " ", text).splitlines():
-        kind, *words = line.split() or [""]
-        if kind == "v":
-            vertices += 1
-        elif kind in ("f", "l", "p"):
-            corners = [int(word.split("/")[0]) for word in words]
-            named.update(corner if corner > 0 else vertices + 1 + corner for corner in corners)
-    unused = vertices - len(named)
-    if unused <= UNUSED * vertices:
-        return ()
-    return (f"warning: {unused} of {vertices} vertices are in no face: the file may be truncated",)
 
 
 def _read(path: Path) -> Mesh:
@@ -152,7 +129,7 @@ def _read(path: Path) -> Mesh:
     check_counts(path, sum(map(len, vertices)), sum(map(len, faces)))
     offsets = np.cumsum([0] + [len(part) for part in vertices[:-1]])
     joined = np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=True)])
-    mesh = Mesh(np.concatenate(vertices), joined, _doubts(path), _painted(vertices, colours))
+    mesh = Mesh(np.concatenate(vertices), joined, colours=_painted(vertices, colours))
     if mesh.area <= FLAT * mesh.diagonal**2:
         raise ValueError(
             f"must have an area, found {mesh.area:.3g} in a box {mesh.diagonal:.3g} across; "

@@ -1,13 +1,52 @@
-"""A folder of one's own photographs as a dataset: one object, whose true shape is not known."""
+"""One's own photographs as a dataset: one object, moved into the unit sphere, whose true shape is not known."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from datasets.captures.capture import AXES, Capture, read_capture
+import numpy as np
+
+from datasets.captures.formats import OPENGL, find_layout
+from datasets.captures.hull import Sphere, sphere_of
+from datasets.captures.take import take
 from datasets.mesh import Mesh
 from datasets.scene import Split
-from renderers.checks import BadInput, check_choice
+from datasets.shot import Shot
+from renderers.checks import BadInput, check_at_least, check_choice
+
+AXES = {"stated": np.eye(4), "flipped": OPENGL}
+FEWEST = 3  # photographs
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs of one object, which lies in the unit sphere.
+
+    Args:
+        format: of the folder.
+        shots: the photographs, by name.
+        masks: where the masks come from, in words; empty without masks.
+        sphere: which part of the file's world became the unit sphere.
+        notes: what was left out or changed.
+    """
+
+    format: str
+    shots: tuple[Shot, ...]
+    masks: str
+    sphere: Sphere
+    notes: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """What was found, in one sentence."""
+        sizes = sorted({(shot.camera.width, shot.camera.height) for shot in self.shots})
+        pixels = " and ".join(f"{width} x {height}" for width, height in sizes)
+        masks = f"masks from {self.masks}" if self.masks else "no masks"
+        place = ", ".join(f"{value:.3g}" for value in self.sphere.centre)
+        return (
+            f"{self.format}: {len(self.shots)} photographs of {pixels} pixels, {masks}; the unit sphere has its centre "
+            f"at ({place}) and radius {self.sphere.radius:.3g}, {self.sphere.found}"
+        )
 
 
 @runtime_checkable
@@ -57,3 +96,46 @@ class OwnPhotographs:
     def identity(self) -> dict[str, Any]:
         """The folder; runs are told apart by the contents of its files."""
         return {"name": "photos", "path": self.path, "masks": self.masks, "axes": self.axes}
+
+
+def read_capture(
+    folder: Path, *, longest: int, masks: bool = True, axes: str = "stated", held_out: int | None = None
+) -> Capture:
+    """Reads the photographs of a folder.
+
+    Args:
+        folder: in one of the formats of `formats`.
+        longest: most pixels of a photograph's longer side; larger ones are made smaller.
+        masks: whether masks are used where there are any.
+        axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
+        held_out: of so many photographs one, from the first on, has no part in finding the sphere; None: all have.
+
+    Raises:
+        BadInput: where something is missing, or cameras and masks do not fit.
+    """
+    check_at_least("longest", longest, 8, "128 shows what there is")
+    check_choice("axes", axes, tuple(AXES))
+    layout = find_layout(folder)
+    if len(layout.frames) < FEWEST:
+        raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
+    frames = [replace(frame, world_to_camera=AXES[axes] @ frame.world_to_camera) for frame in layout.frames]
+    shots = [take(frame, longest) for frame in frames]
+    lacking = [shot.name for shot in shots if shot.mask is None]
+    if masks and 0 < len(lacking) < len(shots):
+        raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
+    masked = masks and not lacking
+    shots = shots if masked else [replace(shot, mask=None) for shot in shots]
+    if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
+        raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
+    given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
+    sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(given)
+    largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
+    whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
+    source = "files" if frames[0].mask is not None else "the alpha channel"
+    return Capture(
+        layout.format,
+        tuple(shot.within(sphere.centre, sphere.radius) for shot in shots),
+        source if masked else "",
+        sphere,
+        (*layout.notes, *whole),
+    )

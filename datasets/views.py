@@ -1,7 +1,7 @@
 """Positions of cameras, and the pixels of a view whose depth is given."""
 
 from dataclasses import dataclass
-from math import asin, atan2, degrees, inf, radians, tan
+from math import asin, atan2, degrees, inf, nan, radians, tan
 
 import numpy as np
 import torch
@@ -120,16 +120,12 @@ def parse_amount(points: str | int) -> tuple[float, bool]:
     Raises:
         ValueError: for anything else.
     """
-    text, remedy = str(points).strip(), 'write "dense", a share such as "10%", or a number such as 100'
-    if text == "dense":
-        return 1.0, True
+    text = "100%" if points == "dense" else str(points).strip()
     is_share = text.endswith("%")
     try:
         value = float(text.removesuffix("%")) / 100 if is_share else float(int(text))
     except ValueError:
-        raise ValueError(f"points must be an amount, not {text!r}: {remedy}") from None
-    if not value > 0:
-        raise ValueError(f"points must be positive, not {text!r}: {remedy}")
-    if is_share and value > 1:
-        raise ValueError(f"points must be at most 100%, not {text!r}: {remedy}")
+        value = nan
+    if not value > 0 or (is_share and value > 1):
+        raise ValueError(f'points must be "dense", a share up to "100%", or a number such as 100, not {text!r}')
     return value, is_share

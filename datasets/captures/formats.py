@@ -138,11 +138,10 @@ def idr(folder: Path) -> Layout | None:
             f"{lost[0]} has no camera: {files[0].name} has {count} cameras, and there are {len(images)} images; "
             "remove those without a camera, or add its world_mat and scale_mat"
         )
-    masks = _matched(images, _images(folder, "mask", "masks"))
+    masks = _masks(folder, images)
     frames = [Frame(image, *decomposed(projections[i]), masks.get(image)) for i, image in place.items()]
-    unused = [str(i) for i in range(count) if i not in place]
-    notes = (f"no image for cameras {', '.join(unused)}",) if unused else ()
-    return Layout("IDR/NeuS", tuple(frames), (np.zeros(3), 1.0) if scaled else None, notes)
+    unused = [f"camera {i}" for i in range(count) if i not in place]
+    return Layout("IDR/NeuS", tuple(frames), (np.zeros(3), 1.0) if scaled else None, _without_image(unused))
 
 
 def transforms(folder: Path) -> Layout | None:
@@ -150,18 +149,11 @@ def transforms(folder: Path) -> Layout | None:
     files = [file for name in ("transforms.json", "transforms_train.json") if (file := folder / name).is_file()]
     if not files:
         return None
-    try:
-        stored = json.loads(files[0].read_text())
-        listed = [stored | frame for frame in stored["frames"]]
-        found = [(frame, _with_suffix(folder / frame["file_path"])) for frame in listed]
-        frames = [_nerf_frame(folder, frame, image) for frame, image in found if image is not None]
-    except BadInput:
-        raise
-    except (LookupError, TypeError, ValueError) as error:
-        raise BadInput(f"{files[0]} cannot be read ({type(error).__name__}: {error}): export it again") from error
+    stored = json.loads(files[0].read_text())
+    found = [(stored | frame, _with_suffix(folder / frame["file_path"])) for frame in stored["frames"]]
+    frames = [_nerf_frame(folder, frame, image) for frame, image in found if image is not None]
     missing = [str(frame["file_path"]) for frame, image in found if image is None]
-    notes = (f"{len(missing)} images are not there, such as {missing[0]}",) if missing else ()
-    return Layout("NeRF", tuple(sorted(frames, key=lambda frame: _order(frame.image))), None, notes)
+    return Layout("NeRF", tuple(sorted(frames, key=lambda frame: _order(frame.image))), None, _without_image(missing))
 
 
 def _nerf_frame(folder: Path, known: dict[str, Any], image: Path) -> Frame:
@@ -187,7 +179,7 @@ def middlebury(folder: Path) -> Layout | None:
         return None
     frames, missing = [], []
     images = {image.name: image for image in _images(folder, ".")}
-    masks = _matched(list(images.values()), _images(folder, "mask", "masks"))
+    masks = _masks(folder, list(images.values()))
     for line in files[0].read_text().splitlines()[1:]:
         name, *numbers = line.split()
         if len(numbers) != 21:
@@ -200,8 +192,7 @@ def middlebury(folder: Path) -> Layout | None:
             missing.append(name)
     if lost := sorted(set(images) - {frame.image.name for frame in frames}):
         raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
-    notes = (f"no image for {', '.join(missing)}",) if missing else ()
-    return Layout("Middlebury", tuple(frames), None, notes)
+    return Layout("Middlebury", tuple(frames), None, _without_image(missing))
 
 
 def llff(folder: Path) -> Layout | None:
@@ -215,7 +206,7 @@ def llff(folder: Path) -> Layout | None:
             f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)} and {len(images)} "
             "images: copy the images that were removed, or make it again"
         )
-    masks, frames = _matched(images, _images(folder, "mask", "masks")), []
+    masks, frames = _masks(folder, images), []
     for image, row in zip(images, rows, strict=True):
         pose = row[:15].reshape(3, 5)
         down, right, back, centre, (height, width, focal) = pose.T
@@ -237,7 +228,7 @@ def colmap(folder: Path) -> Layout | None:
         raise BadInput(f"{places[0]} is read by pycolmap: {install('colmap')}") from error
     stored = pycolmap.Reconstruction(str(places[0]))
     images = {image.name: image for image in _images(folder, "images", "images_2", "images_4", "images_8")}
-    masks, frames, missing = _matched(list(images.values()), _images(folder, "mask", "masks")), [], []
+    masks, frames, missing = _masks(folder, list(images.values())), [], []
     for seen in sorted(stored.images.values(), key=lambda one: one.name):
         camera, name = stored.cameras[seen.camera_id], Path(seen.name).name
         model = camera.model.name
@@ -251,8 +242,8 @@ def colmap(folder: Path) -> Layout | None:
         image, size, motion = images[name], (camera.height, camera.width), _motion(matrix[:, :3], matrix[:, 3])
         frames.append(Frame(image, camera.calibration_matrix(), motion, masks.get(image), size, _distortion(bent)))
     points = np.array([point.xyz for point in stored.points3D.values()])
-    notes = (f"no image for {', '.join(missing)}",) if missing else ()
-    return Layout("COLMAP", tuple(frames), _about(points) if len(points) else None, notes)
+    sphere = _about(points) if len(points) else None
+    return Layout("COLMAP", tuple(frames), sphere, _without_image(missing))
 
 
 def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "4 4"]]:
@@ -308,19 +299,26 @@ def _numbered(images: list[Path]) -> dict[int, Path]:
     return {int(found[-1]): image for image in images if (found := re.findall(r"\d+", image.stem))}
 
 
-def _matched(images: list[Path], masks: list[Path]) -> dict[Path, Path]:
-    """The mask of each image: of the same name, or else the same last number.
+def _masks(folder: Path, images: list[Path]) -> dict[Path, Path]:
+    """The mask of each image in the folder of masks: of the same name, or else the same last number.
 
     Raises:
         BadInput: where there are masks, but an image has none.
     """
-    if not masks:
-        return {}
+    masks = _images(folder, "mask", "masks")
     by_name, by_number = {mask.stem: mask for mask in masks}, _numbered(masks)
-    found = {image: by_name.get(image.stem) or by_number.get(next(iter(_numbered([image])), -1)) for image in images}
-    if lacking := [image for image, mask in found.items() if mask is None]:
-        raise BadInput(f"{lacking[0]} has no mask in {masks[0].parent}: add it, or remove the folder of masks")
-    return {image: mask for image, mask in found.items() if mask is not None}
+    found = {}
+    for image in images if masks else []:
+        mask = by_name.get(image.stem) or by_number.get(next(iter(_numbered([image])), -1))
+        if mask is None:
+            raise BadInput(f"{image} has no mask in {masks[0].parent}: add it, or remove the folder of masks")
+        found[image] = mask
+    return found
+
+
+def _without_image(names: list[str]) -> tuple[str, ...]:
+    """A note on cameras whose image is not there; none where all are."""
+    return (f"no image for {len(names)} of the cameras, such as {names[0]}",) if names else ()
 
 
 def _with_suffix(path: Path) -> Path | None:

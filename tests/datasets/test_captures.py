@@ -10,13 +10,12 @@ import torch
 from PIL import Image
 
 from bench.photos import main
-from datasets.captures.capture import Capture, read_capture
-from datasets.captures.formats import OPENGL, decomposed, find_layout
+from datasets.captures.formats import OPENGL, find_layout
 from datasets.captures.hull import hull_mesh, hull_views
 from datasets.captures.take import take
+from datasets.own_photographs import read_capture
 from datasets.views import look_at
 from renderers.camera import Camera
-from renderers.fields.analytic import sphere
 
 CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
 SIZE = 40, 48  # height and width
@@ -118,38 +117,48 @@ def colmap(folder: Path) -> None:
         (folder / "sparse" / "0" / f"{name}.txt").write_text(text)
 
 
-FORMATS = {"IDR/NeuS": idr, "NeRF": nerf, "Middlebury": middlebury, "COLMAP": colmap}
+def llff(folder: Path) -> None:
+    """Cameras of images four times as large, whose principal point is in the middle."""
+    write_images(folder, "images_4")
+    rows = []
+    for camera in cameras():
+        right, down, forward, centre = camera.camera_to_world.double().numpy()[:3].T
+        pose = np.stack([down, right, -forward, centre, 4 * np.array([*SIZE, FOCAL])], axis=1)
+        rows.append([*pose.flatten(), 0.5, 3.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
 
 
-def found(capture: Capture) -> np.ndarray:
-    """The hull's vertices in the world of the files, from the ball's centre."""
-    hull = hull_mesh(capture.shots, 64)
-    assert hull is not None
-    return hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE
+FORMATS = {"IDR/NeuS": idr, "NeRF": nerf, "Middlebury": middlebury, "COLMAP": colmap, "LLFF": llff}
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_ball_is_where_it_is(tmp_path, name):
+def test_cameras_are_those_that_were_written(tmp_path, name):
     FORMATS[name](tmp_path)
     capture = read_capture(tmp_path, longest=48)
     assert (capture.format, len(capture.shots), capture.notes) == (name, 10, ())
     assert name in capture.summary and "48 x 40 pixels, masks from" in capture.summary
     for shot, camera in zip(capture.shots, cameras(), strict=True):
-        torch.testing.assert_close(shot.camera.intrinsics, camera.intrinsics, rtol=0, atol=1e-3)
-        moved = shot.within(-capture.sphere.centre / capture.sphere.radius, 1 / capture.sphere.radius)
-        stated = capture.format == "IDR/NeuS"  # whose scale_mat is part of its cameras
-        if not stated:
+        intrinsics = camera.intrinsics.clone()
+        if name == "LLFF":
+            intrinsics[:2, 2] = torch.tensor([SIZE[1] / 2, SIZE[0] / 2])
+        torch.testing.assert_close(shot.camera.intrinsics, intrinsics, rtol=0, atol=1e-3)
+        if name != "IDR/NeuS":  # whose scale_mat is part of its cameras
+            moved = shot.within(-capture.sphere.centre / capture.sphere.radius, 1 / capture.sphere.radius)
             torch.testing.assert_close(moved.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-4)
-    if not capture.sphere.found.startswith("as"):
-        vertices = found(capture)
-        assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).max() < 0.06  # a pixel is .025 wide there
-        assert np.abs(vertices.mean(axis=0)).max() < 0.02
-        assert np.linalg.norm(capture.sphere.centre - CENTRE) + RADIUS < capture.sphere.radius < 1.4 * RADIUS
-    covered = [
-        float((seen & shot.mask).sum() / shot.mask.sum())
-        for shot, seen in zip(capture.shots, hull_views(capture.shots, hull_mesh(capture.shots, 64)), strict=True)
-    ]
-    assert min(covered) > 0.9
+
+
+def test_the_ball_is_where_it_is_and_its_hull_no_smaller(tmp_path):
+    nerf(tmp_path)
+    capture = read_capture(tmp_path, longest=48)
+    hull = hull_mesh(capture.shots, 64)
+    assert hull is not None and hull.watertight
+    vertices = hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE
+    distances = np.linalg.norm(vertices, axis=1)
+    assert np.abs(distances - RADIUS).max() < 0.06  # a pixel is .025 wide there
+    assert distances.min() > RADIUS - 0.02 and np.abs(vertices.mean(axis=0)).max() < 0.02
+    assert np.linalg.norm(capture.sphere.centre - CENTRE) + RADIUS < capture.sphere.radius < 1.4 * RADIUS
+    for shot, seen in zip(capture.shots, hull_views(capture.shots, hull), strict=True):
+        assert (seen & shot.mask).sum() > 0.9 * shot.mask.sum()
 
 
 def test_the_unit_sphere_of_idr_is_that_of_its_scale_mat(tmp_path):
@@ -161,113 +170,78 @@ def test_the_unit_sphere_of_idr_is_that_of_its_scale_mat(tmp_path):
     np.testing.assert_allclose(np.ptp(hull.vertices, axis=0), 2 * RADIUS / 0.5, atol=0.1)
 
 
-def test_llff_has_axes_down_right_and_backward_and_a_camera_for_another_size(tmp_path):
-    write_images(tmp_path, "images_4")
-    rows = []
-    for camera in cameras():
-        world = camera.camera_to_world.double().numpy()
-        right, down, forward, centre = world[:3].T
-        pose = np.stack([down, right, -forward, centre, np.array([4.0 * SIZE[0], 4.0 * SIZE[1], 4.0 * FOCAL])], axis=1)
-        rows.append([*pose.flatten(), 0.5, 3.0])
-    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
-    layout = find_layout(tmp_path)
-    assert layout.format == "LLFF"
-    for frame, camera in zip(layout.frames, cameras(), strict=True):
-        np.testing.assert_allclose(frame.world_to_camera, camera.world_to_camera.numpy(), atol=1e-5)
-        assert take(frame, 48).camera.intrinsics[0, 0].item() == pytest.approx(FOCAL)
-    (tmp_path / "images_4" / "003.png").unlink()
-    with pytest.raises(ValueError, match=r"found shape \[10, 17\] and 9 images"):
-        find_layout(tmp_path)
-
-
-def test_a_projection_is_taken_apart_whatever_its_scale_and_sign():
-    camera = cameras()[4]
-    for factor in (1.0, -2.5):
-        intrinsics, motion = decomposed(factor * whole(camera) @ camera.world_to_camera.double().numpy()[:3])
-        np.testing.assert_allclose(intrinsics, camera.intrinsics.numpy(), atol=1e-4)
-        np.testing.assert_allclose(motion, camera.world_to_camera.numpy(), atol=1e-6)
-
-
 def test_a_photograph_is_made_smaller_with_its_camera_and_never_larger(tmp_path):
     nerf(tmp_path)
-    frame = find_layout(tmp_path).frames[0]
-    small, large = take(frame, 24), take(frame, 1000)
-    assert (small.camera.height, small.camera.width, small.colours.shape) == (20, 24, (20, 24, 3))
-    torch.testing.assert_close(small.camera.intrinsics[:2], large.camera.intrinsics[:2] / 2)
-    assert (large.camera.height, large.camera.width) == SIZE
-    assert large.colours[0, 0].tolist() == [1.0, 1.0, 1.0]  # transparent is white
+    small, large = (read_capture(tmp_path, longest=longest) for longest in (24, 4096))
+    assert large.notes == ("the photographs have at most 48 pixels, not 4096",) and small.notes == ()
+    assert small.shots[0].colours.shape == (20, 24, 3) and large.shots[0].colours.shape == (*SIZE, 3)
+    torch.testing.assert_close(small.shots[0].camera.intrinsics[:2], large.shots[0].camera.intrinsics[:2] / 2)
+    assert large.shots[0].colours[0, 0].tolist() == [1.0, 1.0, 1.0]  # transparent is white
 
 
 def test_distortion_is_taken_out(tmp_path):
-    """A straight bar that a lens has bent by half a pixel is straight again."""
-    bend, side, fine, focal = 0.15, 60, 8, 50.0
-    ends = ((np.arange(side * fine) + 0.5) / fine - side / 2) / focal
-    y, x = np.meshgrid(ends, ends, indexing="ij")
-    straight_x, straight_y = x, y
-    for _ in range(30):  # where a bent pixel comes from
-        square = straight_x**2 + straight_y**2
-        straight_x, straight_y = x / (1 + bend * square), y / (1 + bend * square)
-    bar = (np.abs(straight_x - 0.3) < 0.05).reshape(side, fine, side, fine).mean(axis=(1, 3))
-
-    def spread(picture: np.ndarray) -> float:
-        return float(np.ptp(picture[5:55] @ np.arange(side) / picture[5:55].sum(axis=1)))
-
-    Image.fromarray(np.round(255 * np.repeat(bar[..., None], 3, axis=-1)).astype(np.uint8)).save(tmp_path / "0.png")
-    stored = {"fl_x": focal, "w": side, "h": side, "k1": bend}
+    """Each pixel of a ramp says where it was taken from; OpenCV finds the same places."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
+    bent, side = {"k1": 0.15, "k2": -0.08, "p1": 0.03, "p2": -0.05}, 60
+    intrinsics = np.array([[50.0, 0, 31], [0, 48.0, 28], [0, 0, 1]])
+    rows, columns = np.mgrid[:side, :side] + 0.5
+    ramp = np.dstack([4 * columns, 4 * rows, 0 * rows]).astype(np.uint8)
+    Image.fromarray(ramp).save(tmp_path / "0.png")
+    stored = {"fl_x": 50.0, "fl_y": 48.0, "cx": 31.0, "cy": 28.0, "w": side, "h": side, **bent}
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({**stored, "frames": [frame]}))
-    shot = take(find_layout(tmp_path).frames[0], 60)
-    straight = shot.colours[..., 0].numpy()
-    assert spread(bar) > 0.4 and spread(straight) < 0.12
-    assert straight[30] @ (np.arange(side) + 0.5) / straight[30].sum() == pytest.approx(30 + 0.3 * focal, abs=0.1)
+    found = take(find_layout(tmp_path).frames[0], side).colours.numpy()[..., :2] * 255 / 4
+    rays = np.stack([(columns - 31) / 50, (rows - 28) / 48, np.ones_like(rows)], axis=-1).reshape(-1, 3)
+    numbers = np.array([*bent.values()])
+    places = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), intrinsics, numbers)[0].reshape(side, side, 2)
+    inside = ((places > 1) & (places < side - 1)).all(axis=-1)
+    assert inside.mean() > 0.8 and np.abs(places - np.dstack([columns, rows]))[inside].max() > 2
+    np.testing.assert_allclose(found[inside], places[inside], atol=0.01)
 
 
-def spoilt(folder: Path, how: str) -> None:
-    """Writes the ball in IDR's format, with a mistake."""
-    idr(folder)
-    if how == "image missing":
-        (folder / "image" / "000004.png").unlink()
-    elif how == "image without camera":
-        shutil.copy(folder / "image" / "000004.png", folder / "image" / "000010.png")
-    elif how == "mask missing":
-        (folder / "mask" / "004.png").unlink()
-    elif how == "mask of another size":
-        Image.new("L", (10, 10)).save(folder / "mask" / "004.png")
-    elif how == "empty mask":
-        Image.new("L", SIZE[::-1]).save(folder / "mask" / "004.png")
-    elif how == "broken image":
-        (folder / "image" / "000004.png").write_bytes(b"no image")
-    elif how == "no numbers":
-        np.savez(folder / "cameras_sphere.npz", **{f"world_mat_{i}": np.full((4, 4), np.nan) for i in range(10)})
-    elif how == "broken cameras":
-        (folder / "cameras_sphere.npz").write_bytes(b"no archive")
-    elif how == "gap in the cameras":
-        with np.load(folder / "cameras_sphere.npz") as stored:
-            known = {name: stored[name] for name in stored if name != "world_mat_0"}
-        np.savez(folder / "cameras_sphere.npz", **known)
-    elif how == "no images":
-        shutil.rmtree(folder / "image")
-    elif how == "no cameras":
-        (folder / "cameras_sphere.npz").unlink()
+def without_first_camera(folder: Path) -> None:
+    with np.load(folder / "cameras_sphere.npz") as stored:
+        known = {name: stored[name] for name in stored if name != "world_mat_0"}
+    np.savez(folder / "cameras_sphere.npz", **known)
 
 
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ("image without camera", ("000010.png has no camera", "has 10 cameras, and there are 11 images", "remove")),
-        ("mask missing", ("000004.png has no mask in", "add it, or remove the folder")),
-        ("mask of another size", ("004.png has 10 x 10 pixels, its image 48 x 40",)),
-        ("empty mask", ("the mask of 000004.png is empty", "use no masks")),
-        ("broken image", ("000004.png cannot be read as an image", "copy or export it again")),
-        ("no numbers", ("idr cameras of", "cannot be read", "export them again")),
-        ("broken cameras", ("idr cameras of", "cannot be read", "export them again")),
-        ("gap in the cameras", ("idr cameras of", "world_mat_0", "export them again")),
-        ("no images", ("has cameras (IDR/NeuS) but none of their images",)),
-        ("no cameras", ("has no cameras that are known", "transforms.json", "poses_bounds.npy")),
-    ],
-)
-def test_what_cannot_be_used_is_told_in_one_line(tmp_path, capsys, how, words):
-    spoilt(tmp_path, how)
+def no_numbers(folder: Path) -> None:
+    np.savez(folder / "cameras_sphere.npz", **{f"world_mat_{i}": np.full((4, 4), np.nan) for i in range(10)})
+
+
+MISTAKES = {  # in the ball in IDR's format, and what is said of them
+    "image without camera": (
+        lambda f: shutil.copy(f / "image" / "000004.png", f / "image" / "000010.png"),
+        ("000010.png has no camera", "has 10 cameras, and there are 11 images", "remove"),
+    ),
+    "mask missing": (lambda f: (f / "mask" / "004.png").unlink(), ("000004.png has no mask in", "add it, or remove")),
+    "mask of another size": (
+        lambda f: Image.new("L", (10, 10)).save(f / "mask" / "004.png"),
+        ("004.png has 10 x 10 pixels, its image 48 x 40",),
+    ),
+    "empty mask": (
+        lambda f: Image.new("L", SIZE[::-1]).save(f / "mask" / "004.png"),
+        ("the mask of 000004.png is empty", "use no masks"),
+    ),
+    "broken image": (
+        lambda f: (f / "image" / "000004.png").write_bytes(b"no image"),
+        ("000004.png cannot be read as an image", "copy or export it again"),
+    ),
+    "no numbers": (no_numbers, ("idr cameras of", "cannot be read", "export them again")),
+    "gap in the cameras": (without_first_camera, ("idr cameras of", "world_mat_0", "export them again")),
+    "no images": (lambda f: shutil.rmtree(f / "image"), ("has cameras (IDR/NeuS) but none of their images",)),
+    "no cameras": (
+        lambda f: (f / "cameras_sphere.npz").unlink(),
+        ("has no cameras that are known", "transforms.json", "poses_bounds.npy"),
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_cannot_be_used_is_told_in_one_line(tmp_path, capsys, mistake):
+    spoil, words = MISTAKES[mistake]
+    idr(tmp_path)
+    spoil(tmp_path)
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 2
     out, err = capsys.readouterr()
     assert out == "" and len(err.splitlines()) == 1
@@ -275,12 +249,30 @@ def test_what_cannot_be_used_is_told_in_one_line(tmp_path, capsys, how, words):
 
 
 def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
-    spoilt(tmp_path, "image missing")
+    idr(tmp_path)
+    (tmp_path / "image" / "000004.png").unlink()
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
     out = capsys.readouterr().out
-    assert "9 photographs" in out and "note: no image for cameras 4" in out
+    assert "9 photographs" in out and "note: no image for 1 of the cameras, such as camera 4" in out
     assert int(out.split("overlap by ")[1].split("%")[0]) > 90
     assert (tmp_path / "photos.png").stat().st_size > 10_000
+
+
+def test_a_folder_of_another_format_too_and_broken_ones_are_told(tmp_path):
+    nerf(tmp_path)
+    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))
+    assert find_layout(tmp_path).notes == ("other cameras in the folder are not used: IDR/NeuS",)
+    stored = json.loads((tmp_path / "transforms.json").read_text())
+    angle = {name: value for name, value in stored.items() if name != "fl_x"} | {"camera_angle_x": 39.6}
+    flat = stored | {"frames": [frame | {"transform_matrix": [[1.0, 0.0], [0.0, 1.0]]} for frame in stored["frames"]]}
+    for broken, words in ((angle, "between 0 and pi, not 39.6: it is in radians"), (flat, "cannot be read")):
+        (tmp_path / "transforms.json").write_text(json.dumps(broken))
+        with pytest.raises(ValueError, match=words):
+            find_layout(tmp_path)
+    llff(tmp_path / "rows")
+    (tmp_path / "rows" / "images_4" / "003.png").unlink()
+    with pytest.raises(ValueError, match=r"found shape \[10, 17\] and 9 images"):
+        find_layout(tmp_path / "rows")
 
 
 def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
@@ -303,28 +295,6 @@ def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "note: least in 000007.png" in out and out.splitlines()[-1] == str(tmp_path / "a" / "b.png")
     assert (tmp_path / "a" / "b.png").is_file()
-
-
-def test_of_two_formats_the_one_with_images_is_taken_and_the_other_named(tmp_path):
-    nerf(tmp_path)
-    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))
-    capture = read_capture(tmp_path, longest=48)
-    assert capture.format == "NeRF" and capture.notes == ("other cameras in the folder are not used: IDR/NeuS",)
-
-
-@pytest.mark.parametrize("key", ["camera_angle_x", "transform_matrix"])
-def test_broken_transforms_are_told(tmp_path, key):
-    nerf(tmp_path)
-    stored = json.loads((tmp_path / "transforms.json").read_text())
-    if key == "camera_angle_x":
-        del stored["fl_x"]
-        stored[key] = 39.6
-    else:
-        stored["frames"][3][key] = [[1.0, 0.0], [0.0, 1.0]]
-    (tmp_path / "transforms.json").write_text(json.dumps(stored))
-    words = "between 0 and pi, not 39.6: it is in radians" if key == "camera_angle_x" else "cannot be read"
-    with pytest.raises(ValueError, match=words):
-        read_capture(tmp_path, longest=48)
 
 
 def test_images_of_16_bits_turned_images_and_masks_of_labels_are_read(tmp_path):
@@ -370,24 +340,3 @@ def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
     assert all(shot.mask is None for shot in capture.shots) and "no masks" in capture.summary
     np.testing.assert_allclose(capture.sphere.centre, CENTRE, atol=1e-3)
     assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
-
-
-def test_a_hull_is_no_smaller_than_the_ball(tmp_path):
-    nerf(tmp_path)
-    capture = read_capture(tmp_path, longest=48)
-    hull = hull_mesh(capture.shots, 64)
-    assert hull is not None
-    place = torch.from_numpy((CENTRE - capture.sphere.centre) / capture.sphere.radius).float()
-    ball = sphere(RADIUS / capture.sphere.radius, tuple(place.tolist()))
-    assert hull.watertight and ball(torch.from_numpy(hull.vertices).float()).min() > -0.05
-
-
-def test_photographs_that_are_smaller_than_was_asked_for_are_told(tmp_path):
-    nerf(tmp_path)
-    small = read_capture(tmp_path, longest=16)
-    assert not any("pixels, not" in note for note in small.notes)
-    size = max(small.shots[0].colours.shape)
-    assert size == 16
-    whole = read_capture(tmp_path, longest=4096)
-    largest = max(max(shot.colours.shape) for shot in whole.shots)
-    assert whole.notes[-1] == f"the photographs have at most {largest} pixels, not 4096"

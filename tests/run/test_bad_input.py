@@ -150,7 +150,7 @@ def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
     ("renderer=custom", ("renderer._target_ must be given", "renderer._target_=PACKAGE.CLASS")),
     ("view.azimuth=3", ("view.azimuth must be a list of 2, not 3",)),
     ("models.candidates=sphere", ("models.candidates must be a list", ": write models.candidates=[sphere]")),
-    ("task.points=0", ("points must be positive, not '0'", "dense")),
+    ("task.points=0", ('points must be "dense", a share', "not '0'")),
     ("split=tst", ("split must be one of train, validation, test, not 'tst'",)),
     ("index=1000000", ("index must be at most 999999, not 1000000",)),
     ("time_limit=0", ("time_limit must be positive",)),
