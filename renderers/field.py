@@ -285,26 +285,8 @@ def points_in_ball(count: int) -> Float[Tensor, "count 3"]:
     return torch.rand(count, 1, **draws) ** (1 / 3) * direction
 
 
-@runtime_checkable
-class Occupancy(Protocol):
-    """Points [*batch, 3] to logits [*batch] of the probability p of being inside: any callable."""
-
-    def __call__(self, points: Float[Tensor, "*batch 3"], /) -> Float[Tensor, "*batch"]: ...
-
-
 @dataclass(frozen=True)
-class _OccupancyField:
-    logits: Occupancy
-    level: float
-    flops: Flops | None
-    kind: Kind = Kind.LEVEL
-    lipschitz: float | None = None
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self.level - self.logits(points)
-
-
-def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None = None) -> Field:
+class OccupancyField:
     """The level set p = threshold (DVR, Sec. 3.1) as a field: logit(threshold) - logit(p), negative where p is above.
 
     Args:
@@ -312,10 +294,19 @@ def occupancy_field(logits: Occupancy, threshold: float, *, flops: Flops | None 
         threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
         flops: operations per point, where that is known.
     """
-    if not 0 < threshold < 1:
-        raise ValueError(f"threshold must lie between 0 and 1, not {threshold}: DVR uses 0.5")
-    level = log(threshold / (1 - threshold))
-    return _OccupancyField(logits, level, flops)  # pyright: ignore[reportReturnType] (it is frozen)
+
+    logits: Values
+    threshold: float
+    flops: Flops | None = None
+    kind: Kind = Kind.LEVEL
+    lipschitz: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold < 1:
+            raise ValueError(f"threshold must lie between 0 and 1, not {self.threshold}: DVR uses 0.5")
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return log(self.threshold / (1 - self.threshold)) - self.logits(points)
 
 
 def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:

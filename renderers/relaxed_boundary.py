@@ -57,7 +57,6 @@ class RelaxedBoundary(SurfaceRenderer):
         return self.band
 
     def with_blur(self, blur: float) -> "RelaxedBoundary":
-        """See `Blurred`."""
         return replace(self, band=blur)
 
     def render(self, field: Field, rays: Rays) -> Rendering:

@@ -49,7 +49,6 @@ class Own:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`."""
         return boundary.silhouette_loss(renderer, field, rays, rendering, observed)
 
 
@@ -79,7 +78,6 @@ class Hinge:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`."""
         loss = self.of_rendering(field, rays, rendering, observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
         return loss
@@ -136,7 +134,6 @@ class CrossEntropy:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`."""
         wanted = ~(observed.mask & rendering.hit)
         loss = self.of(replace(rendering, closest=closest_values(field, rays, rendering, wanted)), observed.mask)
         boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
@@ -215,7 +212,6 @@ class Occupancy:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
     ) -> Float[Tensor, ""]:
-        """See `SilhouetteLoss`."""
         return self.of(field, rays, rendering, observed)
 
     def of(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:

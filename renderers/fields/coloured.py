@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Flops, Kind, occupancy_field
+from renderers.field import Field, Flops, Kind, OccupancyField
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import CHUNK
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
@@ -184,10 +184,9 @@ class OccupancyOf:
         return self.bound.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return occupancy_field(self.bound.logits, THRESHOLD)(points)
+        return OccupancyField(self.bound.logits, THRESHOLD)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        """See `Coloured`."""
         return self.bound.colours(points)
 
 
@@ -234,7 +233,6 @@ class ColouredGrid(nn.Module):
         return Grid(self.distances, self.reach)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        """See `Coloured`."""
         places = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
         sampled = torch.nn.functional.grid_sample(self.logits[None], places, padding_mode="border", align_corners=True)
         return torch.sigmoid(COLOUR_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))

@@ -48,7 +48,7 @@ class OccupancyNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class BoundOccupancy:
-    """An occupancy network at one code. It is no Field: `field.occupancy_field` makes one of its logits."""
+    """An occupancy network at one code. It is no Field: `field.OccupancyField` makes one of its logits."""
 
     network: OccupancyNetwork
     shifts: tuple[Tensor, ...]

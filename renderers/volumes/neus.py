@@ -65,7 +65,6 @@ class NeuS(VolumeRenderer):
         return 1 / self.sharpness
 
     def with_blur(self, blur: float) -> "NeuS":
-        """See `Blurred`."""
         return replace(self, sharpness=1 / blur, sharpening=0)
 
     def at_iteration(self, iteration: int) -> "NeuS":

@@ -76,7 +76,6 @@ class VolSDF(VolumeRenderer):
         return self.width
 
     def with_blur(self, blur: float) -> "VolSDF":
-        """See `Blurred`."""
         return replace(self, width=blur, sharpening=0)
 
     def at_iteration(self, iteration: int) -> "VolSDF":

@@ -302,6 +302,12 @@ def test_a_least_step_brings_a_grazing_ray_to_its_surface():
     assert floored.distance.item() == pytest.approx(1.5, abs=2e-3)
 
 
+def test_values_are_divided_by_the_slope_before_a_step_is_made_of_them():
+    steep = Shape(lambda points: 4 * sphere(0.5)(points))
+    assert marched(steep, HEAD_ON, replace(PLAIN, slope=4.0)).distance.item() == pytest.approx(1.5, abs=1e-4)
+    assert marched(steep, HEAD_ON, PLAIN).status.item() != Status.HIT
+
+
 def test_relaxed_steps_are_fewer_and_find_the_same():
     """Also next to an outline, where most steps are spent."""
     rays, counts = camera_of(48).double().rays(), {}

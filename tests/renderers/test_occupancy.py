@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Flops, Kind, occupancy_field, occupancy_logits
+from renderers.field import Flops, Kind, OccupancyField, occupancy_logits
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.occupancy import OccupancyNetwork
 from tests.looped import each
@@ -98,7 +98,7 @@ def test_the_field_of_an_occupancy_is_negative_where_the_probability_exceeds_the
     def logits(points: Tensor) -> Tensor:
         return torch.tensor([0.1, 0.3, 0.6], dtype=points.dtype).logit()
 
-    low, half = occupancy_field(logits, 0.2), occupancy_field(logits, 0.5)
+    low, half = OccupancyField(logits, 0.2), OccupancyField(logits, 0.5)
     points = torch.zeros(3, 3, dtype=torch.float64)
     assert (low(points) < 0).tolist() == [False, True, True]
     assert (half(points) < 0).tolist() == [False, False, True]
@@ -108,7 +108,7 @@ def test_the_field_of_an_occupancy_is_negative_where_the_probability_exceeds_the
     assert (low.kind, low.lipschitz, low.flops) == (Kind.LEVEL, None, None)
     for threshold in (0.0, 1.0, float("nan")):
         with pytest.raises(ValueError, match="threshold must lie between 0 and 1"):
-            occupancy_field(logits, threshold)
+            OccupancyField(logits, threshold)
 
 
 @each("field, factor", [(sphere(0.5), 4.0), (BOUND, 4.0), (LEVEL, 1.0)])
