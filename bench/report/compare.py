@@ -14,8 +14,8 @@ from bench.pictures import style
 from bench.records import format
 from bench.records.read import read_plans
 from bench.report.data import statistics
-from bench.report.data.records import RunKey, by_shape
-from bench.report.data.runs import Runs
+from bench.report.data.records import RunKey, by_shape, error, setting, shape
+from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
 from bench.report.write import chart
 from bench.report.write.result import Result
@@ -36,6 +36,9 @@ RATIO = (
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
 CONDITION = "task.points"  # over which tables have columns
 ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
+PRIORS = Selection("priors")
+ORACLE = "oracle: the prior's fit to the truth"
+FITTED = "The oracle is a code fitted to the distances of the true mesh (`+experiment=priors`), of all of these shapes."
 Line = dict[str, Any]
 
 
@@ -339,7 +342,7 @@ class Compared:
             if name in marks:
                 lines.append(chart.level(mark, places, marks[name]))
                 lines.append(chart.level("1.5 times that", places, 1.5 * marks[name], dash=":"))
-            panels.append(chart.panel_data(name, "", self.label, lines, self.conditions))
+            panels.append(chart.panel_data(name, "", self.label, lines, ticks=self.conditions))
         height = -(-len(panels) // 4)
         return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 
@@ -359,3 +362,23 @@ def heading(condition: str) -> str:
 
 def _end(found: Gap | None, end: str) -> float:
     return math.nan if found is None else getattr(found.ratio, end)
+
+
+def oracles(runs: Runs, metric: str, scale: float = 1000.0) -> dict[str, float]:
+    """The median Chamfer, times `scale`, of the prior's fit, of each family of which all shapes were fitted.
+
+    The fits must have been judged as the runs were: with the same split, prior, grid and number of points.
+    """
+    fits = runs.other(PRIORS)
+    if fits is None or _judged(fits.requested()) != _judged(runs.requested()):
+        return {}
+    found = {shape(record): scale * error(record, metric) for record in fits.records}
+    wanted = {name: {shape(record) for record in records} for name, records in runs.families().items()}
+    complete = {name: shapes for name, shapes in wanted.items() if shapes <= set(found)}
+    return {name: float(statistics.median([found[one] for one in shapes])) for name, shapes in complete.items()}
+
+
+def _judged(config: dict[str, Any]) -> list[Any]:
+    """The settings on which an evaluation depends."""
+    paths = (("split",), ("prior",), ("evaluation", "grid"), ("evaluation", "points"))
+    return [setting(config, *path) for path in paths]

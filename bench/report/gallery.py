@@ -32,6 +32,7 @@ SHAPES = tuple(kind + part for kind in (START, FOUND, TRUE) for part in ("normal
 FRONT, BEHIND = 0, 1  # its views
 REFERENCE = ("normals", "reference_normals", "hit", "reference_hit")  # see `bench.pictures.run_figures.save_images`
 COUNTED = ("size", "hits", "lost", "false", "angle_median", "angle_p99", "angle_max")
+JUDGED = "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged"  # of notes
 Arrays = dict[str, np.ndarray]
 Window = tuple[float, float, float]  # see `style.window`
 Paint = Callable[[Arrays], Sequence[np.ndarray]]  # a picture [height, width, 3] per view; none without a surface

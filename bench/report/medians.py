@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.pictures import style
 from bench.records import format, metrics
 from bench.report.data.records import Record, family, index
 from bench.report.data.runs import Runs
@@ -63,39 +61,24 @@ def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | No
     return {line["method"]: line[name] for line in lines if line["runs"] == most}
 
 
-@style.styled
 def draw_runs(runs: Runs, panels: Mapping[str, pd.Series], *, log: bool = True) -> Figure:
     """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
         runs: of the rows.
-        panels: of each measure its values by the label of its axis; nan is not drawn, infinite is a cross at the edge.
-        log: whether an axis whose values differ by more than a factor of five is logarithmic.
+        panels: of each measure its values by the label of its axis; nan is not drawn, infinite is at the edge.
+        log: whether an axis whose values differ by a factor is logarithmic.
     """
-    rows = list(runs.rows())
-    figure, (axes,) = chart.sheet(0.19 * len(rows) + 0.9, 1, len(panels), sharey=True)
-    for axis, (label, values) in zip(axes, panels.items(), strict=True):
+    rows, made = list(runs.rows()), []
+    for label, values in panels.items():
+        drawn = []
         for place, row in enumerate(rows):
-            mine = ((runs.frame.row == row.name) & (runs.frame.preset == row.preset)).to_numpy() & values.notna()
-            _points(axis, place, row.preset, values[mine].to_numpy(float))
-        if log and style.needs_log(values, 5.0):
-            style.log_axis(axis, "x", values)
-        axis.set_xlabel(label)
-        axis.grid(axis="y", visible=False)
-    axes[0].set_yticks(range(len(rows)), [row.name for row in rows])
-    axes[0].set_ylim(len(rows) - 0.4, -0.6)
-    return figure
-
-
-def _points(axis: Axes, place: int, preset: str, values: np.ndarray) -> None:
-    where, known = _spread(place, len(values)), np.isfinite(values)
-    chart.points(axis, preset, values[known], where[known], ms=3.5, alpha=0.8)
-    lost = where[~known]
-    chart.points(axis, preset, [0.99] * len(lost), lost, marker="x", transform=axis.get_yaxis_transform())
-    middle = float(median(values)) if len(values) > 1 else np.inf
-    if np.isfinite(middle):
-        axis.plot([middle, middle], [place - 0.38, place + 0.38], color="#222222", lw=1.2)
-
-
-def _spread(place: int, count: int) -> np.ndarray:
-    return place + np.linspace(-0.25, 0.25, count) if count > 1 else np.full(count, float(place))
+            mine = values[(runs.frame.row == row.name) & (runs.frame.preset == row.preset)].dropna().to_numpy(float)
+            spread = np.linspace(-0.25, 0.25, len(mine)) if len(mine) > 1 else np.zeros(len(mine))
+            drawn.append(chart.series(row.name, row.preset, mine, place + spread))
+            if len(mine) > 1 and np.isfinite(middle := float(median(mine))):
+                drawn.append(chart.level("median", [middle] * 2, 0) | {"y": [place - 0.38, place + 0.38]})
+        panel = chart.panel_data("", label, "", drawn, rows=[row.name for row in rows])
+        panel["x"]["log"] &= log
+        made.append(panel)
+    return chart.draw(made, 0.19 * len(rows) + 0.9, legend=0, sharey=True)

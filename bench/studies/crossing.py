@@ -61,9 +61,8 @@ class Crossed:
 
     def gap(self, family: str, first: list[Setting], second: list[Setting]) -> compare.Gap | None:
         """The gap between two groups of settings; None where one of them was not run."""
-        if not {*first, *second} <= {*self.rows}:
-            return None
-        return self.found.gap_of(family, [self.rows[key] for key in first], [self.rows[key] for key in second])
+        absent = ("", "")
+        return self.found.gap_of(family, *([self.rows.get(key, absent) for key in of] for of in (first, second)))
 
 
 def crossed(runs: Runs) -> Crossed:
@@ -109,7 +108,7 @@ def draw(settings: Crossed) -> Figure:
             errors = [settings.found.error(family, row) for row in at.values()]
             drawn.append(chart.series(settings.labels[renderer], renderer, beside, errors))
         names = [settings.labels[loss].removesuffix(" mask loss") for loss in losses]
-        panels.append(chart.panel_data(family, "loss of the mask", compare.LABEL, drawn, names))
+        panels.append(chart.panel_data(family, "loss of the mask", compare.LABEL, drawn, ticks=names))
     return chart.draw(panels, 2.8, sharey=True)
 
 

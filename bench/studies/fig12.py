@@ -87,8 +87,7 @@ def pictures(runs: Runs) -> Result:
         "The shape with the least number of each family: where it began, and what each row found, over the "
         "displacement.",
         remarks=(
-            "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged, seen from the "
-            "first photograph's side.",
+            f"{gallery.JUDGED}, seen from the first photograph's side.",
             "Start: the shape of the random code, misplaced; at “known place” no similarity is optimised.",
             "DIST, Fig. 24, shows photographs of real chairs, and what PMO makes of them; these shapes are synthetic.",
             *gallery.missing(scenes.values()),

@@ -128,31 +128,27 @@ def _verdict_visible(data: pd.DataFrame) -> str:
     return f"{'; '.join(said)} (n = one shape)." if said else ""
 
 
-@style.styled
 def draw(data: pd.DataFrame) -> Figure:
     """Draws a line per renderer: the median errors of each band for code and camera, and the silhouette's numbers."""
-    names = list(dict.fromkeys(data["name"]))
-    figure, (axes,) = chart.sheet(0.2 * len(names) + 1.3, 1, 3, sharey=True)
-    places = data["name"].map(names.index)
-    for axis, of in zip(axes[:2], ("code", "camera"), strict=True):
-        for band, colour in ANGLES.items():
-            some = data["band"] == band
-            axis.plot(style.finite(data[f"{of}_median_error"][some]), places[some], "o", color=colour, label=band)
-        style.log_axis(axis, "x", data[f"{of}_median_error"][data["band"].isin(ANGLES)])
-        axis.set(title=f"gradient for the {of}", xlabel="median relative error (ratio)")
-    outline = data["band"] == OUTLINE
-    for name, marker in zip(OF_IMAGE, "DP", strict=True):
-        label = name.replace("image_", "")
-        axes[2].plot(
-            style.finite(data[name][outline]), places[outline], marker, color="#444444", label=label, ls="none"
-        )
-    axes[2].axvline(1.0, color="#555555", lw=0.8, ls=":")
-    axes[2].set(title=OUTLINE, xlabel="cosine and scale (exact: 1)", ylim=(len(names) - 0.5, -0.5))
     status = dict(zip(data["name"], data["status"], strict=True))
-    failed = {name: f"{name} ({status[name].replace('_', ' ')})" for name in names if status[name] != "ok"}
-    axes[0].set_yticks(range(len(names)), [failed.get(name, name) for name in names])
-    style.legend_below(figure, axes[0], axes[2], columns=5)
-    return figure
+    rows = [name if of == "ok" else f"{name} ({of.replace('_', ' ')})" for name, of in status.items()]
+
+    def points(name: str, column: str, band: str, colour: str, symbol: str) -> chart.Series:
+        own = data[data["band"] == band]
+        places = own["name"].map(list(status).index).tolist()
+        return {"name": name, "x": style.finite(own[column]), "y": places, "colour": colour, "symbol": symbol}
+
+    panels = []
+    for of in ("code", "camera"):
+        drawn = [points(band, f"{of}_median_error", band, colour, "o") for band, colour in ANGLES.items()]
+        panels.append(chart.panel_data(f"gradient for the {of}", "median relative error (ratio)", "", drawn, rows=rows))
+    drawn = [
+        points(name.replace("image_", ""), name, OUTLINE, "#444444", symbol)
+        for name, symbol in zip(OF_IMAGE, "DP", strict=True)
+    ]
+    panels.append(chart.panel_data(OUTLINE, "cosine and scale (exact: 1)", "", drawn, rows=rows))
+    panels[-1]["x"]["log"] = False
+    return chart.draw(panels, 0.2 * len(rows) + 1.3, legend=5, sharey=True)
 
 
 def draw_visibility(data: pd.DataFrame) -> Figure:

@@ -2,11 +2,10 @@
 
 import math
 
-from bench.report.oracle import PRIORS
-from bench.report.study import Result, Runs, format, gallery, records, statistics, table
+from bench.report.study import Result, Runs, compare, format, gallery, records, statistics, table
 
 PLACE = 70
-READS = (PRIORS,)
+READS = (compare.PRIORS,)
 SHOWN = 3  # shapes per family in the figure
 DEFINED = {
     "chamfer_l2": "Fit",

@@ -8,8 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records.read import curve_lines
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style
-from bench.report.write.table import IDENTITY, Column, text, to_data
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
@@ -47,8 +46,13 @@ NUMBERS = (
 )
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COSTS = (
-    *(text("row", "Renderer"), Column("axes"), Column("rank", "Mean rank")),
-    *(text("at_once", "At once"), text("never", "None"), Column("cost", "Field values per ray"), text("preset")),
+    *(table.text("row", "Renderer"), table.Column("axes"), table.Column("rank", "Mean rank")),
+    *(
+        table.text("at_once", "At once"),
+        table.text("never", "None"),
+        table.Column("cost", "Field values per ray"),
+        table.text("preset"),
+    ),
 )
 
 
@@ -61,20 +65,26 @@ def make(runs: Runs) -> Result:
     about = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
     about["resolution"] = records.setting(task, "resolution")
     about["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
-    table = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
-    table.insert(0, "Axis", [title(axis) for axis in axes.index])
-    table.insert(1, "Unit", list(axes["unit"]))
+    words = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
+    words.insert(0, "Axis", [title(axis) for axis in axes.index])
+    words.insert(1, "Unit", list(axes["unit"]))
     return Result(
         runs,
         "The severity at which each renderer breaks.",
         "The severity at which half of the trials succeed.",
         question="Where does each renderer break?",
-        verdict=_verdict(cells),
+        verdict=format.ends(
+            "Axes on which a renderer does not break",
+            cells.groupby("row", sort=False)["never"].sum().to_dict(),
+            f"{trials:.0f} trials on {len(axes)} axes",
+            show=table.whole,
+            most=True,
+        ),
         n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals, the milder end first",
         remarks=[note.format(**about) for note in NOTES],
         data=_data(runs, cells, axes),
-        table=table,
+        table=words,
         figure=draw(cells, axes),
         atlas=_atlas(cells, axes),
     )
@@ -97,6 +107,7 @@ def make_cost(runs: Runs) -> Result:
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
         for line in lines.dropna(subset=["cost", "rank"]).itertuples()
     ]
+    costs = [f"{line.row}, {format.number(line.cost)} field values per ray" for line in lines.itertuples()]
     panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(
@@ -104,7 +115,7 @@ def make_cost(runs: Runs) -> Result:
         "Robustness over cost.",
         "Mean rank of the breakdowns over the median, over axes, of the field values per ray at the mild end.",
         question="Is a robust renderer an expensive one?",
-        verdict=_verdict_cost(lines, len(shades)),
+        verdict=format.ends("Mean rank", dict(zip(costs, lines["rank"], strict=True)), f"{len(shades)} axes"),
         n=f"{len(shades)} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
         columns=COSTS,
@@ -223,19 +234,9 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
         for record in runs.records
     ]
     about, rows = cells[["axis", "group", "unit", "short", "full"]], list(cells["row"].unique())
-    data = pd.concat([about, to_data(IDENTITY, runs.records)], axis=1).assign(**metrics, failures=kinds)
+    data = pd.concat([about, table.to_data(table.IDENTITY, runs.records)], axis=1).assign(**metrics, failures=kinds)
     order = np.lexsort((cells["row"].map(rows.index), cells["axis"].map(axes.index.get_loc)))
     return data.iloc[order].reset_index(drop=True)
-
-
-def _verdict(cells: pd.DataFrame) -> str:
-    """On how many axes the renderers break that break most and least often."""
-    counts = cells.groupby("row", sort=False)[["never", "known"]].sum()
-    best, least = ((counts.index[i], *counts.iloc[i]) for i in (counts.never.argmax(), counts.never.argmin()))
-    return (
-        f"{best[0]} does not break on *{best[1]} of {best[2]}* axes, {least[0]} on {least[1]} of {least[2]} "
-        f"(n = {cells['trials'].sum():.0f} trials)."
-    )
 
 
 def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
@@ -283,20 +284,6 @@ def _cost(cells: pd.DataFrame, row: str, mean: float) -> dict[str, Any]:
     ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
     cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
     return {"row": row, "axes": len(cells), "rank": mean, **ends, "cost": cost}
-
-
-def _verdict_cost(lines: pd.DataFrame, axes: int) -> str:
-    """The most robust renderer and the cheapest; empty where no rank or no cost is known."""
-    known = lines.dropna(subset=["rank", "cost"])
-    if known.empty:
-        return ""
-    best, cheap = (known.loc[known[name].idxmin()] for name in ("rank", "cost"))
-    number = format.number
-    rest = f"{cheap['row']} is the cheapest: rank {number(cheap['rank'])} for {number(cheap['cost'])}"
-    return (
-        f"{best['row']} has the best mean rank, *{number(best['rank'])}* of {len(known)}, for {number(best['cost'])} "
-        f"field values per ray; {'no renderer is cheaper' if best['row'] == cheap['row'] else rest} (n = {axes} axes)."
-    )
 
 
 def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:

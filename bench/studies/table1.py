@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import pandas as pd
-
 from bench.report.study import Result, Runs, Selection, format, records, table
 from bench.report.write.table import metric
 
@@ -30,14 +28,13 @@ NOTES = (
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
 )
 _TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
-# Metrics of the CSV: at the requested size, and at a smaller one where that alone was finished.
+# Metrics of the CSV: at the requested size, and none where a smaller one alone was finished.
 MEASURED = (
     *("queries", "coarse_queries", "step_queries", "step_coarse_queries", "step_gradients", *_TIMES),
     *(f"{time}_{end}" for time in _TIMES for end in ("low", "high")),
     *("repeats", "forward_gemm", "step_gemm", "rays", "peak_memory_bytes", "hits", "lost", "false", "wrong"),
     *("depth_error_p99", "depth_error_max", "depth_error_median"),
 )
-FINISHED = ("size", "queries", "peak_memory_bytes", "hits", "lost", "false", "wrong", *_TIMES)
 
 
 def make(runs: Runs) -> Result:
@@ -46,52 +43,42 @@ def make(runs: Runs) -> Result:
     presets = [records.row_of(record).preset for record in runs.records]
     order = sorted(range(len(presets)), key=lambda i: place.get(presets[i], len(place)))
     runs = replace(runs, records=[runs.records[i] for i in order])
-    data, times = _data(runs), records.repeated(runs.records)
+    times = records.repeated(runs.records)
     return Result(
         runs,
         "The cost of each strategy of sphere tracing.",
         "Computed field values (queries), times, peak memory and errors of one rendering and its gradient"
         + (f", times as medians of {times} repeats." if times else "."),
         question="What does one rendering and its gradient cost, and what does each strategy save?",
-        verdict=_verdict(data),
+        verdict=_verdict(runs),
         remarks=NOTES,
-        data=data,
         columns=COLUMNS,
         lines=runs.named(),
+        run_columns=RUNS,
     )
 
 
-def _data(runs: Runs) -> pd.DataFrame:
-    """A line per run: what was measured at the requested size, what was published, what was finished at a smaller."""
-    requested, steps = runs.number("config.view.resolution"), runs.number("config.renderer.steps")
-    number = {
-        name: pd.Series([records.measured(r, name) for r in runs.records], dtype=float)
-        for name in {*MEASURED, *FINISHED}
-    }
-    done = number["size"] == requested
-    full = {_key(name): number[name].where(done) for name in MEASURED}
-    paper = pd.DataFrame([PUBLISHED.get(preset, (None,) * 4) for preset in runs.frame.preset], dtype=object)
-    said = {f"published_{name}": paper[at] for at, name in enumerate(("size", "steps", "queries", "time"))}
-    smaller = {f"finished_{_key(name)}": number[name].where(~done) for name in FINISHED}
-    return table.to_data(table.IDENTITY, runs.records).assign(size=requested, steps=steps, **full, **said, **smaller)
-
-
-def _key(metric: str) -> str:
-    """The column of the CSV with a metric."""
-    return metric.replace("_seconds", "_s")
-
-
-def _verdict(data: pd.DataFrame) -> str:
+def _verdict(runs: Runs) -> str:
     """The cheapest strategy and the dearest of those that finish."""
-    found = data[(data["status"] == "ok") & data["step_s"].notna()]
-    limits = int(data["status"].isin(["timeout", "oom"]).sum())
-    said = f"A step, where it finishes ({limits} of {len(data)} rows reach a limit at this size)"
-    return format.ends(said, dict(zip(found["row"], found["step_s"], strict=True)), "one shape", show=format.seconds)
+    ended = [record for record in runs.records if record["status"] == "ok"]
+    limits = sum(record["status"] in ("timeout", "oom") for record in runs.records)
+    said = f"A step, where it finishes ({limits} of {len(runs.records)} rows reach a limit at this size)"
+    steps = {records.row_of(record).name: _at_size(record, "step_seconds") for record in ended}
+    return format.ends(said, steps, "one shape", show=format.seconds)
+
+
+def _requested(record: records.Record) -> int | None:
+    return records.setting(record["config"], "view", "resolution")
+
+
+def _at_size(record: records.Record, metric: str) -> float | None:
+    """A metric at the requested size."""
+    return records.measured(record, metric) if records.measured(record, "size") == _requested(record) else None
 
 
 def _size(record: records.Record) -> str:
     """The size at which the row was measured, with the requested size and the status where these differ."""
-    size, requested = records.measured(record, "size"), records.setting(record["config"], "view", "resolution")
+    size, requested = records.measured(record, "size"), _requested(record)
     status = "" if record["status"] == "ok" else record["status"]
     if size is not None and size == requested:
         return f"{requested} ({status})" if status else str(requested)
@@ -112,10 +99,23 @@ def _step(record: records.Record) -> str:
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
 
 
-def _published(record: records.Record, part: int) -> str:
-    return str(PUBLISHED.get(records.row_of(record).preset, ("",) * 4)[part])
+def _published(record: records.Record, part: int) -> int | str | None:
+    return PUBLISHED.get(records.row_of(record).preset, (None,) * 4)[part]
 
 
+RUNS = (
+    *table.IDENTITY,
+    table.Column("size", value=_requested),
+    table.configured("steps", "renderer", "steps"),
+    *(
+        table.Column(name.replace("_seconds", "_s"), value=lambda record, name=name: _at_size(record, name))
+        for name in MEASURED
+    ),
+    *(
+        table.Column(f"published_{name}", value=lambda record, at=at: _published(record, at))
+        for at, name in enumerate(("size", "steps", "queries", "time"))
+    ),
+)
 COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
     *(
         table.text("name", "Strategy"),
@@ -137,8 +137,8 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
         "Depth error median / max",
         table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
-    table.shown("Published queries", lambda record: _published(record, 2)),
-    table.shown("Published time", lambda record: _published(record, 3)),
+    table.shown("Published queries", lambda record: str(_published(record, 2) or "")),
+    table.shown("Published time", lambda record: str(_published(record, 3) or "")),
 )
 
 PAGES = {"table1": make}

@@ -1,6 +1,5 @@
 """Table 2 and Figs. 20 to 22 of DIST: shape completion over the sparsity of the depth image."""
 
-from bench.report.oracle import LABEL, NOTE, oracles
 from bench.report.study import Result, Runs, Selection, compare, gallery, records, table
 
 PLACE = 20
@@ -29,8 +28,8 @@ NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
     "Dense depth implies the mask; “paper's as printed” is the setting of DIST, B.4, with the mean of the squared code "
     "of the official code. The figure leaves out rows with the settings of papers.",
-    f"{NOTE} “Published” is DIST, Table 2: 200 shapes of ShapeNet with another prior and camera, and another number of "
-    "points per share, so these numbers do not compare with the measured ones.",
+    f"{compare.FITTED} “Published” is DIST, Table 2: 200 shapes of ShapeNet with another prior and camera, and another "
+    "number of points per share, so these numbers do not compare with the measured ones.",
 )
 RUNS = (
     table.FAMILY,
@@ -46,7 +45,7 @@ BOTH = (gallery.FRONT, gallery.BEHIND)
 
 def make(runs: Runs) -> Result:
     """A line per family and row, with the oracle and published numbers beside each family."""
-    found, oracle = compare.Compared(runs, lambda _: REFERENCE), oracles(runs, compare.METRIC)
+    found, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
     published = {
         family: {row: dict(zip(compare.ORDER, numbers, strict=True)) for row, numbers in rows.items()}
         for family, rows in PUBLISHED.items()
@@ -59,9 +58,9 @@ def make(runs: Runs) -> Result:
         verdict=found.best("errors × 1000 over all numbers of points"),
         remarks=(compare.ERROR, " ".join((found.shapes(), _iterations(runs))), *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=found.beside({LABEL: oracle}, published),
+        lines=found.beside({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
-        figure=found.draw_conditions([r for r in found.rows if not r[0].endswith(VARIANTS)], oracle, LABEL),
+        figure=found.draw_conditions([r for r in found.rows if not r[0].endswith(VARIANTS)], oracle, compare.ORACLE),
     )
 
 
@@ -84,8 +83,7 @@ def pictures(runs: Runs) -> Result:
         "The shape with the least number of each family at each number of given depth points, from the given camera "
         "and from behind.",
         remarks=(
-            "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged; given depths "
-            "are yellow where they are near.",
+            f"{gallery.JUDGED}; given depths are yellow where they are near.",
             "Dense depth implies the mask, “DIST with mask” sees it at all numbers of points, and DeepSDF is given the "
             "true normals.",
             "DIST, Figs. 20 to 22, shows shapes of ShapeNet; these are of other families and another prior.",

@@ -1,6 +1,5 @@
 """Table 3 and Figs. 11 and 23 of DIST: shape from many views, from random initial codes."""
 
-from bench.report.oracle import LABEL, NOTE, oracles
 from bench.report.study import Result, Runs, Selection, compare, gallery, medians, records, table
 
 PLACE = 40
@@ -15,7 +14,7 @@ NOTES = (
     "Error: mean squared distance from points of the true surface to the nearest of the found one, in that direction "
     "only, in squared scene units, times 1000; that of a run that did not end ok is infinite.",
     f"{compare.RATIO} {compare.FAILURE}",
-    f"All runs start from random codes, one per shape, the same for each method. {NOTE}",
+    f"All runs start from random codes, one per shape, the same for each method. {compare.FITTED}",
     "“Published” is DIST, Table 3, which does not say whether it has means or medians: 50 shapes of PMO's renderings "
     "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
 )
@@ -40,7 +39,7 @@ def make(runs: Runs) -> Result:
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
     above = {
         "start: random codes": starts.groupby(runs.frame.family, sort=False).median().dropna().to_dict(),
-        LABEL: oracles(runs, records.ONE_WAY),
+        compare.ORACLE: compare.oracles(runs, records.ONE_WAY),
     }
     published = {name: {row: {"": str(number)} for row, number in rows.items()} for name, rows in PUBLISHED.items()}
     return found.result(
@@ -67,8 +66,7 @@ def pictures(runs: Runs) -> Result:
         f"The truth, the start, and the shape that each row found, of the {MOST_SHAPES} shapes of each family with the "
         "least numbers.",
         remarks=(
-            "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged, seen from the "
-            "first photograph's side.",
+            f"{gallery.JUDGED}, seen from the first photograph's side.",
             "Start: the shape of the random code that all rows begin with; a mesh row moves the vertices of the "
             "prior's mesh, as PMO does, and is no run of PMO's code.",
             "DIST, Figs. 11 and 23, shows shapes of ShapeNet beside PMO; these are of other families.",

@@ -5,11 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from bench.records.read import read_records
-from bench.report.data.runs import choose
-from bench.studies import dvr_table1, single_view_budget, single_view_renderers
 from tests.report.test_report_galleries import cells, notes
-from tests.report.test_report_paper import write_run
+from tests.report.test_report_paper import page_of, write_run
 from tests.report.test_report_shapes import images
 
 ROWS = {
@@ -42,14 +39,8 @@ def made(
     )  # fmt: skip
 
 
-def of(results, study, page=""):
-    """The result of a page of a study, by default of its first."""
-    make = study.PAGES[page] if page else study.make
-    return make(choose(read_records(results)[0], study.READS[0], results))
-
-
 def lines(results):
-    table = of(results, dvr_table1).table
+    table = page_of(results, "dvr_table1").table
     return {(line["Family"], line["Training"]): line for line in table.to_dict("records")}
 
 
@@ -79,7 +70,7 @@ def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_pa
         made(tmp_path, "Newton", 0.2, index=index, **teaches, **cost)
         made(tmp_path, "IDR", 0.3, index=index, **teaches, status="ok" if index else "empty")
         made(tmp_path, "Nearest image", 0.1, index=index, **teaches)
-    table = of(tmp_path, single_view_renderers).table.set_index("Renderer")
+    table = page_of(tmp_path, "single_view_renderers").table.set_index("Renderer")
     assert table.loc["Newton", ["Trained in", "Field values"]].tolist() == ["90.0 s", "2.00M"]
     assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
     assert table["Over Newton"].tolist() == ["", "∞ (n = 3)", "0.500 (n = 3)"]
@@ -93,9 +84,9 @@ def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path):
             made(tmp_path, "Mean shape", 0.01, **more, renderer="dist")
             made(tmp_path, "IDR", 0.2 * factor, **more, renderer="idr")
             if index == 0 and family == "car":
-                assert of(tmp_path, single_view_renderers).verdict == ""  # without a row of Newton
+                assert page_of(tmp_path, "single_view_renderers").verdict == ""  # without a row of Newton
             made(tmp_path, "Newton", 0.2, **more)
-    verdict = of(tmp_path, single_view_renderers).verdict
+    verdict = page_of(tmp_path, "single_view_renderers").verdict
     assert "car: *1.50* (IDR); n = 3 unseen shapes. " in verdict and "sofa: *0.500* (IDR); n = 3" in verdict
 
 
@@ -114,7 +105,7 @@ def test_a_ratio_to_a_row_that_failed_alone_says_nothing(tmp_path):
         made(tmp_path, "Newton", 0.2, **more, status="ok" if index else "empty")
         made(tmp_path, "IDR", 0.3, **more, status="empty" if index == 1 else "ok")
         made(tmp_path, "Nearest image", 0.1, **more)
-    result = of(tmp_path, single_view_renderers)
+    result = page_of(tmp_path, "single_view_renderers")
     assert result.verdict == "" and result.table["Over Newton"].tolist() == ["", "– (n = 3)", "0 (n = 3)"]
 
 
@@ -122,7 +113,7 @@ def test_its_intervals_are_named_by_what_they_are_of(tmp_path):
     for index in range(6):
         made(tmp_path, "RGB", 0.1 + index / 100, index=index)
     said = "95 % intervals over shapes, bootstrapped of medians and Student's of ratios."
-    assert said in of(tmp_path, dvr_table1).caption
+    assert said in page_of(tmp_path, "dvr_table1").caption
 
 
 def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
@@ -132,7 +123,7 @@ def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
         with np.load(folder / "images.npz") as file:
             np.savez(folder / "images.npz", **file, given=np.full((4, 4, 3), index / 4))
         made(tmp_path, "Mean shape", 0.5 - chamfer, index=index)
-    result = of(tmp_path, dvr_table1, "single_view_figures")
+    result = page_of(tmp_path, "single_view_figures")
     found = cells(result.figure.axes[0])
     assert list(dict.fromkeys(row for row, _ in found)) == ["car 1, best", "car 2, worst"]
     assert found["car 1, best", "given"] == (0.25,) * 3 and found["car 2, worst", "given"] == (0.5,) * 3
@@ -154,7 +145,7 @@ def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
     for (shapes, views), chamfer in errors.items():
         for index in range(3):
             budget(tmp_path, shapes, views, chamfer, index)
-    result = of(tmp_path, single_view_budget)
+    result = page_of(tmp_path, "single_view_budget")
     table = result.table.set_index("Condition")
     shapes, views = ("training shapes: {}".format, "images of each shape: {}".format)
     assert list(table.index) == [shapes(12), shapes(96), views(1), views(4), views(24)]
@@ -172,7 +163,7 @@ def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_train
         for (shapes, views), factor in {(96, 24): 1.0, (96, 1): 2.0, (12, 24): 1.5 if index % 2 else 0.7}.items():
             budget(tmp_path, shapes, views, (0.02 + 0.001 * index) * factor, index)
     said = "The interval excludes 1 for *1 of 2* ratios to the training on 96 shapes with 24 images each; n = 8 shapes."
-    assert of(tmp_path, single_view_budget).verdict == said
+    assert page_of(tmp_path, "single_view_budget").verdict == said
 
 
 def test_a_failed_run_is_the_worst(tmp_path):
@@ -186,8 +177,8 @@ def test_a_failed_run_is_the_worst(tmp_path):
 def test_its_figure_has_a_point_for_each_shape(tmp_path):
     for index in range(3):
         made(tmp_path, "RGB", 0.1 * index, index=index)
-    (axis,) = of(tmp_path, dvr_table1).figure.axes
-    points, _, middle = axis.get_lines()
+    (axis,) = page_of(tmp_path, "dvr_table1").figure.axes
+    points, middle = axis.get_lines()
     assert sorted(points.get_xdata()) == pytest.approx([0.8, 0.9, 1.0])
     assert list(middle.get_xdata()) == pytest.approx([0.9, 0.9])
     assert [label.get_text() for label in axis.get_yticklabels()] == ["RGB"]

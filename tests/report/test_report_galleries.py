@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from bench.records.read import read_records
-from bench.report.data.runs import choose
 from bench.report.gallery import Block, Cell, draw
-from bench.studies import dvr_table2, fig12, table2, table3
-from tests.report.test_report_paper import told, write_run
+from bench.studies import dvr_table2
+from tests.report.test_report_paper import page_of, told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 COLOURS = {normal: tuple(np.array(normal) / 2 + 0.5) for normal in (UP, RIGHT, TOWARDS)}
@@ -64,10 +62,6 @@ def many_views(results, experiment, row, *, dataset="car", index=0, status="ok",
         saved(folder, **shown)
 
 
-def made(results, study, page):
-    return study.PAGES[page](choose(read_records(results)[0], study.READS[0], results))
-
-
 def cells(axis, across=1):
     """The colour in the middle of the first picture of each cell; white without one; the names of rows and columns."""
     rows = [label.get_text().replace("\n", " ") for label in axis.get_yticklabels()]
@@ -90,7 +84,7 @@ def test_completed_shapes_stand_over_the_points_with_the_truth_behind(tmp_path):
     for row, normal in (("DeepSDF samples", UP), ("DIST", RIGHT), ("DIST with mask", UP), ("IDR with mask", UP)):
         for points in ("dense", "20"):
             completed(tmp_path, row, points, found=normal)
-    result = made(tmp_path, table2, "completion_gallery")
+    result = page_of(tmp_path, "completion_gallery")
     found = cells(result.figure.axes[0], across=2)
     assert [column for row, column in found if row == "DIST"] == ["dense", "20 pts", "truth"]
     assert list(dict.fromkeys(row for row, _ in found)) == ["given depths", *list(NAMES)[:3]]
@@ -105,7 +99,7 @@ def test_the_first_shape_of_each_family_and_the_first_seed_are_shown(tmp_path):
         for index in (3, 1):
             for seed in (1, 0):
                 completed(tmp_path, "DIST", "20", dataset=dataset, index=index, seed=seed)
-    result = made(tmp_path, table2, "completion_gallery")
+    result = page_of(tmp_path, "completion_gallery")
     assert [axis.get_title(loc="left") for axis in result.figure.axes] == ["sofa", "plane"]
     assert result.data[["index", "seed"]].to_numpy().tolist() == [[1, 0], [1, 0]]
     assert "Not shown: 6 runs" in told(result)
@@ -117,7 +111,7 @@ def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path
     completed(tmp_path, "DIST with mask", "20", status="crashed", pictures=False)
     completed(tmp_path, "DIST with mask", "50", status="empty", found=None)
     completed(tmp_path, "DIST", "50", pictures=False)
-    result = made(tmp_path, table2, "completion_gallery")
+    result = page_of(tmp_path, "completion_gallery")
     assert sorted(notes(result.figure)) == sorted(["not_reached", "crashed", "empty", "no picture", "no run"])
     assert cells(result.figure.axes[0], across=2)["DIST", "20 pts"] == COLOURS[RIGHT]
     assert "3 of 5 runs did not end ok" in result.caption
@@ -128,7 +122,7 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
     for index in range(6):
         many_views(tmp_path, "table3", "DIST", index=index, found=UP)
         many_views(tmp_path, "table3", "Mesh, 48³", index=index, status="ok" if index else "diverged", found=RIGHT)
-    result = made(tmp_path, table3, "multiview_gallery")
+    result = page_of(tmp_path, "multiview_gallery")
     found = cells(result.figure.axes[0])
     assert list(dict.fromkeys(row for row, _ in found)) == [f"car {index}" for index in range(4)]
     assert [found["car 0", column] for column in ("truth", "start", "DIST", "Mesh, 48³")] == [
@@ -141,7 +135,7 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
 def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
     for task in ({"degrees": 20.0}, {}, {"similarity": True}, {"shift": 0.1}, {"scale": 0.8}):
         many_views(tmp_path, "fig12", "DIST", task=task, found=UP if task else RIGHT)
-    result = made(tmp_path, fig12, "misplaced_gallery")
+    result = page_of(tmp_path, "misplaced_gallery")
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "DIST"]
     assert columns == ["0.8 times as large", "in place", "known place", "turned by 20°", "shifted by 0.1", "truth"]
@@ -172,7 +166,7 @@ def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
     rendered(tmp_path, "Newton, RGB", "rgb_newton", size=0)
     rendered(tmp_path, "DIST, RGB", "rgb_dist")
     rendered(tmp_path, "DIST, RGB", "rgb_dist", dataset="car", status="crashed", size=0)
-    result = made(tmp_path, dvr_table2, "rerendering")
+    result = page_of(tmp_path, "rerendering")
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "sofa 0"]
     sizes = list(dvr_table2.SIDES)

@@ -2,12 +2,9 @@
 
 import pytest
 
-from bench.records.read import read_records
-from bench.report.data.runs import choose
-from bench.report.write.paper import write_paper
 from bench.report.write.result import latex
 from bench.studies import parsimony
-from tests.report.test_report_paper import told, write_run
+from tests.report.test_report_paper import page_of, told, write_run
 
 NETWORK, PAPERS = "network_8x512", 1_839_614  # the papers' network, and its numbers
 SIZES = {"sphere": 4, "box": 9, "union_3": 30, "grid_24": 3000, NETWORK: PAPERS}  # free numbers
@@ -62,14 +59,10 @@ def four(tmp_path_factory):
     return tmp_path
 
 
-def made(results):
-    return parsimony.make(choose(read_records(results)[0], parsimony.READS[0], results))
-
-
 @pytest.fixture(scope="module")
 def page(four):
     """Made once: tests of the same runs only look at it."""
-    return made(four)
+    return page_of(four, "parsimony")
 
 
 def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
@@ -115,7 +108,7 @@ def test_what_suffices_is_filled_and_the_recommended_is_ringed(page):
 
 def test_a_candidate_that_failed_is_counted_and_crossed(tmp_path):
     climbed(tmp_path, "car", {"sphere": 8, "box": 1, "grid_24": 0.2}, needs="grid_24", failed=("box",))
-    page = made(tmp_path)
+    page = page_of(tmp_path, "parsimony")
     assert page.table["Failed candidates"].item() == "1 of 3"
     assert page.data.set_index("rung").loc["box", "failed"] == "nan: why"
     crosses = [line for line in page.figure.axes[0].lines if line.get_marker() == "x" and len(line.get_xdata())]
@@ -124,7 +117,7 @@ def test_a_candidate_that_failed_is_counted_and_crossed(tmp_path):
 
 def test_pages_say_by_which_size_the_choice_is(page, tmp_path):
     climbed(tmp_path, "car", {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
-    other = made(tmp_path)
+    other = page_of(tmp_path, "parsimony")
     assert "free numbers" in other.title and other.figure.axes[0].get_xlabel() == "free numbers"
     assert "the smallest candidate by stored numbers whose error" in told(page)
 
@@ -133,11 +126,10 @@ def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
     names = ["Overhead of field=auto", "Evaluations at pixel precision"]
     assert page.table.set_index("Scene").loc["box 0", names].tolist() == ["1.50", "0.250×"]
     climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ..., "auto.overhead": ...})
-    assert made(tmp_path).table[names].iloc[0].tolist() == ["–", "–"]
+    assert page_of(tmp_path, "parsimony").table[names].iloc[0].tolist() == ["–", "–"]
 
 
-def test_the_report_is_written_even_where_all_runs_failed(tmp_path):
+def test_a_page_is_made_even_where_all_runs_failed(tmp_path):
     climbed(tmp_path, "car", {"sphere": 8}, needs="sphere", status="timeout")
-    written = write_paper(read_records(tmp_path)[0], tmp_path)
-    assert [path.stem for path in written] == ["parsimony"] and written[0].with_suffix(".png").is_file()
-    assert "timeout" in (tmp_path / "paper" / "parsimony.md").read_text()
+    page = page_of(tmp_path, "parsimony")
+    assert page.table["Recommended"].tolist() == ["timeout"] and page.verdict == ""

@@ -6,10 +6,8 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from bench.pictures import style
-from bench.records.read import read_records
 from bench.report import gallery
-from bench.report.data.runs import choose
-from bench.studies import benchmark, fig4, fig7, gradients, table1
+from bench.studies import benchmark, gradients
 from tests.report.test_report_paper import (
     DYNAMIC,
     NAIVE,
@@ -18,18 +16,12 @@ from tests.report.test_report_paper import (
     bands,
     costs,
     drawn,
+    page_of,
     told,
     write_images,
     write_judged,
     write_run,
 )
-
-STUDIES = {study.READS[0].experiment: study for study in (benchmark, fig4, fig7, gradients, table1)}
-
-
-def made(results, name, page=""):
-    study = STUDIES[name]
-    return study.PAGES[page or name](choose(read_records(results)[0], study.READS[0], results))
 
 
 def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
@@ -38,15 +30,12 @@ def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     timed_out = {"status": "timeout", "reason": "64 pixels took over 60 s"}
     write_run(tmp_path, "table1", NAIVE, metrics=costs(6_100_000, size=32), **timed_out)
     write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck", environment={})
-    page = made(tmp_path, "table1")
+    page = page_of(tmp_path, "table1")
     rows = page.data.set_index("row")
     rows = rows.astype(object).where(rows.notna(), None)
     assert list(rows.index) == [NAIVE, PARALLEL, DYNAMIC, "of ours"]  # the paper's order, then others
     assert list(rows["queries"]) == [None, None, 2_100_000, 5]  # those of the asked size: as N/A in the paper
     assert list(rows["size"]) == [64, 64, 64, 64]
-    assert list(rows["finished_queries"]) == [6_100_000, None, None, None]
-    assert list(rows["finished_size"]) == [32, None, None, None]
-    assert list(rows["finished_peak_memory_bytes"]) == [123_000_000, None, None, None]
     assert list(rows["published_queries"]) == ["N/A", "6.06M", "1.99M", None]
     assert list(rows["published_time"]) == ["N/A", "3.39s", "1.23s", None]
     assert list(rows["published_steps"]) == [50, 50, 50, None]
@@ -63,7 +52,7 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
     write_run(tmp_path, "table1", NAIVE, metrics=costs(size=32), status="timeout", reason="over 60 s")
     write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck")
-    page = made(tmp_path, "table1")
+    page = page_of(tmp_path, "table1")
     assert list(page.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
     assert page.table["Step"].iloc[2] == "750 ms (625–875)"
     assert page.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
@@ -104,7 +93,7 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
     for size, threads, factor in ((256, 1, 0.6), (256, 2, 0.9), (128, 2, 0.5), (128, 1, 0.75)):
         timed(tmp_path, size, threads, factor)
     timed(tmp_path, 512, 1, metrics={}, status="timeout", reason="dvr: more than 9 field values")
-    page = made(tmp_path, "benchmark")
+    page = page_of(tmp_path, "benchmark")
     ratios = {128: {1: 0.75, 2: 0.5}, 256: {1: 0.6, 2: 0.9}}
     lines = [(size, n, each) for size, own in ratios.items() for n, ratio in own.items() for each in (1.0, ratio)]
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
@@ -121,7 +110,7 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
 
 
 def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
-    page = made(write_judged(tmp_path), "gradients")
+    page = page_of(write_judged(tmp_path), "gradients")
     rows = page.data.set_index(["row", "band"])
     assert list(rows.index) == [(name, band) for name in ("dist", "dvr", "naive") for band in gradients.BANDS]
     assert rows.loc[("dvr", "oblique"), "code_scale"] == 4.0
@@ -143,7 +132,7 @@ def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
 
 
 def test_gradients_figure_plots_the_numbers_of_its_csv(tmp_path):
-    page = made(write_judged(tmp_path), "gradients")
+    page = page_of(write_judged(tmp_path), "gradients")
     code, camera, outline = page.figure.axes
     own = page.data[page.data["band"] == "oblique"]
     assert drawn(code, "oblique", "x")[:2] == list(own["code_median_error"])[:2] == [2e-4, 2e-4]
@@ -165,7 +154,7 @@ def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
     write_run(tmp_path, "gradients", None, metrics=bands() | own | {"silhouette.image_cosine": 0.5}, renderer="dvr")
     write_run(tmp_path, "gradients", None, metrics=bands() | own | blurred, renderer="neus")
     write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
-    page = made(tmp_path, "gradients", "gradients_visibility")
+    page = page_of(tmp_path, "gradients_visibility")
     rows = page.data.set_index("row")
     assert rows.loc["neus", "blur"].tolist() == [0.001, 0.03]
     assert rows.loc["neus", "image_error"].tolist() == [0.3, 0.2]
@@ -183,7 +172,7 @@ def test_fig4_counts_what_the_pictures_show(tmp_path):
     write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1, tilt=10.0)
     write_images(write_run(tmp_path, "fig4", NAIVE, status="timeout", reason="slow"), size=8)
     write_run(tmp_path, "fig4", "+ aggressive")
-    page = made(tmp_path, "fig4")
+    page = page_of(tmp_path, "fig4")
     rows = page.data.set_index("row")
     assert list(rows.index) == [PARALLEL, DYNAMIC, NAIVE, "+ aggressive"]
     assert list(rows["size"]) == [24, 24, 8, None]
@@ -212,7 +201,7 @@ def test_angles_are_degrees_where_both_hit(tmp_path):
 
 def test_lost_and_false_pixels_have_their_colours(tmp_path):
     write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1)
-    shown = made(tmp_path, "fig4").figure.axes[0].get_images()[-1].get_array()
+    shown = page_of(tmp_path, "fig4").figure.axes[0].get_images()[-1].get_array()
     images = gallery.arrays(tmp_path / "runs" / "run000", gallery.REFERENCE)[0]
     for colour, mask, other in ((style.MISSED, "reference_hit", "hit"), (style.SPURIOUS, "hit", "reference_hit")):
         wrong = images[mask] & ~images[other]
@@ -230,7 +219,7 @@ def test_lost_and_false_pixels_have_their_colours(tmp_path):
 def test_broken_pictures_are_a_remark(tmp_path, content, why):
     path = write_run(tmp_path, "fig4", DYNAMIC) / "images.npz"
     path.write_bytes(content) if isinstance(content, bytes) else np.savez(path, **content)
-    page = made(tmp_path, "fig4")
+    page = page_of(tmp_path, "fig4")
     assert why in told(page) and list(page.data["lost"]) == [None]
 
 
@@ -240,7 +229,7 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
         write_images(write_run(tmp_path, "fig7", None, metrics=metrics, settings={"renderer": {"epsilon": epsilon}}))
     settings = {"renderer": {"epsilon": 5e-3}}
     write_run(tmp_path, "fig7", None, settings=settings, status="killed", reason="stopped", environment={})
-    page = made(tmp_path, "fig7")
+    page = page_of(tmp_path, "fig7")
     assert list(page.data["epsilon"]) == [5e-2, 5e-3, 5e-5, 5e-7]
     assert list(page.data["lost_share"]) == [0.01, None, 0.0, 0.1]
     assert list(page.data["false_share"]) == [0.25, None, 0.0025, 0.0]
@@ -254,5 +243,5 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
 def test_pictures_are_of_one_scene(tmp_path):
     write_images(write_run(tmp_path, "fig7", None, settings={"index": 1}))
     write_images(write_run(tmp_path, "fig7", None, settings={"index": 0}))
-    page = made(tmp_path, "fig7")
+    page = page_of(tmp_path, "fig7")
     assert list(page.data["index"]) == [0] and "Not shown: 1 run" in told(page)

@@ -2,10 +2,8 @@
 
 import pytest
 
-from bench.records.read import read_records
-from bench.report.data.runs import choose
 from bench.studies import scans
-from tests.report.test_report_paper import write_run
+from tests.report.test_report_paper import page_of, write_run
 
 DRAGON, BUNNY = "scans/dragon", "scans/bunny"
 
@@ -20,12 +18,8 @@ def made(results, depths, error, *, folder=DRAGON, index=0, status="ok", rendere
     )  # fmt: skip
 
 
-def page(results):
-    return scans.make(choose(read_records(results)[0], scans.READS[0], results))
-
-
 def row(results) -> dict[str, str]:
-    (line,) = page(results).table.to_dict("records")
+    (line,) = page_of(results, "scans").table.to_dict("records")
     return line
 
 
@@ -56,7 +50,7 @@ def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, me
     made(tmp_path, "measured", 2.0)
     made(tmp_path, "exact", 1.0, index=1)
     made(tmp_path, "measured", 2.0, index=1, status=status)
-    line, result = row(tmp_path), page(tmp_path)
+    line, result = row(tmp_path), page_of(tmp_path, "scans")
     assert (f": *{ratio}* (newton); n = " in result.verdict) is (status == "refused")
     assert (line["Depth error, measured"], line["Depth error, ratio"]) == (measured, ratio)
     assert line["Failed"] == failed
@@ -72,7 +66,7 @@ def test_where_both_failed_neither_is_better(tmp_path):
 
 def test_without_a_pair_there_is_no_ratio(tmp_path):
     made(tmp_path, "exact", 1.0)
-    assert row(tmp_path)["Depth error, ratio"] == "–" and page(tmp_path).verdict == ""
+    assert row(tmp_path)["Depth error, ratio"] == "–" and page_of(tmp_path, "scans").verdict == ""
 
 
 def test_where_each_failed_alone_the_ratio_is_unknown_and_not_in_the_verdict(tmp_path):
@@ -80,5 +74,5 @@ def test_where_each_failed_alone_the_ratio_is_unknown_and_not_in_the_verdict(tmp
         for other in ("exact", "measured"):
             made(tmp_path, other, 1.0, index=index, status="ok" if other == depths else "diverged")
             made(tmp_path, other, 2.0 if other == "exact" else 3.0, index=index, renderer="dist")
-    assert [line["Depth error, ratio"] for line in page(tmp_path).table.to_dict("records")] == ["–", "1.50"]
-    assert page(tmp_path).verdict.endswith(": *1.50* (dist); n = 2 scans.")
+    assert [line["Depth error, ratio"] for line in page_of(tmp_path, "scans").table.to_dict("records")] == ["–", "1.50"]
+    assert page_of(tmp_path, "scans").verdict.endswith(": *1.50* (dist); n = 2 scans.")

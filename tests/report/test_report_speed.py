@@ -6,11 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.records.read import read_records
-from bench.report.data.curves import history_of
-from bench.report.data.runs import choose
-from bench.studies import speed_curves, speed_front
-from tests.report.test_report_paper import told, write_run
+from bench.studies import speed_curves
+from tests.report.test_report_paper import page_of, told, write_run
 
 
 def completed(results, label, errors, **changed):
@@ -51,12 +48,6 @@ def rendered(results, label, seconds, error, *, size=64, index=0, queries=1000):
     write_run(results, "speed_rendering", label, task="ablation", dataset="sofa", metrics=metrics, settings=settings)
 
 
-def made(results, study=speed_front):
-    (make,) = study.PAGES.values()
-    records = read_records(results)[0]
-    return make(*(choose(records, selection, results) for selection in study.READS))
-
-
 @pytest.fixture
 def three(tmp_path):
     """A fast one, a good one, and one that is worse than both in everything; a fourth fails on two shapes of three."""
@@ -69,7 +60,7 @@ def three(tmp_path):
 
 
 def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
-    page = made(three)
+    page = page_of(three, "speed_front")
     data = page.data.set_index("setting")
     assert data["dominated"].to_dict() == {"fast": False, "good": False, "bad": True, "broken": True}
     chance = 7 / 27  # that at least two of three draws are the shape that it did not fail on; then it beats "fast"
@@ -82,7 +73,7 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
 
 
 def test_dominated_points_are_hollow_and_the_front_is_numbered(three):
-    axis = made(three).figure.axes[0]
+    axis = page_of(three, "speed_front").figure.axes[0]
     drawn = {line.get_markerfacecolor() == "none": line for line in axis.lines if line.get_label() == "dist"}
     solid, hollow = ([*zip(*drawn[each].get_data(), strict=True)] for each in (False, True))
     assert solid == [(1.0, 7.0), (3.0, 0.6)] and hollow == [(4.0, 8.0)]  # the infinite one is in the table alone
@@ -93,7 +84,7 @@ def test_dominated_points_are_hollow_and_the_front_is_numbered(three):
 def test_one_draw_has_no_probability(tmp_path):
     for label, errors in (("fast", [9, 6]), ("good", [9, 5, 1])):
         completed(tmp_path, label, errors)
-    result = made(tmp_path)
+    result = page_of(tmp_path, "speed_front")
     assert result.table["P(on the front)"].tolist() == ["–", "–"]
     assert result.data["on_front"].isna().all() and result.data["error_low"].isna().all()
     assert "One shape and one seed are one draw" in told(result)
@@ -105,7 +96,7 @@ def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path
         rendered(tmp_path, "dist", mine, 0.01 + index / 1000, index=index)
         rendered(tmp_path, "dist, K 3", other, 0.01 + index / 1000, index=index)
         rendered(tmp_path, "dist, 20 steps", 0.9, 0.03, index=index, queries=500)
-    data = made(tmp_path).data.set_index("setting")
+    data = page_of(tmp_path, "speed_front").data.set_index("setting")
     columns = ["seconds", "error", "evaluations", "on_front", "dominated"]
     assert data.loc["dist", columns].tolist() == data.loc["dist, K 3", columns].tolist()
     assert data.loc["dist", "seconds"] == pytest.approx(1.2)  # of 1.1, 1.3 and 1.2, the shapes' medians
@@ -113,10 +104,10 @@ def test_equal_settings_have_equal_rows_whatever_noise_their_times_have(tmp_path
 
 
 def test_the_charts_of_the_page_have_the_numbers_and_lead_to_the_runs(three):
-    page = made(three)
+    page = page_of(three, "speed_front")
     shown = [x for series in page.chart["panels"][0]["series"] if series["name"] != "front" for x in series["x"]]
     assert sorted(shown) == sorted(page.data["seconds"][np.isfinite(page.data["seconds"].astype(float))])
-    page = made(three, speed_curves)
+    page = page_of(three, "speed_curves")
     curves = page.chart["panels"][0]["series"]
     assert {link for one in curves for link in one["link"]} < {f"#/run/{name}" for name in page.data["folder"]}
     line = next(series for series in curves if series["name"] == "good")
@@ -124,7 +115,7 @@ def test_the_charts_of_the_page_have_the_numbers_and_lead_to_the_runs(three):
 
 
 def test_a_look_costs_what_was_spent_before_it(three):
-    data = made(three, speed_curves).data
+    data = page_of(three, "speed_curves").data
     good = data[(data["row"] == "good") & (data["index"] == 0)]
     assert good["error"].tolist() == [9, 5, 3, 0.5]
     assert good["seconds"].tolist() == [0, 1, 2, 3]
@@ -134,7 +125,7 @@ def test_a_look_costs_what_was_spent_before_it(three):
 
 def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert speed_curves.TARGET == 1e-3
-    page = made(three, speed_curves)
+    page = page_of(three, "speed_curves")
     table = page.table.set_index("Setting")
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
     assert table.loc["bad"].tolist() == ["3", "0", "∞", "0.775"]  # the last is the rank correlation of loss and error
@@ -142,36 +133,19 @@ def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert page.verdict.endswith("*3.00 s* (good); n = 3 runs each, and 1 of 4 settings reach it in most.")
 
 
-def test_the_verdict_says_the_median_of_the_table(tmp_path):
-    for index, errors in enumerate(([9, 1], [9, 8, 8, 8, 1], [9, 8])):
-        completed(tmp_path, "some", errors, index=index)
-        completed(tmp_path, "slow", [9, 8, 8, 8, 8, 1], index=index)
-    page = made(tmp_path, speed_curves)
-    assert page.table.set_index("Setting").loc["some"].tolist()[:3] == ["3", "2", "4.00 s"]  # of 1, 4 and ∞
-    assert page.verdict.startswith("Median time to an error of 1 (Chamfer × 1000): *4.00 s* (some) to 5.00 s (slow);")
-
-
 def test_where_every_median_is_infinite_the_figure_is_drawn_and_there_is_no_verdict(tmp_path):
     for index in range(3):
         completed(tmp_path, "dist", [9, 8], index=index, status="nan")
-    page = made(tmp_path, speed_curves)
+    page = page_of(tmp_path, "speed_curves")
     page.figure.draw_without_rendering()
     assert page.verdict == ""
-
-
-def test_a_run_without_a_curve_has_not_reached_the_target(tmp_path):
-    folder = completed(tmp_path, "dist", [9, 8, 2])
-    (folder / "curve.jsonl").unlink()
-    runs = choose(read_records(tmp_path)[0], speed_curves.READS[0], tmp_path)
-    (record,) = runs.records
-    assert speed_curves.time_to(history_of(runs, record), record) == math.inf
 
 
 def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
     for index in range(2):
         completed(tmp_path, "dist", [9, 1], index=index)
     completed(tmp_path, "idr", [9, 1], renderer="idr")
-    row = made(tmp_path).table.set_index("Setting").loc["idr"]
+    row = page_of(tmp_path, "speed_front").table.set_index("Setting").loc["idr"]
     assert row["Failed"] == "0 of 1, 1 missing"
     assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
 
@@ -181,7 +155,7 @@ def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
     record = json.loads((folder / "record.json").read_text())
     record["seconds"]["forward"] = math.nan
     (folder / "record.json").write_text(json.dumps(record))
-    assert math.isinf(made(tmp_path).data["seconds"].iloc[0])
+    assert math.isinf(page_of(tmp_path, "speed_front").data["seconds"].iloc[0])
 
 
 def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
@@ -189,7 +163,7 @@ def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
     settings = {"index": 0, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "validation"}
     write_run(tmp_path, "speed_completion", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
               settings=settings, minute=0)  # fmt: skip
-    result = made(tmp_path)
+    result = page_of(tmp_path, "speed_front")
     assert result.data["error"].tolist() == [1.0]
     assert "Not shown: 1 run" in told(result)
 
@@ -199,7 +173,7 @@ def test_renderings_of_another_size_are_not_compared(tmp_path):
     rendered(tmp_path, "dist, 20 steps", 0.5, 0.02)
     rendered(tmp_path, "dist, half", 0.1, 0.001, size=32)
     rendered(tmp_path, "dist", 1.0, 0.01)
-    result = made(tmp_path)
+    result = page_of(tmp_path, "speed_front")
     assert "Not shown: 2 runs of this experiment at another scale" in told(result)
     assert result.data["setting"].tolist() == ["dist", "dist, 20 steps"]
     assert result.data["dominated"].tolist() == [False, False]
@@ -210,5 +184,5 @@ def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
     completed(tmp_path, "dist", [9, 5, 1])
     folder = completed(tmp_path, "idr", [9, 5, 1], status="timeout", renderer="idr")
     (folder / "curve.jsonl").unlink()
-    for study in (speed_front, speed_curves):
-        assert "idr" in made(tmp_path, study).table.to_string()
+    for name in ("speed_front", "speed_curves"):
+        assert "idr" in page_of(tmp_path, name).table.to_string()

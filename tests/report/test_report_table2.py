@@ -1,19 +1,13 @@
 """Table 2 and the priors' page, made from run folders whose numbers are known."""
 
 import math
-import sys
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from bench.pictures import style
-from bench.records.read import read_records
-from bench.report import oracle
-from bench.report.data.runs import choose
-from bench.report.write.paper import write_paper
-from bench.studies import priors, table2
-from tests.report.test_report_paper import told, write_run
+from bench.report import compare
+from tests.report.test_report_paper import page_of, told, write_run
 
 REFERENCE, OTHER = "DIST with mask", "Naive with mask"
 
@@ -34,11 +28,6 @@ def completed(results, label, chamfer, **changed):
     )
 
 
-def made(results, make=table2.make):
-    (selection,) = sys.modules[make.__module__].READS
-    return make(choose(read_records(results)[0], selection, results))
-
-
 def cell(result, method, column):
     row = result.table[result.table["Method"] == method]
     return row[column].iloc[0]
@@ -49,7 +38,7 @@ def test_a_cell_is_the_median_over_shapes_and_a_failure_is_infinite(tmp_path):
         completed(tmp_path, REFERENCE, value, index=index)
     for index, value in enumerate((1.0, None, None)):
         completed(tmp_path, OTHER, value, index=index)
-    result = made(tmp_path)
+    result = page_of(tmp_path, "table2")
     assert cell(result, REFERENCE, "100 pts") == "2.00"
     assert cell(result, OTHER, "100 pts") == "∞"
     assert cell(result, REFERENCE, "Failed") == "0 of 3"
@@ -61,7 +50,7 @@ def test_a_cell_is_the_median_over_shapes_and_a_failure_is_infinite(tmp_path):
 def test_columns_stand_as_in_the_paper_and_published_numbers_are_marked(tmp_path):
     for points in ("7", "20", "10%", "dense"):
         completed(tmp_path, REFERENCE, 1.0, points=points)
-    result = made(tmp_path)
+    result = page_of(tmp_path, "table2")
     assert list(result.table.columns) == [
         *("Family", "Method", "dense", "10%", "20 pts", "7 pts", "Geometric mean", "Ratio to DIST with mask", "Failed")
     ]
@@ -76,7 +65,7 @@ def test_another_setting_of_the_shared_parts_is_told(tmp_path):
     write_run(
         tmp_path, "table2", OTHER, task="completion", dataset="sofa", settings={"view": {"resolution": 8}}, minute=0
     )
-    assert "Runs differ in view.resolution: rows with other values do not compare." in made(tmp_path).notes
+    assert "Runs differ in view.resolution: rows with other values do not compare." in page_of(tmp_path, "table2").notes
 
 
 @pytest.mark.parametrize("odd", [{"renderer": {"epsilon": 1.0}}, {"silhouette": {"weight": 9}}, {"task": {"code": 1}}])
@@ -87,21 +76,10 @@ def test_another_setting_under_the_same_name_is_no_part_of_the_row(tmp_path, odd
     settings = {"index": 0, "dataset": {"name": "sofa"}} | odd | {"task": task}
     run = {"task": "completion", "dataset": "sofa", "metrics": {"chamfer_l2": 1}, "settings": settings}
     write_run(tmp_path, "table2", REFERENCE, minute=1, **run)
-    result = made(tmp_path)
+    result = page_of(tmp_path, "table2")
     assert cell(result, REFERENCE, "100 pts") == "2.00" and "Not shown: 1 run" in told(result)
     write_run(tmp_path, "table2", REFERENCE, minute=50, **run)
-    assert cell(made(tmp_path), REFERENCE, "Failed") == "0 of 1"  # the newest setting, alone
-
-
-def test_a_row_that_fails_at_one_sparsity_is_not_the_better_one(tmp_path):
-    for index in range(6):
-        for points in ("dense", "100", "20"):
-            completed(tmp_path, REFERENCE, 1.0 + index, index=index, points=points)
-            completed(tmp_path, OTHER, None if points == "20" else 2.0 * (1 + index), index=index, points=points)
-    result = made(tmp_path)
-    ratio = float(cell(result, OTHER, "Ratio to DIST with mask").split()[0])
-    assert ratio == pytest.approx(2 ** (2 / 3), rel=1e-2)  # where it fails it has the largest error of any row
-    assert cell(result, OTHER, "Failed") == "6 of 18"
+    assert cell(page_of(tmp_path, "table2"), REFERENCE, "Failed") == "0 of 1"  # the newest setting, alone
 
 
 def test_families_and_both_tasks_share_a_table(tmp_path):
@@ -112,7 +90,7 @@ def test_families_and_both_tasks_share_a_table(tmp_path):
     write_run(
         tmp_path, "table2", REFERENCE, task="completion", dataset="mesh", metrics={"chamfer_l2": 0.005}, settings=folder
     )
-    table = made(tmp_path).table
+    table = page_of(tmp_path, "table2").table
     own = table[~table["Method"].str.startswith("published") & (table["Family"] != "all families")]
     assert own[["Family", "Method", "100 pts"]].to_numpy().tolist() == [
         ["sofa", REFERENCE, "1.00"],
@@ -124,7 +102,7 @@ def test_families_and_both_tasks_share_a_table(tmp_path):
 
 def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
     def caption():
-        return made(tmp_path, table2.make).caption
+        return page_of(tmp_path, "table2").caption
 
     def write(index, seed, **more):
         task = {"points": "100", "_target_": "completion"}
@@ -148,17 +126,17 @@ def test_the_oracle_is_of_all_of_the_tables_shapes(tmp_path):
     for index in (3, 4):
         completed(tmp_path, REFERENCE, 1.0, index=index)
     fitted(tmp_path, 0.25, index=3)
-    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
+    assert compare.ORACLE not in page_of(tmp_path, "table2").table["Method"].tolist()
     for index, value in ((4, 0.75), (5, 9.0)):
         fitted(tmp_path, value, index=index)
-    assert cell(made(tmp_path), oracle.LABEL, "100 pts") == "0.500"
+    assert cell(page_of(tmp_path, "table2"), compare.ORACLE, "100 pts") == "0.500"
 
 
 @pytest.mark.parametrize("changed", [{"evaluation": {"grid": 8}}, {"split": "validation"}, {"prior": {"shapes": 1}}])
 def test_an_oracle_that_was_judged_otherwise_is_not_shown(tmp_path, changed):
     completed(tmp_path, REFERENCE, 1.0)
     fitted(tmp_path, 0.1, **changed)
-    assert oracle.LABEL not in made(tmp_path).table["Method"].tolist()
+    assert compare.ORACLE not in page_of(tmp_path, "table2").table["Method"].tolist()
 
 
 def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
@@ -166,7 +144,7 @@ def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
         completed(tmp_path, REFERENCE, 1.0, points=points)
         completed(tmp_path, OTHER, None, points=points)
     fitted(tmp_path, 0.2)
-    figure = made(tmp_path).figure
+    figure = page_of(tmp_path, "table2").figure
     (axis,) = [axis for axis in figure.axes if axis.axison]
     lines = {line.get_label(): line.get_ydata() for line in axis.lines}
     assert list(lines[REFERENCE]) == [1.0, 1.0]
@@ -192,7 +170,7 @@ def test_a_prior_is_shown_beside_its_floor(tmp_path):
     normals, hit = np.zeros((8, 8, 3)), np.ones((8, 8), dtype=bool)
     images = {"normals": normals, "reference_normals": normals, "hit": hit, "reference_hit": hit}
     np.savez(folder / "images.npz", **images)
-    result = made(tmp_path, priors.make)
+    result = page_of(tmp_path, "priors")
     row = result.table.iloc[0]
     assert (row["Fit"], row["Floor"], row["Fit / floor"], row["largest"]) == ("0.240", "0.200", "1.20", "2.50")
     assert row["|gradient|"] == "0.980"
@@ -200,20 +178,3 @@ def test_a_prior_is_shown_beside_its_floor(tmp_path):
     titles = [label.get_text().replace("\n", " ") for label in axis.get_xticklabels()]
     assert titles == ["truth", "fit: 1.00 × floor", "truth", "fit: 1.20 × floor", "truth", "fit: 2.50 × floor"]
     assert result.data["ratio"].tolist() == pytest.approx([1.0, 1.2, 2.5])
-
-
-def test_a_prior_that_failed_on_a_shape_scores_worst_there(tmp_path):
-    fitted(tmp_path, 0.2)
-    fitted(tmp_path, 0.1, index=1, status="crashed")
-    row = made(tmp_path, priors.make).table.iloc[0]
-    assert row["largest"] == "∞"
-    assert row["Shapes"] == "2"
-
-
-def test_all_files_are_written(tmp_path):
-    completed(tmp_path, REFERENCE, 1.0)
-    fitted(tmp_path, 0.2)
-    written = {path.name for path in write_paper(read_records(tmp_path)[0], tmp_path)}
-    tables = {"table2.csv", "priors.csv"}
-    assert written == {*tables, "completion_gallery.csv"}
-    assert pd.read_csv(tmp_path / "paper" / "table2.csv")["chamfer_l2"].tolist() == [0.001]

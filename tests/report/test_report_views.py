@@ -3,13 +3,9 @@
 import pytest
 from scipy import stats
 
-from bench.records.read import read_records
-from bench.report import oracle
 from bench.report.data.records import ONE_WAY
-from bench.report.data.runs import choose
-from bench.report.write.paper import write_paper
-from bench.studies import fig6, fig10, fig12, table3
-from tests.report.test_report_paper import told, write_run
+from bench.studies import fig10
+from tests.report.test_report_paper import page_of, told, write_run
 
 ENDS = ONE_WAY
 
@@ -52,10 +48,6 @@ def posed(results, label, degrees, success, *, seed=0, task="pose", dataset=None
     )
 
 
-def made(results, page):
-    return page.make(choose(read_records(results)[0], page.READS[0], results))
-
-
 def row(result, method):
     return result.table[result.table["Method"] == method].iloc[0]
 
@@ -64,7 +56,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
     for index, (end, start) in enumerate(((1.0, 8.0), (2.0, 4.0), (4.0, 40.0))):
         found(tmp_path, "table3", "DIST", end, index=index, start=start, method="multiview_dist")
         found(tmp_path, "table3", "IDR", 2 * end, index=index, start=start, method="multiview_idr")
-    result = made(tmp_path, table3)
+    result = page_of(tmp_path, "table3")
     ours, idr = row(result, "DIST"), row(result, "IDR")
     assert (ours["Median"], ours["Geometric mean"], ours["Failed"]) == ("2.00", "2.00 (n = 3)", "0 of 3")
     assert (ours["Ratio to DIST"], idr["Ratio to DIST"]) == ("", "2.00 (n = 3); 0 of 3")
@@ -80,7 +72,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
 def test_published_numbers_of_pmo_stand_beside_the_mesh_row(tmp_path):
     found(tmp_path, "table3", "DIST", 1.0)
     found(tmp_path, "table3", "Mesh, 48³", 2.0, renderer="mesh_proxy", method="multiview_mesh")
-    result = made(tmp_path, table3)
+    result = page_of(tmp_path, "table3")
     ends = dict(zip(result.table["Method"], result.table["Median"], strict=True))
     assert list(ends.items()) == [
         *(("start: random codes", "8.00"), ("DIST", "1.00"), ("Mesh, 48³", "2.00")),
@@ -89,28 +81,6 @@ def test_published_numbers_of_pmo_stand_beside_the_mesh_row(tmp_path):
     ]
     assert list(result.data["row"]) == ["DIST", "Mesh, 48³"]  # the CSV has measured rows alone
     assert "“Mesh, 48³” moves the vertices" in told(result) and "read it beside “published: PMO, random" in told(result)
-
-
-def test_a_run_that_failed_is_infinite_and_told(tmp_path):
-    for index in range(3):
-        found(tmp_path, "table3", "DIST", 1.0, index=index)
-        found(tmp_path, "table3", "Naive", 1.0 if index == 0 else None, index=index)
-    result = made(tmp_path, table3)
-    assert row(result, "Naive")[["Median", "Failed", "Loop"]].tolist() == ["∞", "2 of 3", "3.00 s"]
-    assert "2 of 6 runs did not end ok" in result.caption
-    assert len(result.data) == 6
-
-
-def test_the_oracle_stands_beside_where_all_shapes_have_one(tmp_path):
-    for index in range(2):
-        found(tmp_path, "table3", "DIST", 0.6, index=index)
-        write_run(
-            *(tmp_path, "priors", None),
-            task="prior_fit",
-            metrics={ENDS: 0.0002, "chamfer_l2": 0.0005},
-            settings={"index": index, "dataset": {"name": "car"}},
-        )
-    assert row(made(tmp_path, table3), oracle.LABEL)["Median"] == "0.200"
 
 
 def test_rows_may_have_images_of_their_own_size(tmp_path):
@@ -122,7 +92,7 @@ def test_rows_may_have_images_of_their_own_size(tmp_path):
         metrics_start={ENDS: 0.004},
         settings={"task": {"focal": 1.0}, "view": {"resolution": 32}, "dataset": {"name": "car"}},
     )
-    result = made(tmp_path, table3)
+    result = page_of(tmp_path, "table3")
     assert row(result, "DIST")["Median"] == "1.00"
     assert row(result, "Naive, 32 x 32")["Median"] == "2.00"
     assert "Not shown" not in told(result)
@@ -133,7 +103,7 @@ def test_figure_10_varies_one_condition_at_a_time(tmp_path):
     found(tmp_path, "fig10", "DIST", 3.0, focal=0.5)
     found(tmp_path, "fig10", "DIST", 5.0, start_scale=2.0)
     found(tmp_path, "fig10", "DIST", 9.0, focal=0.5, start_scale=2.0)  # both: in neither panel
-    result = made(tmp_path, fig10)
+    result = page_of(tmp_path, "fig10")
     medians = dict(zip(result.table["Condition"], result.table["Median"], strict=True))
     focal, noise = (one.label for one in fig10.CONDITIONS)
     shown = {f"{focal}: 0.5": 3, f"{focal}: 1": 1, f"{noise}: 1": 1, f"{noise}: 2": 5}
@@ -148,7 +118,7 @@ def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_pat
     found(tmp_path, "fig12", "DIST", 0.2, **placed | {"similarity": True})
     found(tmp_path, "fig12", "DIST", 4.0, **placed)  # its place is known: another problem, in no panel
     found(tmp_path, "fig12", "DIST", 0.2, **placed | {"degrees": 20.0, "shift": 0.1})  # two: in no panel
-    result = made(tmp_path, fig12)
+    result = page_of(tmp_path, "fig12")
     table = result.table.set_index("Condition")
     assert table.loc["rotation (degrees): 20", "Success"] == "2 of 4 (n = 4)"  # a failed run is no success
     assert table.loc["rotation (degrees): 20", "Median"] == "1.00 (n = 4)"
@@ -165,7 +135,7 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
         posed(tmp_path, "DIST", 30, success, seed=seed)
         posed(tmp_path, "ICP, point to plane", 30, 1, seed=seed, task="pose_icp")
     posed(tmp_path, "DIST", 90, 0)
-    result = made(tmp_path, fig6)
+    result = page_of(tmp_path, "fig6")
     mine, theirs = row(result, "DIST"), row(result, "ICP, point to plane")
     assert mine["30°"] == "2 of 4 (n = 1)"  # a failed run is a pose that was not found; one shape, no interval
     assert mine["90°"] == "0 of 1 (n = 1)"
@@ -180,7 +150,7 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
 def test_views_of_one_mesh_are_one_shape(tmp_path):
     for index in range(8):
         posed(tmp_path, "DIST", 30, 1, dataset={"path": "/meshes/fandisk.obj", "strength": 0.0}, index=index)
-    result = made(tmp_path, fig6)
+    result = page_of(tmp_path, "fig6")
     assert row(result, "DIST")["30°"] == "8 of 8 (n = 1)"
     assert "n = 8 runs (1 shape, 8 views, 1 seed)" in result.caption
 
@@ -190,7 +160,7 @@ def test_six_shapes_have_an_interval_that_does_not_count_their_views(tmp_path):
         for index in range(2):
             mesh = {"path": f"/meshes/{shape}.obj", "strength": 0.0}
             posed(tmp_path, "DIST", 30, int(shape > 0), dataset=mesh, index=index)
-    result = made(tmp_path, fig6)
+    result = page_of(tmp_path, "fig6")
     low, high = stats.binomtest(5, 6).proportion_ci(method="exact")  # as one trial per shape
     assert row(result, "DIST")["30°"] == f"10 of 12 [{100 * low:.1f}, {100 * high:.1f}] %"
     assert "95 % intervals over shapes (Clopper and Pearson)" in result.caption
@@ -201,34 +171,5 @@ def test_six_shapes_have_an_interval_that_does_not_count_their_views(tmp_path):
 
 def test_a_single_run_of_one_condition_has_a_page(tmp_path):
     found(tmp_path, "fig12", "DIST", 0.5, shift=0.2, degrees=0.0, scale=1.0, similarity=True)
-    result = made(tmp_path, fig12)
+    result = page_of(tmp_path, "fig12")
     assert [len(axis.lines) for axis in result.figure.axes] == [3, 0, 0] and len(result.table) == 1
-
-
-def test_few_shapes_are_drawn_as_points_and_six_as_a_band(tmp_path):
-    for index in range(5):
-        for focal in (0.5, 1.0):
-            found(tmp_path, "fig10", "DIST", 1.0 + index, index=index, focal=focal)
-    result = made(tmp_path, fig10)
-    axis = result.figure.axes[0]
-    small = [line for line in axis.lines if line.get_markersize() == 2]
-    assert sorted(small[0].get_ydata()) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert result.table["Median"].tolist() == ["3.00 (n = 5)"] * len(result.table)
-    assert "fewer than six shapes: points, no interval" in result.caption
-    for focal in (0.5, 1.0):
-        found(tmp_path, "fig10", "DIST", 6.0, index=5, focal=focal)
-    result = made(tmp_path, fig10)
-    axis = result.figure.axes[0]
-    assert not [line for line in axis.lines if line.get_markersize() == 2] and axis.collections
-    assert result.table["Median"].tolist() == ["3.50 [1.00, 6.00]"] * len(result.table)
-    assert "95 % bootstrap intervals over shapes." in result.caption  # one seed: no word of seeds
-
-
-def test_all_pages_are_written(tmp_path):
-    found(tmp_path, "table3", "DIST", 1.0)
-    found(tmp_path, "fig10", "DIST", None)
-    posed(tmp_path, "DIST", 30, None)
-    written = write_paper(read_records(tmp_path)[0], tmp_path)
-    assert [path.stem for path in written] == ["table3", "multiview_gallery", "fig10", "fig6"]
-    for path in written:
-        assert path.with_suffix(".png").stat().st_size > 1000

@@ -48,22 +48,21 @@ def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
     return {"name": name, "x": ends, "y": [value, value], "colour": GREY, "symbol": "", "dash": "-", **more}
 
 
-def panel_data(title: str, x: str, y: str, series: list[Series], ticks: Sequence[str] = (), **more: Any) -> Panel:
+def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
     """A panel of a chart; an axis is logarithmic where its values are positive and span a factor above 3.
 
     Args:
         title: its title.
         x, y: what its axes carry, with the unit.
         series: what is drawn.
-        ticks: the names of the positions 0, 1, ... along x.
-        more: what the page reads as well.
+        more: what the page reads as well; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
     """
     axes = {}
     for letter, name in (("x", x), ("y", y)):
         values = [v for each in series for v in each[letter] if math.isfinite(v)]
         log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
         axes[letter] = {"title": name, "log": log}
-    return {"title": title, **axes, "series": series} | ({"ticks": list(ticks)} if ticks else {}) | more
+    return {"title": title, **axes, "series": series, **more}
 
 
 def sheet(
@@ -89,7 +88,7 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     figure, axes = sheet(height, lines, columns, **how)
     size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels with one axis have one edge
     for place, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
-        _panel(axis, panel, _edge(panels[place // size * size :][:size]))
+        _panel(axis, panel, _edge(panels[place // size * size :][:size], "y", "high"))
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
     for axis in axes[:, 1:].flat if "sharey" in how else ():
@@ -103,50 +102,50 @@ def _shown(panel: Panel) -> list[Series]:
     return [each for each in panel["series"] if not each.get("off")]
 
 
-def _edge(panels: Sequence[Panel]) -> float:
-    """Where what is infinite is drawn: above all else of panels that share an axis."""
-    drawn = [each for panel in panels for each in _shown(panel)]
-    return 2 * max((v for each in drawn for v in (*each["y"], *each.get("high", ())) if math.isfinite(v)), default=1.0)
+def _edge(panels: Sequence[Panel], *of: str) -> float:
+    """Where what is infinite is drawn: beyond all else of panels that share an axis, in these parts of their series."""
+    values = [v for panel in panels for each in _shown(panel) for key in of for v in each.get(key, ())]
+    return 2 * max(filter(math.isfinite, values), default=1.0)
 
 
 def _panel(axis: Axes, panel: Panel, edge: float) -> None:
     shown = _shown(panel)
     for each in shown:
-        _series(axis, each, edge)
+        _series(axis, each, [_edge([panel], "x"), edge])
     for letter in "xy":
         if panel[letter]["log"]:
             style.log_axis(axis, letter, [v for each in shown for v in (*each[letter], *each.get("low", ()))])
     if "ticks" in panel:
         axis.set_xticks(range(len(panel["ticks"])), panel["ticks"])
+    if "rows" in panel:
+        axis.set_yticks(range(len(panel["rows"])), panel["rows"])
+        axis.set_ylim(len(panel["rows"]) - 0.4, -0.6)
     if panel["y"].get("reversed"):
         axis.invert_yaxis()
     axis.set(title=panel["title"], xlabel=panel["x"]["title"], ylabel=panel["y"]["title"])
 
 
-def _series(axis: Axes, each: Series, edge: float) -> None:
-    """Draws a series; what is infinite at the edge, intervals as a band around a line, else as bars."""
-    x, y, line = each["x"], np.minimum(each["y"], edge), "dash" in each
+def _series(axis: Axes, each: Series, edges: list[float]) -> None:
+    """Draws a series; what is infinite at the edge, points as crosses there; intervals as a band or as bars."""
+    x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
     how: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
     how |= {"markevery": max(len(x) // 6, 1)} if line else {}
     how |= {"drawstyle": "steps-post"} if each.get("step") else {}
     how |= {"mfc": "none"} if each.get("hollow") else {}
     how |= {"ms": 0.55 * each["size"]} if "size" in each else {}
-    axis.plot(x, y, label=None if each.get("quiet") else each["name"], **how)
+    lost = (np.isinf(each["x"]) | np.isinf(each["y"])) & (not line)
+    axis.plot(x[~lost], y[~lost], label=None if each.get("quiet") else each["name"], **how)
+    if lost.any():
+        axis.plot(x[lost], y[lost], "x", color=each["colour"])
     if "low" in each:
-        ends = [np.minimum(each[end], edge) for end in ("low", "high")]
+        ends = [np.minimum(each[end], edges[1]) for end in ("low", "high")]
         if line:
             axis.fill_between(x, *ends, color=each["colour"], alpha=0.15, lw=0)
         else:
             axis.vlines(x, *ends, color=each["colour"], lw=0.7)
     if "shapes" in each:
-        at, found = np.minimum(each["shapes"], [math.inf, edge]).T
+        at, found = np.minimum(each["shapes"], edges).T
         axis.plot(at, found, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
-
-
-def points(axis: Axes, preset: str, x: Any, y: Any, **how: Any) -> None:
-    """Draws the points of a row with the marker and colour of its preset."""
-    look = style.look(preset)
-    axis.plot(x, y, **{"color": look.colour, "marker": look.marker, "ls": "none", **how})
 
 
 def _rounded(values: Iterable[float]) -> list[float]:

@@ -71,7 +71,7 @@ class Result:
         data: the raw numbers, including those that the figure plots; by default as the columns have them.
         table: the numbers as text for readers; by default as the columns have them.
         figure: the figure.
-        chart: panels of series for the page, as `chart_panel` makes them.
+        chart: panels of series for the page, as `chart.panel_data` makes them.
         atlas: a grid of cells for the page, as the study `stability` makes it.
     """
 
