@@ -189,13 +189,16 @@ def test_rows_of_several_seeds_and_shapes_are_told_apart(tmp_path):
 
 
 def test_hostile_words_are_escaped_everywhere(tmp_path):
-    hostile = r"50 % of a_b & #1 {x} \input | ~^ $" + HOSTILE
+    hostile = r"[50 % of a_b & #1 {x} \input | ~^ $" + HOSTILE
     odd = costs(depth_error_max="inf")
     write_run(tmp_path, "table1", hostile, metrics=odd, status="crashed", reason=hostile)
     main([f"results_dir={tmp_path}"])
     text = (tmp_path / "paper" / "table1.tex").read_text()
+    assert r"\begin{tabular}{lr" in text
     row = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
-    assert r"50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
+    assert (
+        r"{[}50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
+    )
     assert r"\textless{}script\textgreater{}" in row
     assert row.replace(r"\&", "").count("&") == 12 and row.count(r"\\") == 1  # the 13 cells of one row
     assert r"$\infty$" in row and r"64$\times$64" in text and text.isascii()

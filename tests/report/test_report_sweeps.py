@@ -77,11 +77,11 @@ def test_six_shapes_have_an_interval(tmp_path):
     cells = [cell(r, index=i) for r in ("dist", "dvr", "idr") for i in range(6)]
     swept(tmp_path, cells)
     for number, one in enumerate(cells):
-        failed = one.renderer == "idr" and number % 2
+        failed = one.renderer == "idr" and number % 3 == 0
         ran(tmp_path, one, None if failed else 0.001 * (1 + number % 6) * (2 if one.renderer == "dvr" else 1))
     found = table(tmp_path)
-    assert found.loc["IDR", "failed"] == 3
-    assert 0.1 < found.loc["IDR", "failed_low"] < 0.5 < found.loc["IDR", "failed_high"] < 0.9
+    assert found.loc["IDR", "failed"] == 2
+    assert 0 < found.loc["IDR", "failed_low"] < 0.1 and 0.7 < found.loc["IDR", "failed_high"] < 0.9
     found = found.loc[["DIST", "DVR"]]
     assert (found["chamfer_l2_low"] < found["chamfer_l2"]).all() and (found["fscore_high"] > found["fscore"]).all()
     assert found.loc["DVR", ["ratio", "ratio_low", "ratio_high"]].tolist() == pytest.approx([2, 2, 2])  # paired
