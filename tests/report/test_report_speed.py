@@ -4,6 +4,7 @@ import json
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bench.studies import speed_curves
@@ -131,6 +132,11 @@ def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert table.loc["bad"].tolist() == ["3", "0", "∞", "0.775"]  # the last is the rank correlation of loss and error
     assert table.loc["broken"].tolist() == ["3", "1", "∞", "–"]  # failed runs did not, whatever they scored
     assert page.verdict.endswith("*3.00 s* (good); n = 3 runs each, and 1 of 4 settings reach it in most.")
+
+
+def test_the_time_to_the_target_is_that_of_the_first_checkpoint_there():
+    history = pd.DataFrame({"seconds": [0.0, 1.0, 2.0], "error": [9.0, 1.0, 0.5]})
+    assert speed_curves.time_to(history, {"status": "ok"}) == 1.0
 
 
 def test_where_every_median_is_infinite_the_figure_is_drawn_and_there_is_no_verdict(tmp_path):
