@@ -119,6 +119,10 @@ def read_capture(
     if len(layout.frames) < FEWEST:
         raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
     frames = [replace(frame, world_to_camera=AXES[axes] @ frame.world_to_camera) for frame in layout.frames]
+    middle = -np.mean([frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in frames], axis=0)
+    moved = np.eye(4)
+    moved[:3, 3] = middle  # the origin among the cameras: single precision would round a far world
+    frames = [replace(frame, world_to_camera=frame.world_to_camera @ moved) for frame in frames]
     shots = [take(frame, longest) for frame in frames]
     lacking = [shot.name for shot in shots if shot.mask is None]
     if masks and 0 < len(lacking) < len(shots):
@@ -128,7 +132,11 @@ def read_capture(
     if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
         raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
     given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
-    sphere = Sphere(*layout.sphere, "as the format states") if layout.sphere else sphere_of(given)
+    if layout.sphere:
+        centre, radius = layout.sphere
+        sphere = Sphere(centre - middle, radius, "as the format states")
+    else:
+        sphere = sphere_of(given)
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
     whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
@@ -136,6 +144,6 @@ def read_capture(
         layout.format,
         tuple(shot.within(sphere.centre, sphere.radius) for shot in shots),
         source if masked else "",
-        sphere,
+        replace(sphere, centre=sphere.centre + middle),
         (*layout.notes, *whole),
     )

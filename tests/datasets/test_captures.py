@@ -340,3 +340,22 @@ def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
     assert all(shot.mask is None for shot in capture.shots) and "no masks" in capture.summary
     np.testing.assert_allclose(capture.sphere.centre, CENTRE, atol=1e-3)
     assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
+
+
+@pytest.mark.parametrize("away", [1e4, 4e6])
+def test_a_world_that_is_far_away_is_read_as_exactly_as_one_at_the_origin(tmp_path, away):
+    """Rounding to single precision would move UTM coordinates by 22 pixels."""
+    shots = []
+    for folder, offset in (("near", 0.0), ("far", away)):
+        (tmp_path / folder).mkdir()
+        nerf(tmp_path / folder)
+        file = tmp_path / folder / "transforms.json"
+        stored = json.loads(file.read_text())
+        for frame in stored["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] += offset
+        file.write_text(json.dumps(stored))
+        shots.append(read_capture(tmp_path / folder, longest=48).shots)
+    for near, far in zip(*shots, strict=True):
+        points = torch.rand(100, 3) - 0.5
+        torch.testing.assert_close(far.camera.project(points)[0], near.camera.project(points)[0], rtol=0, atol=1e-3)
