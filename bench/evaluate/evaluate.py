@@ -23,7 +23,7 @@ from renderers.camera import Camera
 from renderers.field import Field, autograd_gradients, autograd_normals
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.coloured import Coloured
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, Rendering
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
 GREY = 0.5  # of a mesh without colours
@@ -195,14 +195,14 @@ def true_surface(inputs: RunInputs, seed: int) -> Surface:
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """Renders a field with the run's renderer from a camera, as a View on the CPU."""
-    return _view(inputs.renderer, field, camera, inputs.device)
+    return view_of(render(inputs.renderer, field, camera, inputs.device), field, camera)
 
 
 def picture_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """A field as pictures show it: by one fast renderer, whatever is under test, if the field is of its kind."""
     fast = _fast()
     renderer = fast if field.kind in fast.capabilities.needs else inputs.renderer
-    return _view(renderer, field, camera, inputs.device)
+    return view_of(render(renderer, field, camera, inputs.device), field, camera)
 
 
 @cache
@@ -210,9 +210,14 @@ def _fast() -> Renderer:
     return load("renderer", "newton", warm=False)
 
 
-def _view(renderer: Renderer, field: Field, camera: Camera, device: torch.device) -> View:
+def render(renderer: Renderer, field: Field, camera: Camera, device: torch.device) -> Rendering:
+    """A rendering of a field from a camera, without gradients."""
     with torch.no_grad():
-        rendering = rendered(renderer, field, camera.rays().to(device))
+        return rendered(renderer, field, camera.rays().to(device))
+
+
+def view_of(rendering: Rendering, field: Field, camera: Camera) -> View:
+    """The hits of a rendering as a View on the CPU."""
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
@@ -226,6 +231,19 @@ def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[T
     points = rays.at(view.camera.distance(view.depth)[view.mask])
     image[view.mask] = colours_at(field, points, rays.directions, device)
     return image
+
+
+def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
+    """What the run's renderer shows from a camera: its hits, and their colours or a volume's weighted sums."""
+    rendering = render(inputs.renderer, field, camera, inputs.device)
+    view = view_of(rendering, field, camera)
+    volume = rendering.volume
+    if volume is None:
+        return view, coloured_image(field, view, inputs.device)
+    rays = camera.rays().flat().to(inputs.device)
+    some = rays[volume.ray]
+    colours = colours_at(field, some.at(volume.distance), some.directions, inputs.device).to(inputs.device)
+    return view, volume.summed(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
 
 
 def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "height width 3"]:

@@ -17,7 +17,7 @@ from bench.evaluate.evaluate import (
     Evaluation,
     coloured_image,
     mask_iou,
-    render_view,
+    render_image,
     surface_metrics,
     surface_of,
     unseen,
@@ -37,9 +37,11 @@ from renderers.fields.coloured import Coloured
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
 SURFACE = tuple(WORST_SURFACE)  # their names
 IMAGES = {
-    "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph, both black outside of the shape"
-    " and the photograph outside of its mask, mean over photographs, in decibels. Without masks: over the pixels whose"
-    " rays meet the unit sphere.",
+    "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph's mask, black where the shape is not"
+    " seen, mean over photographs, in decibels, as IDR and NeuS define it. Without masks: over the pixels whose rays"
+    " meet the unit sphere.",
+    "psnr_image": "The same over all pixels, both black outside of the shape and the photograph outside of its mask: a"
+    " smaller object has a higher one.",
     "ssim": "Structural similarity (scikit-image, in windows of 7 x 7 pixels) of the same images, mean, up to 1.",
     "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground in at"
     " least one, mean over held-out photographs, from 0 to 1.",
@@ -66,8 +68,8 @@ def judge(field: Coloured, subject: Subject, inputs: RunInputs) -> Evaluation:
     views = mesh_views(mesh, subject.held_out)
     metrics = surface_scores(mesh, subject, inputs) | field_scores(field, views, subject.held_out, inputs.device)
     metrics |= early_weight(field, views, inputs)
-    own = [render_view(field, shot.camera, inputs) for shot in subject.held_out]
-    scores = field_scores(field, own, subject.held_out, inputs.device)
+    own = [render_image(field, shot.camera, inputs) for shot in subject.held_out]
+    scores = image_scores([view for view, _ in own], [image for _, image in own], subject.held_out)
     metrics |= {OWN + name: value for name, value in scores.items()}
     if mesh is None:
         return Evaluation(metrics, None, (RunStatus.EMPTY, "the field has no surface in the unit sphere"))
@@ -121,23 +123,35 @@ def field_scores(
 def image_scores(
     views: Sequence[View], images: Sequence[Float[Tensor, "_ _ 3"]], shots: Sequence[Shot]
 ) -> dict[str, float]:
-    """The metrics of `IMAGES` of images, black outside of the shape; without masks no `mask_iou`."""
+    """The metrics of `IMAGES` of images, black outside of the shape; without masks none that need them."""
     pairs = [_against(view, image, shot) for view, image, shot in zip(views, images, shots, strict=True)]
-    scores = {name: float(np.mean([pair[name] for pair in pairs])) for name in ("psnr", "ssim")}
-    overlaps = [pair["mask_iou"] for pair in pairs]
+    means = {
+        name: float(np.mean([pair[name] for pair in pairs])) for name in ("psnr", "psnr_image", "ssim", "mask_iou")
+    }
     if any(shot.mask is None for shot in shots):
-        return scores
-    return scores | {"mask_iou": float(np.mean(overlaps)), "mask_iou_least": float(np.min(overlaps))}
+        return {name: means[name] for name in ("psnr", "ssim")}
+    return means | {"mask_iou_least": float(np.min([pair["mask_iou"] for pair in pairs]))}
 
 
 def _against(view: View, image: Float[Tensor, "height width 3"], shot: Shot) -> dict[str, float]:
     judged, known = judged_pixels(shot)
     found, true = (image * judged[..., None]).numpy(), (shot.colours * known[..., None]).numpy()
-    error = float(((found - true) ** 2).sum()) / max(3 * int(judged.sum()), 1)
+    squares = (found - true) ** 2
     window = min(7, (min(true.shape[:2]) - 1) // 2 * 2 + 1)  # in tiny images an odd number below 7
     similar = structural_similarity(true, found, channel_axis=2, data_range=1.0, win_size=window)
     overlap = nan if shot.mask is None else mask_iou(view.mask.numpy(), shot.mask.numpy())
-    return {"psnr": -10 * log10(error) if error else inf, "ssim": float(similar), "mask_iou": overlap}
+    return {
+        "psnr": _decibels(squares[known.numpy()]),
+        "psnr_image": _decibels(squares[judged.numpy()]),
+        "ssim": float(similar),
+        "mask_iou": overlap,
+    }
+
+
+def _decibels(squares: Float[np.ndarray, "n 3"]) -> float:
+    """The peak signal-to-noise ratio of squared errors of colours from 0 to 1; +inf where there is no error."""
+    error = float(squares.mean()) if len(squares) else 0.0
+    return -10 * log10(error) if error else inf
 
 
 def judged_pixels(shot: Shot) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:

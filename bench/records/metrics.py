@@ -32,6 +32,7 @@ SHOWN = {  # in the order of tables
     "depth_mae": Metric("depth error (x1000)", 1000.0, LOWER),
     "mask_iou": Metric("mask IoU", better=HIGHER),
     "psnr": Metric("PSNR (dB)", better=HIGHER),
+    "psnr_image": Metric("PSNR of whole images (dB)", better=HIGHER),
     "ssim": Metric("SSIM", better=HIGHER),
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),

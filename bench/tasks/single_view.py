@@ -42,7 +42,7 @@ TRAINING = {
 }
 SHIPPED_ROW = "+method=single_view"  # the settings of the networks that are shipped
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
-COLOURS = ("psnr", "ssim")  # scores of colours
+COLOURS = ("psnr", "psnr_image", "ssim")  # scores of colours
 DECIDING = (  # settings that determine the network
     *("images", "image_pixels", "elevation", "shapes", "views"),
     *("network", "supervision", "training"),

@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from bench.config import load
+from bench.evaluate.evaluate import render, render_image
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, judge, mesh_views, surface_scores
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness, roughness_scores
@@ -23,6 +24,7 @@ from tests.tiny import ball_prior, camera_of, run_of
 
 CENTRE = (0.1, -0.05, 0.15)
 MASK_IOU = ("mask_iou", "mask_iou_least")
+OF_MASKS = {prefix + name for prefix in ("", OWN) for name in (*MASK_IOU, "psnr_image")}
 OF_HITS = set(COLOURED_DEFINITIONS) - set(WEIGHT)  # the metrics of a renderer that sees hits alone
 
 
@@ -73,8 +75,9 @@ def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inpu
 def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
     metrics = judge(painted(red=0.2), subject, inputs).metrics
     shares = [shot.mask.float().mean().item() for shot in subject.held_out]
-    expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])  # of three colours one is wrong
-    assert metrics["own_psnr"] == pytest.approx(expected, abs=0.01)
+    assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)  # of three colours one is wrong
+    expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])
+    assert metrics["own_psnr_image"] == pytest.approx(expected, abs=0.01)
     assert metrics["own_ssim"] < 0.999 and metrics["own_mask_iou"] == 1.0
 
 
@@ -109,7 +112,8 @@ def test_images_are_compared_black_outside_of_their_masks():
     view = View(camera, torch.zeros(8, 16), torch.zeros(8, 16, 3), larger[1])
     missed, both, spurious = 0.8**2, 0.2**2, 0.6**2  # a quarter of the pixels each
     scores = image_scores([view], [larger[2]], [shot])
-    assert scores["psnr"] == pytest.approx(-10 * log10((missed + both + spurious) / 4), abs=1e-4)
+    assert scores["psnr"] == pytest.approx(-10 * log10((missed + both) / 2), abs=1e-4)
+    assert scores["psnr_image"] == pytest.approx(-10 * log10((missed + both + spurious) / 4), abs=1e-4)
     assert scores["mask_iou"] == pytest.approx(1 / 3)
     blind = image_scores([view], [larger[2]], [replace(shot, mask=None)])
     assert set(blind) == {"psnr", "ssim"}
@@ -129,9 +133,21 @@ def test_means_and_the_least_are_over_photographs_of_any_size():
     images[0] = images[0] + 0.1
     for _ in range(5):  # types are checked of a part that is drawn
         scores = image_scores(views, images, shots)
-    lost = ((shots[1].colours * shots[1].mask[..., None]) ** 2).mean().item()
+    lost = (shots[1].colours[shots[1].mask] ** 2).mean().item()
     assert scores["psnr"] == pytest.approx((20.0 - 10 * log10(lost)) / 2, abs=1e-4)
     assert (scores["mask_iou"], scores["mask_iou_least"]) == (0.5, 0.0)
+
+
+def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
+    """In one colour that is the colour times the opacity; at the colour of its mean depth it would be the colour."""
+    plain = cast(ball(0.6, CENTRE, torch.zeros(3, 10)), torch.float32)  # grey, 1/2
+    volume = replace(inputs, renderer=load("renderer", "neus", sharpness=10.0))
+    view, image = render_image(plain, camera_of(24), volume)
+    rendering = render(volume.renderer, plain, camera_of(24), inputs.device)
+    assert rendering.volume is not None
+    opacity = rendering.volume.summed(torch.ones_like(rendering.volume.weight), 24 * 24).view(24, 24)
+    assert bool((view.mask & (opacity < 0.9)).any())
+    torch.testing.assert_close(image, (opacity / 2)[..., None].expand(-1, -1, 3))
 
 
 def plane(tilt: float, *, count: int = 2000, side: float = 1.0) -> Surface:
