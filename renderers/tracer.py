@@ -18,6 +18,7 @@ from renderers.rendering import Deferred, Rendering, Status, assemble
 # by its square over the slope, times half the field's curvature.
 LONGEST = 0.006
 PATIENT = 2  # times `steps`, where all rays are marched on coarse values, and for those in doubt on the field after it
+OF_BOUNDS = 5  # times `steps`, on a bound, whose values are a part of the distance
 NO_NEARER = 0.25  # times the error of coarse values: to how small ones rays are marched
 PAIRS, SPAN = 64, 0.1  # of points between which the steepness is measured; how far apart they are, in radii
 MOST = 0.95  # quantile of the slopes between them: a few places do not decide the steps everywhere
@@ -30,7 +31,7 @@ class Tracer:
 
     Args:
         steps: most marching steps per ray, beside those of its coarse rays; rays that are left are searched densely.
-            See `PATIENT`.
+            See `PATIENT` and `OF_BOUNDS`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
             the rest. A value so little behind the surface is a hit, whatever its slope.
         unseen: of a ray, between the samples of the march; see `packed_march.Stride`.
@@ -71,7 +72,7 @@ class Tracer:
         """Where all rays end, marched without a graph, and their crossings, which carry the gradient."""
         with torch.no_grad():
             asked = self._asked(field)
-            steps = self.steps if asked.values is field else PATIENT * self.steps
+            steps = self._most(field) * (1 if asked.values is field else PATIENT)
             stride, error = self.stride(asked.error), asked.error
             reached = approach(asked.values, rays, stride, steps=steps, radius=self.sphere_radius, error=error)
         return reached, self._crossings_after(field, rays.flat(), reached, asked)
@@ -80,7 +81,7 @@ class Tracer:
         """Marches flat rays on from where they are, in place, and gives their crossings, which carry the gradient."""
         with torch.no_grad():
             asked = self._asked(field)
-            march(asked.values, rays, reached, self.stride(asked.error), self.steps)
+            march(asked.values, rays, reached, self.stride(asked.error), self._most(field))
         return self._crossings_after(field, rays, reached, asked)
 
     def steepness(self, field: Field, rays: Rays) -> float:
@@ -96,6 +97,10 @@ class Tracer:
         """The rendering, without knowledge of an earlier one."""
         steepness = self.steepness(field, rays)
         return self.assembled(rays, *self.trace(evened(field, steepness), rays), steepness=steepness)
+
+    def _most(self, field: Field) -> int:
+        """The most marching steps per ray of a field of this kind."""
+        return self.steps * (OF_BOUNDS if field.kind is Kind.BOUND else 1)
 
     def _asked(self, field: Field) -> Coarse:
         """What the march asks: the field's coarse values where it offers any, else the field itself."""
@@ -120,7 +125,7 @@ class Tracer:
             index = (~certain).nonzero().squeeze(-1)
             doubtful, anchored = rays[index], torch.ones_like(index, dtype=torch.bool)
             again = reached.some(index).begun_again(doubtful, anchored, radius=self.sphere_radius)
-            march(field, doubtful, again, self.stride(), PATIENT * self.steps)
+            march(field, doubtful, again, self.stride(), PATIENT * self._most(field))
         second = self._crossings(field, doubtful, again).among(index)
         reached.put_back(index, again)
         reached.passed -= error

@@ -130,6 +130,19 @@ def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most):
     assert wrong.counts.value <= most * truth.hit.numel()
 
 
+@each("share, most", [(0.5, 24), (0.2, 50)])
+def test_a_bound_that_is_a_part_of_the_distance_needs_no_search(share, most):
+    """All rays meet the plate; a march that ran out of steps would sample the rest of the ray."""
+    plate, generator = box((0.5, 0.5, 0.01)), torch.Generator().manual_seed(0)
+    origins = torch.nn.functional.normalize(torch.randn(6000, 3, generator=generator), dim=-1)
+    targets = torch.rand(6000, 3, generator=generator) - 0.5
+    rays = Rays(origins, torch.nn.functional.normalize(targets * torch.tensor([0.9, 0.9, 0.0]) - origins, dim=-1))
+    bound = Meter(Shape(lambda p: share * plate(p), Kind.BOUND))
+    rendering = NEWTON.render(bound, rays)
+    assert rendering.hit.all() and (rendering.points.abs() - torch.tensor([0.5, 0.5, 0.01])).amax(-1).abs().max() < 3e-4
+    assert bound.counts.value <= most * len(origins)
+
+
 def test_residuals_and_closest_values_of_a_steep_field_are_its_own():
     ring, rays = SHAPES["ring"], camera().rays()
     plain, steep = (NEWTON.render(Shape(lambda p, k=times: k * ring(p)), rays) for times in (1, 4))
