@@ -31,7 +31,8 @@ class NeuS(VolumeRenderer):
         into view or leaves it has a part, as wide as the sigmoid.
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: the sharpness follows a schedule, and is not learnt; samples lie at the middles of equal
-        shares, and are not drawn; importance follows Eq. 13, not an estimate from slopes; the background is empty.
+        shares, and are not drawn; importance follows Eq. 13, not an estimate from slopes; the background is empty;
+        the cosine is not annealed, as the official code does over its first sixth where it has no masks.
 
     Args:
         samples: equally spaced between where a ray enters and leaves the sphere, its ends among them.

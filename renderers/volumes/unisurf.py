@@ -23,9 +23,10 @@ class UNISURF(VolumeRenderer):
         into view or leaves it has a part, as wide as the occupancy's fall.
     Needs: a distance or a bound inside the sphere, of which the occupancy is a sigmoid. The paper's occupancy network
         learns how steep it is; a level set here has no length, and is refused.
-    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty. Free
-        samples that have no room count as free space. `distance` is the mean by weight: while the interval is wide it
-        lies in front of the surface, as many samples of some occupancy have stopped the light there.
+    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty;
+        the smoothness of normals is a task's loss, and off. Free samples that have no room count as free space.
+        `distance` is the mean by weight: while the interval is wide it lies in front of the surface, as many samples of
+        some occupancy have stopped the light there.
 
     Args:
         search_samples: equally spaced, among which the first change from free to occupied is searched.

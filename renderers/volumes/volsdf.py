@@ -41,7 +41,7 @@ class VolSDF(VolumeRenderer):
 
     Args:
         samples: equally spaced at first, and as many more with each round, where the bound is greatest.
-        rounds: at most.
+        rounds: at most, beside the first.
         error: epsilon, most that the opacity may be off at the samples.
         fine_samples: by the weights of the opacity that was found.
         extra_samples: beside these, of the samples that bound the error, every so many, as in the official code.
@@ -63,7 +63,7 @@ class VolSDF(VolumeRenderer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_at_least("samples", self.samples, 2, "the paper uses 128")
-        check_at_least("rounds", self.rounds, 0, "the paper uses 5")
+        check_at_least("rounds", self.rounds, 0, "4 are the five of the paper")
         check_positive("error", self.error, "the paper uses 0.1")
         check_at_least("fine_samples", self.fine_samples, 1, "the paper uses 64")
         check_at_least("extra_samples", self.extra_samples, 2, "the official code uses 32")

@@ -86,6 +86,13 @@ def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
 
 
 @pytest.mark.slow
+def test_a_grazing_ray_of_volsdf_asks_for_five_rounds_of_samples_at_most():
+    """The official code: 128 in each of five rounds, 64 and 32 of the integral, and the two ends."""
+    meter = Meter(sphere(0.5))
+    VOLSDF.render(meter, Rays(torch.tensor([[0.4995, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])))
+    assert 5 * 128 + 64 + 32 <= meter.counts.value <= 5 * 128 + 64 + 32 + 2
+
+
 @pytest.mark.parametrize(("renderer", "least"), [(VOLSDF, 1.0), (load("renderer", "volsdf_budget"), 0.6)])
 def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(renderer, least):
     rays = parallel(12).flat()
