@@ -18,6 +18,7 @@ from datasets.mesh import Mesh
 from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
+from renderers.field import Counts
 from renderers.silhouette import CrossEntropy
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
@@ -131,6 +132,21 @@ def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
     own = [overlap(model.at(code), one, CPU) for code, one in zip(codes, images, strict=True)]
     other = [overlap(model.at(codes[2 - place]), one, CPU) for place, one in enumerate(images) if place != 1]
     assert min(own) > 0.6 and min(own[0], own[2]) > max(other) + 0.2
+
+
+def test_a_step_over_more_shapes_has_no_larger_loss_and_gradient(images, renderer):
+    """Three times the same shape teach as once: the loss is a mean."""
+    given = []
+    for count in (1, 3):
+        settings = replace(SETTINGS, shapes_per_step=count)
+        lessons = Lessons([images[2]] * 3, replace(VOLUME, points=4096), renderer, settings, CPU)
+        torch.manual_seed(0)
+        model = SingleView(NETWORK)
+        loss = lessons.give(model, 0, Counts())
+        slopes = [one.grad for one in model.parameters() if one.grad is not None]
+        given.append((loss, torch.cat([g.flatten() for g in slopes])))
+    (once, slope), (thrice, other) = given
+    assert thrice == pytest.approx(once, rel=0.1) and other.norm() == pytest.approx(slope.norm().item(), rel=0.3)
 
 
 def test_it_learns_from_the_visual_hull_which_ball_an_image_shows(images, renderer, tmp_path):
