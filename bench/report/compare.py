@@ -16,7 +16,7 @@ from bench.records.read import read_plans
 from bench.report.data import statistics
 from bench.report.data.records import RunKey, by_shape, error, setting, shape
 from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import Interval, geometric, geometric_mean, geometric_ratio
+from bench.report.data.statistics import Interval, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, estimate, text
@@ -24,15 +24,17 @@ from bench.report.write.table import Column, estimate, text
 EVERY = "all families"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
 FAILURE = (
-    "In geometric means a run that did not end ok has the largest finite error of any row on the same shape, seed and "
+    "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
     "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
 )
 CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
 ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
-INTERVAL = "95 % intervals over shapes (Student's, of logarithms)"
+INTERVAL = "95 % intervals over shapes (of the sign test)"
 RATIO = (
-    "A ratio divides two geometric means over shapes; after it stand the shapes on which the row is better, ties half."
+    "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
+    "better, ties half."
 )
+HOLM = "By the sign test over shapes with Holm's correction"
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
 CONDITION = "task.points"  # over which tables have columns
 ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
@@ -56,10 +58,10 @@ class Gap:
 
 
 def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
-    """The gap between two rows on the same shapes, by the geometric means of their errors; None without a shape."""
+    """The gap between two rows on the same shapes, as a median over shapes; None without a shape."""
     if not len(first):
         return None
-    return Gap(geometric_ratio(first, second), statistics.better(first, second), len(first))
+    return Gap(statistics.ratio(first, second), statistics.better(first, second), len(first))
 
 
 @dataclass(frozen=True)
@@ -166,9 +168,9 @@ class Compared:
         return len({run for other in self.rows for run in self.means(family, other)} - {*self.means(family, row)})
 
     def error(self, family: str, row: tuple[str, str]) -> Interval:
-        """The geometric mean of a row's errors over shapes, with its interval; nan without a shape."""
+        """The median of a row's errors over shapes, each a mean over conditions and seeds; nan without a shape."""
         groups = by_shape(self.means(family, row))
-        return geometric(groups) if groups else Interval(math.nan, math.nan, math.nan)
+        return statistics.typical(groups) if groups else Interval(math.nan, math.nan, math.nan)
 
     def gap(self, family: str, row: tuple[str, str], other: tuple[str, str]) -> Gap | None:
         """The gap between two rows, on the shapes and seeds that both have."""
@@ -248,7 +250,7 @@ class Compared:
         return [
             *(text("family", "Family"), text("row", "Method")),
             *(Column(at, heading(at)) for at in self.conditions),
-            *estimate("error", "Geometric mean"),
+            *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
             *(Column(f"ratio_{end}", value=lambda line, end=end: _end(line["ratio"], end)) for end in ("low", "high")),
             *(Column("evaluations", "Values", show=format.count), Column("seconds", "Loop", show=format.seconds)),
@@ -268,10 +270,10 @@ class Compared:
         ratio = changed.pop("ratio", "Ratio to the reference")
         panels = self.front(changed.pop("filled", None))
         whole = [(line["row"], line["ratio"]) for line in self.pooled if not line["lacking"]]
-        sure = excluding_one(whole, ratio.removeprefix("Ratio "))
+        sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
-            "plotted": "Median error under each condition, the geometric mean of all errors, and the median cost "
-            "of runs that ended ok.",
+            "plotted": "Median error under each condition, that over shapes of their geometric means, and the median "
+            "cost of runs that ended ok.",
             "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
@@ -302,7 +304,7 @@ class Compared:
         told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
         least, other = (format.number(line["error"].value) for line in (best, quick))
         quickest = f"the quickest row has {other} {told[1]}; n = {format.plural(n, 'shape')}."
-        return f"The least geometric mean of {least_of} is *{least}* {told[0]}; {quickest}"
+        return f"The least median of {least_of} is *{least}* {told[0]}; {quickest}"
 
     def front(self, filled: Callable[[str], bool] | None = None) -> list[chart.Panel]:
         """Panels of the mean error of each row over each cost, over all families.
@@ -347,12 +349,13 @@ class Compared:
         return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 
 
-def excluding_one(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
-    """A sentence with how many of the known ratios have an interval that excludes 1, and which; empty without any."""
+def differing(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
+    """A sentence with how many of the known ratios differ from 1, see `statistics.differ`; empty without any."""
     known = [(name, found) for name, found in ratios if found is not None and found.ratio.known]
-    sure = [f"{name} {found.ratio}" for name, found in known if found.ratio.excludes(1)]
+    differ = statistics.differ([found.ratio for _, found in known])
+    sure = [f"{name} {found.ratio}" for (name, found), other in zip(known, differ, strict=True) if other]
     named = f": {'; '.join(sure)}" if sure else ""
-    return f"The interval excludes 1 for *{len(sure)} of {len(known)}* ratios {of}{named}." if known else ""
+    return f"{HOLM}, *{len(sure)} of {len(known)}* ratios {of} differ from 1{named}." if known else ""
 
 
 def heading(condition: str) -> str:

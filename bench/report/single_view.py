@@ -7,14 +7,14 @@ from matplotlib.figure import Figure
 
 from bench.report.data.records import Record, RunKey, by_shape, error, median_of_known, run_key, setting
 from bench.report.data.runs import Runs
-from bench.report.data.statistics import Interval, bootstrap, geometric_ratio, median
+from bench.report.data.statistics import Interval, bootstrap, median, ratio
 from bench.report.medians import draw_runs, medians, scored
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, shown, text, thousandfold
 
 NAMES = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
 BASELINES = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # presets
-OVER = "“Over ...”: the ratio of geometric means of Chamfer-L1 to that row over the same shapes; below 1 is better."
-INTERVALS = "95 % intervals over shapes, bootstrapped of medians and Student's of ratios"
+OVER = "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row's; below 1 is better."
+INTERVALS = "95 % intervals over shapes, bootstrapped of medians and of the sign test for ratios"
 RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LOOP)
 
 
@@ -62,7 +62,7 @@ def over(errors: dict[RunKey, float], others: dict[RunKey, float]) -> Interval |
     both = sorted(set(errors) & set(others), key=str)
     if not both:
         return None
-    return geometric_ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
+    return ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
 
 
 def draw(runs: Runs) -> Figure:

@@ -98,7 +98,7 @@ def make(runs: Runs) -> Result:
 
 
 def draw(settings: Crossed) -> Figure:
-    """Draws a panel per family: the geometric mean of each renderer's errors by loss."""
+    """Draws a panel per family: the median error of each renderer by loss."""
     losses, renderers, panels = settings.losses, settings.renderers, []
     for family in settings.found.families:
         drawn = []
@@ -168,11 +168,11 @@ def _columns(compared: dict[str, str]) -> list[table.Column]:
 
 
 def _verdict(settings: Crossed, pooled: list[Line]) -> str:
-    """The largest gap with its parts, and how many gaps under one loss exclude 1."""
+    """The largest gap with its parts, and how many gaps under one loss differ from 1."""
     known = [line for line in pooled if line["own"] is not None and line["loss"] is not None]
     names = settings.labels
     under_one = [(f"{x['compared']} under {names[loss]}", x[loss]) for x in pooled for loss in settings.losses]
-    said = [compare.excluding_one(under_one, "under one loss")]
+    said = [compare.differing(under_one, "under one loss")]
     if known:
         line = max(known, key=lambda line: line["own"].ratio.value)
         value, ends = format.number(line["own"].ratio.value), line["own"].ratio.ends()

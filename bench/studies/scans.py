@@ -24,8 +24,8 @@ RUNS = (
     *(*table.metrics(*METRICS), *table.LOOP),
 )
 NOTES = (
-    "Scans of one object depend on each other, so there is no interval: a ratio is the geometric mean over scans of "
-    "the error with measured depths over that with exact ones, 1 where both failed.",
+    "Scans of one object depend on each other, so there is no interval: a ratio is the median over scans of the "
+    "error with measured depths to that with exact ones, 1 where both failed.",
     "Exact depths are those of the mesh at the pixels that the scanner measured; the mask is that of the mesh in both.",
     "A run that did not end ok counts as infinite; one that was refused does not count.",
 )
@@ -71,7 +71,7 @@ def _line(row: str, runs: Runs, pairs: dict[str, pd.DataFrame]) -> Line:
         if len(mine):
             line |= {f"{metric}_{depths}": float(mine[depths].median()) for depths in (EXACT, MEASURED)}
             exact, measured = (mine[depths].to_numpy()[:, None] for depths in (EXACT, MEASURED))
-            line[f"{metric}_{RATIO}"] = statistics.geometric_ratio([*measured], [*exact]).value
+            line[f"{metric}_{RATIO}"] = statistics.ratio([*measured], [*exact]).value
     return line
 
 

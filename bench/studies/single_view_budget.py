@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bench.report.study import Result, Runs, Selection, conditions, records, single_view, table
+from bench.report.study import Result, Runs, Selection, compare, conditions, records, single_view, statistics, table
 
 PLACE = 43
 READS = (Selection("single_view_budget", ("task.shapes", "task.views"), setup=("machine",)),)
@@ -10,8 +10,8 @@ LABELS = {"shapes": "training shapes", "views": "images of each shape"}
 NOTES = (
     "One of the two numbers varies, the other is the largest. Each point is a training of its own, with the same "
     "number of steps; all are judged by the same shapes, and a failed run counts as infinite.",
-    "“Over the largest”: the ratio of geometric means of Chamfer-L1 to those of the largest training, over the same "
-    "shapes; above 1 is worse.",
+    "“Over the largest”: the median over shapes of the ratio of Chamfer-L1 to that of the largest training; "
+    "above 1 is worse.",
 )
 COLUMNS = (
     *(*conditions.NAMED, *conditions.MEDIAN),
@@ -58,14 +58,14 @@ def _judged(line: dict[str, Any], largest: dict[str, int], whole: list[records.R
 
 
 def _verdict(ratios: list[Any], largest: dict[str, int]) -> str:
-    """How many ratios to the largest training of a family have an interval that excludes 1."""
+    """How many ratios to the largest training of a family differ from 1."""
     known = [ratio for ratio in ratios if ratio.known]
     if not known:
         return ""
-    sure, n = sum(ratio.excludes(1) for ratio in known), max(len(ratio.points) for ratio in known)
+    sure, n = sum(statistics.differ(known)), max(len(ratio.points) for ratio in known)
     return (
-        f"The interval excludes 1 for *{sure} of {len(known)}* ratios to the training on {largest['shapes']} shapes "
-        f"with {largest['views']} images each; n = {n} shapes."
+        f"{compare.HOLM}, *{sure} of {len(known)}* ratios to the training on {largest['shapes']} shapes "
+        f"with {largest['views']} images each differ from 1; n = {n} shapes, one training each."
     )
 
 

@@ -54,7 +54,7 @@ def make(runs: Runs) -> Result:
     return found.result(
         "Shape completion from one depth image, over its sparsity.",
         "Which method completes a shape best from sparse depth?",
-        plotted="Median error over {shapes and seeds} at each number of given depth points, and the geometric mean.",
+        plotted="Median error over {shapes and seeds} at each number of given depth points, and over all.",
         verdict=found.best("errors × 1000 over all numbers of points"),
         remarks=(compare.ERROR, " ".join((found.shapes(), _iterations(runs))), *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],

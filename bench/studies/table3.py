@@ -46,7 +46,7 @@ def make(runs: Runs) -> Result:
         "Shape from many views, without a mask.",
         "Which method finds a shape by photographs from many views, without a mask?",
         ratio="Ratio to DIST",
-        plotted="Median error over {shapes and seeds}, the geometric mean, and the median cost of runs that ended ok.",
+        plotted="Median error over {shapes and seeds}, over shapes alone, and the median cost of runs that ended ok.",
         verdict=found.best("errors × 1000, from truth to prediction"),
         remarks=(*NOTES, *(ON_MESH.format(row=row.name) for row in runs.rows() if row.preset == MESH)),
         lines=found.beside(above, published),

@@ -32,7 +32,7 @@ def make(runs: Runs) -> Result:
         "Methods at their defaults, tuned, and at their papers' settings.",
         "Are our defaults as good as tuned settings?",
         ratio="Ratio to the default",
-        verdict=compare.excluding_one(ratios, "of tuned settings to the defaults"),
+        verdict=compare.differing(ratios, "of tuned settings to the defaults"),
         remarks=NOTES,
         lines=lines,
         run_columns=RUNS,

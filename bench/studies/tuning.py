@@ -34,7 +34,7 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "What tuning is worth.",
-        "Geometric mean of the test errors, if the best of so many drawn settings on the validation shapes is taken; "
+        "Median of the test errors, if the best of so many drawn settings on the validation shapes is taken; "
         "evaluations are medians of runs that ended ok.",
         question="What is tuning worth?",
         verdict=format.ends(
@@ -42,7 +42,7 @@ def make(runs: Runs) -> Result:
             {line["method"]: line["worth"] and line["worth"].value for line in lines},
             f"{len({run[0] for method in methods for run in method.test_runs})} test shapes",
         ),
-        interval="95 % intervals over test shapes (Student's, of logarithms)",
+        interval="95 % intervals over test shapes (of the sign test)",
         estimates=[found for line in lines for found in line["curve"].values()],
         remarks=_notes(runs, methods),
         columns=[
@@ -61,11 +61,11 @@ def make(runs: Runs) -> Result:
 def _line(method: Tuning) -> Line:
     """Its curve, and the error of the best of all draws over that of one draw as `worth`; None for one draw."""
     most = max(method.budgets)
-    worth = statistics.geometric_ratio(method.expected(most), method.expected(1)) if most > 1 else None
+    worth = statistics.ratio(method.expected(most), method.expected(1)) if most > 1 else None
     return {
         **{"method": method.label, "preset": method.method, "failed": f"{method.failed} of {method.runs}"},
         **{"evaluations": method.evaluations[method.best], "worth": worth},
-        "curve": {k: statistics.geometric(method.expected(k)) for k in method.budgets},
+        "curve": {k: statistics.typical(method.expected(k)) for k in method.budgets},
     }
 
 

@@ -24,7 +24,6 @@ from tests.tiny import ball_prior, camera_of, run_of
 
 CENTRE = (0.1, -0.05, 0.15)
 MASK_IOU = ("mask_iou", "mask_iou_least")
-OF_MASKS = {prefix + name for prefix in ("", OWN) for name in (*MASK_IOU, "psnr_image")}
 OF_HITS = set(COLOURED_DEFINITIONS) - set(WEIGHT)  # the metrics of a renderer that sees hits alone
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import COSTS, EVERY, Compared
+from bench.report.compare import COSTS, EVERY, HOLM, Compared
 from bench.report.data.runs import choose
 from bench.studies import one_loss, tuned
 from tests.report.test_report_paper import write_run
@@ -64,19 +64,19 @@ def test_a_line_has_errors_ratio_cost_and_both_fronts(whole):
     assert (newton["evaluations"], newton["seconds"], newton["failed"]) == (500, 8.0, "0 of 24")
     assert newton["100"] == pytest.approx(0.5 * (6 + 9) / 2)  # of sofas 1 to 6 and planes 9 to 54
     own = line(result, "newton with mask", "plane")
-    assert own["error"] == pytest.approx(0.5 * 720 ** (1 / 6) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
+    assert own["error"] == pytest.approx(0.5 * 12 ** (1 / 2) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
     assert own["100"] == pytest.approx(0.5 * 3.5 * 9) and own["20"] == pytest.approx(0.5 * 3.5 * 9 * 4)
     fronts = {name: [line(result, f"{name} with mask")[f"front_{c}"] for c in COSTS] for name in METHODS}
     assert fronts == {"dist": ["", "yes"], "newton": ["yes", "yes"], "neus": ["yes", "yes"], "volsdf": ["", ""]}
     assert line(result, "dist with mask")["ratio"] == ""
-    assert "excludes 1 for *3 of 3* ratios to DIST: newton with mask 0.500 [0.500, 0.500];" in result.verdict
+    assert "*3 of 3* ratios to DIST differ from 1: newton with mask 0.500 [0.500, 0.500];" in result.verdict
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
     result = one_loss.make(compared(tmp_path, families=("sofa",), failed={("newton", "sofa", 0)}))
     newton = line(result, "newton with mask", "sofa")
     assert newton["failed"] == "2 of 12"
-    assert newton["error"] == pytest.approx(2 * (0.5**5 * 2 * 720) ** (1 / 6))  # VolSDF's on the first shape
+    assert newton["error"] == pytest.approx(4)  # of 2 to 6, and of VolSDF's 4 on the first shape
 
 
 def test_without_the_reference_there_is_no_ratio_and_no_verdict(whole):
@@ -168,7 +168,7 @@ def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
                 )
     result = tuned.make(choose(read_records(tmp_path)[0], tuned.READS[0], tmp_path))
     table = result.table.set_index("Method")
-    said = "The interval excludes 1 for *1 of 1* ratios of tuned settings to the defaults: DIST, tuned on sofa 0.500"
+    said = f"{HOLM}, *1 of 1* ratios of tuned settings to the defaults differ from 1: DIST, tuned on sofa 0.500"
     assert result.verdict.startswith(said)
     assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
     assert table.loc["DIST", "Ratio to the default"] == ""

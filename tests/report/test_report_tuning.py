@@ -129,7 +129,7 @@ def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path
     assert first.test.shape == second.test.shape == (3, 6)
     assert second.test == pytest.approx(first.test + math.log(10))
     assert [(method.method, method.runs) for method in (first, second)] == [("dist_mask", 36), ("idr_mask", 36)]
-    two = statistics.geometric_ratio(first.expected(2), first.expected(1))
+    two = statistics.ratio(first.expected(2), first.expected(1))
     assert two.value < 0.9
     assert list(tuning.make(read(tmp_path)).table["Best over one draw"]) == [str(two)] * 2
 

@@ -58,7 +58,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
         found(tmp_path, "table3", "IDR", 2 * end, index=index, start=start, method="multiview_idr")
     result = page_of(tmp_path, "table3")
     ours, idr = row(result, "DIST"), row(result, "IDR")
-    assert (ours["Median"], ours["Geometric mean"], ours["Failed"]) == ("2.00", "2.00 (n = 3)", "0 of 3")
+    assert (ours["Median"], ours["Median over shapes"], ours["Failed"]) == ("2.00", "2.00 (n = 3)", "0 of 3")
     assert (ours["Ratio to DIST"], idr["Ratio to DIST"]) == ("", "2.00 (n = 3); 0 of 3")
     assert (ours["Loop"], ours["Values"]) == ("3.00 s", "5.00k")
     assert row(result, "start: random codes")["Median"] == "8.00"

@@ -9,15 +9,16 @@ from bench.report.data.statistics import (
     Interval,
     bootstrap,
     clopper_pearson,
+    differ,
     dominated,
     front,
-    geometric,
-    geometric_ratio,
     interquartile_mean,
     median,
     paired_bootstrap,
     rank,
+    ratio,
     share,
+    typical,
 )
 from tests.looped import each
 
@@ -242,29 +243,40 @@ def test_front_of_uncertain_cases():
     assert front([point((1, 1), (1, INF))], seed=0, draws=8000) == pytest.approx([0.25], abs=0.02)
 
 
-def test_the_interval_of_a_geometric_mean_is_students_over_the_shapes():
-    errors = [np.array([1.0, 4.0]), *(np.array([e]) for e in (1.0, 2.0, 4.0, 8.0, 16.0))]
-    found = geometric(errors)
-    logs = np.log([2.0, 1.0, 2.0, 4.0, 8.0, 16.0])
-    ends = stats.t.interval(0.95, 5, logs.mean(), stats.sem(logs))
-    assert found.value == pytest.approx(np.exp(logs.mean()))
-    assert (found.low, found.high) == pytest.approx(tuple(np.exp(ends)))
-    assert not geometric(errors[:5]).known
-    assert geometric([*errors, np.array([math.inf])]).value == math.inf
+def test_the_interval_of_a_median_is_that_of_the_sign_test():
+    errors = [np.array([1.0, 4.0]), *(np.array([e]) for e in (1.0, 3.0, 4.0, 8.0, 16.0))]
+    found = typical(errors)
+    assert (found.value, found.low, found.high) == pytest.approx((math.sqrt(12), 1.0, 16.0))  # of six, all
+    assert not typical(errors[:5]).known
+    failed = typical([*errors, np.array([math.inf])])
+    assert (failed.value, failed.high) == (pytest.approx(4.0), math.inf)
+    twelve = typical([np.array([2.0**k]) for k in range(12)])
+    assert (twelve.low, twelve.high) == pytest.approx((4.0, 512.0))  # Conover 1999, Table A3: the third of twelve
 
 
-def test_the_ratio_of_geometric_means_is_paired_by_shape():
+def test_holm_takes_the_least_chance_first_and_stops_at_the_first_that_does_not_differ():
+    def of(below: int, shapes: int = 12) -> Interval:
+        return ratio([np.array([0.5])] * below + [np.array([2.0])] * (shapes - below), [np.array([1.0])] * shapes)
+
+    assert differ([of(10), of(12)]) == [True, True]  # .0005 <= .05 / 2, then .039 <= .05
+    assert differ([of(12), of(10), of(10), of(6)]) == [True, False, False, False]  # .039 > .05 / 3
+    assert differ([of(0), of(5, shapes=5)]) == [True, False]  # five shapes have no interval, and are not counted
+    assert differ([]) == []
+
+
+def test_a_ratio_is_paired_by_shape():
     first = [np.array([e]) for e in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
-    found = geometric_ratio([3 * e for e in first], first)
+    found = ratio([3 * e for e in first], first)
     assert (found.value, found.low, found.high) == pytest.approx((3.0, 3.0, 3.0))
     assert found.points == pytest.approx((3.0,) * 6)
     with pytest.raises(ValueError, match="must have the same shapes"):
-        geometric_ratio(first, first[:5])
+        ratio(first, first[:5])
 
 
 def test_where_both_fail_on_a_shape_the_ratio_is_1():
     good, failed = np.array([2.0]), np.array([np.inf])
-    found = geometric_ratio([failed, *[2 * good] * 5], [failed, *[good] * 5])
+    found = ratio([failed, *[2 * good] * 5], [failed, *[good] * 5])
     assert found.points == pytest.approx((1.0, *[2.0] * 5))
-    assert found.value == pytest.approx(2 ** (5 / 6)) and found.low < found.value < found.high
-    assert geometric_ratio([failed, *[good] * 5], [good] * 6).value == np.inf
+    assert (found.value, found.low, found.high) == pytest.approx((2.0, 1.0, 2.0))
+    apart = ratio([failed] * 3 + [good] * 3, [good] * 3 + [failed] * 3)  # neither is known to be better
+    assert math.isnan(apart.value) and (apart.low, apart.high) == (0.0, math.inf)
