@@ -25,13 +25,15 @@ def merge(sources: list[Path], into: Path) -> list[str]:
     A run with a link that leads out of its results folder is not copied, and has a line too.
 
     Raises:
-        ValueError: for a source that is not a results folder, or that is or contains `into`.
+        ValueError: for a source that is not a results folder, or that is or contains `into`; where `into` is a file.
     """
     for source in sources:
         if not (source / "runs").is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
         if not leads_out(into, source):
             raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")
+    if into.is_file():
+        raise ValueError(f"{into} is a file: --into must be a folder, or a new name")
     check_links(into)
     (into / "runs").mkdir(parents=True, exist_ok=True)
     lines: list[str] = []

@@ -136,6 +136,8 @@ def check_results(results_dir: Path) -> None:
     Raises:
         ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
     """
+    if results_dir.is_file():
+        raise ValueError(f"results_dir={results_dir} is a file: name the folder that has runs")
     if not results_dir.is_dir():
         raise ValueError(
             f"results_dir={results_dir}: there is no such folder; name one that has runs, or make a run: "

@@ -1,7 +1,7 @@
 """One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, two figures."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -131,8 +131,7 @@ class Compared:
     @cached_property
     def conditions(self) -> list[str]:
         """The values of the condition, in their order."""
-        found = {str(value) for value in self.cells["at"]}
-        return [value for value in ORDER if value in found] + sorted(found - {*ORDER})
+        return ordered({str(value) for value in self.cells["at"]})
 
     def part(self, family: str, row: tuple[str, str], at: str | None = None) -> pd.DataFrame:
         """The lines of a family, or of `EVERY`, and of a row, at one condition or at all."""
@@ -356,6 +355,13 @@ def differing(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
     sure = [f"{name} {found.ratio}" for (name, found), other in zip(known, differ, strict=True) if other]
     named = f": {'; '.join(sure)}" if sure else ""
     return f"{HOLM}, *{len(sure)} of {len(known)}* ratios {of} differ from 1{named}." if known else ""
+
+
+def ordered(conditions: Collection[str]) -> list[str]:
+    """Values of the condition, from many points to few; words that are not known last."""
+    numbers = sorted((value for value in conditions if value.isdigit()), key=int, reverse=True)
+    words = sorted({*conditions} - {*numbers})
+    return [*(w for w in ORDER if w in words), *numbers, *(w for w in words if w not in ORDER)]
 
 
 def heading(condition: str) -> str:

@@ -97,7 +97,7 @@ def pictures(runs: Runs) -> Result:
 def _block(name: str, of_family: list[records.Record], scene: gallery.Scene) -> gallery.Block:
     """The rows of a family over the number of points, behind them the truth."""
     found = records.grouped(of_family, _points)
-    points = [p for p in compare.ORDER if p in found] + sorted(found.keys() - {*compare.ORDER})
+    points = compare.ordered(found)
     given = [scene.shared(found[p][:1], gallery.depth) for p in points]
     rows = {"given depths": [*given, scene.shared(of_family, gallery.normals(gallery.TRUE), BOTH)]}
     for row, own in records.grouped(of_family, records.row_of).items():

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import COSTS, EVERY, HOLM, Compared
+from bench.report.compare import COSTS, EVERY, HOLM, Compared, ordered
 from bench.report.data.runs import choose
 from bench.studies import one_loss, tuned
 from tests.report.test_report_paper import write_run
@@ -77,6 +77,11 @@ def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
     newton = line(result, "newton with mask", "sofa")
     assert newton["failed"] == "2 of 12"
     assert newton["error"] == pytest.approx(4)  # of 2 to 6, and of VolSDF's 4 on the first shape
+
+
+def test_conditions_stand_from_many_points_to_few():
+    found = {"9", "dense", "500", "20", "mine", "90", "10%", "100"}
+    assert ordered(found) == ["dense", "10%", "500", "100", "90", "20", "9", "mine"]
 
 
 def test_without_the_reference_there_is_no_ratio_and_no_verdict(whole):

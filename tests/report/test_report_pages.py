@@ -82,21 +82,27 @@ def test_two_presets_under_one_label_are_two_rows(tmp_path):
     assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
 
 
-def test_a_study_is_found_by_its_file(tmp_path, monkeypatch):
+def test_a_study_is_found_by_its_file_and_one_that_cannot_be_read_costs_no_other(tmp_path, monkeypatch):
     folder = tmp_path / "studies"
     folder.mkdir()
     (folder / "mine.py").write_text(STUDY.format(place=5))
+    (folder / "broken.py").write_text("import nonsense_module\n")
+    (folder / "twice.py").write_text(STUDY.format(place=6))
     monkeypatch.setattr(paper, "STUDIES", folder)
     monkeypatch.setattr(bench.studies, "__path__", [str(folder)])
     studies.cache_clear()
     try:
         write_run(tmp_path, "mine", NAIVE, metrics=costs(3))
-        written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path)]
-        assert written == ["mine.csv", "mine_again.csv"]
+        problems: list[str] = []
+        written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
+        assert written == ["mine.csv", "mine_again.csv"] and len(problems) == 2
+        assert problems[0].startswith("not made: bench/studies/broken.py (ModuleNotFoundError: ")
+        assert problems[1].startswith("not made: bench/studies/twice.py (ValueError: another study has a page mine: ")
         assert [found.name for found in find_paper(tmp_path) if not found.shipped] == ["mine", "mine_again"]
     finally:
         studies.cache_clear()
-        sys.modules.pop("bench.studies.mine", None)
+        for name in ("mine", "twice"):
+            sys.modules.pop(f"bench.studies.{name}", None)
 
 
 @pytest.mark.parametrize("caption", [False, True])

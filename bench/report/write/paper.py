@@ -35,6 +35,9 @@ the experiment that a page names; the README of `conf` lists the experiments and
 """
 
 
+BROKEN = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)  # of an odd or foreign record
+
+
 @dataclass(frozen=True)
 class Study:
     """A file of `bench/studies`: the runs that it reads, and its pages, each made of them by a function.
@@ -46,6 +49,7 @@ class Study:
     place: int
     reads: tuple[Selection, ...]
     pages: dict[str, Callable[..., Result]]
+    problem: str = ""  # of a file that cannot be read
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
         """The result of each page; none where there is no run of it."""
@@ -57,12 +61,17 @@ class Study:
 
 @cache
 def studies() -> tuple[Study, ...]:
-    """All files of `bench/studies`, in the order of their places."""
-    files = [import_module(f"bench.studies.{file.name}") for file in iter_modules([str(STUDIES)])]
-    return tuple(sorted((Study(f.PLACE, f.READS, f.PAGES) for f in files), key=lambda study: study.place))
-
-
-BROKEN = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)  # of an odd or foreign record
+    """All files of `bench/studies`, in the order of their places; a file that cannot be read has a problem alone."""
+    found: list[Study] = []
+    for file in iter_modules([str(STUDIES)]):
+        try:
+            read = import_module(f"bench.studies.{file.name}")
+            if taken := {name for study in found for name in study.pages} & {*read.PAGES}:
+                raise ValueError(f"another study has a page {min(taken)}: give it another name")
+            found.append(Study(read.PLACE, read.READS, read.PAGES))
+        except (*BROKEN, ImportError, NameError, SyntaxError) as error:
+            found.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
+    return tuple(sorted(found, key=lambda study: study.place))
 
 
 def write_paper(
@@ -79,6 +88,8 @@ def write_paper(
     for study in studies():
         experiments = [selection.experiment for selection in study.reads]
         try:
+            if study.problem:
+                raise ValueError(study.problem)
             results = study.results(records, results_dir)
             pages = [
                 (name, result, result.shown(100 * study.place + place, experiments))
@@ -87,7 +98,8 @@ def write_paper(
         except BROKEN as error:
             if problems is None:
                 raise
-            problems.append(f"not made: {', '.join(study.pages)} ({type(error).__name__}: {error})")
+            told = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"
+            problems.append(f"not made: {study.problem or told}")
             continue
         for name, result, shown in pages:
             if into is None or not shown.caption.startswith(SMOKE):
