@@ -31,7 +31,7 @@ NOTES = (
 COST_NOTES = (
     "Axes are those that evaluate renderings and that every renderer supports; rank 1 is the best, and equal "
     "breakdowns share their mean rank.",
-    "A run that did not end ok, or is missing, has the worst rank.",
+    "A run that did not end ok, or is missing, has the worst rank; 95 % bootstrap intervals over axes.",
     "At once: axes on which it breaks at the mildest severity; none: on which it does not break at the severest.",
 )
 CURVE_NOTES = (
@@ -46,7 +46,7 @@ NUMBERS = (
 )
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COSTS = (
-    *(table.text("row", "Renderer"), table.Column("axes"), table.Column("rank", "Mean rank")),
+    *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
     *(
         table.text("at_once", "At once"),
         table.text("never", "None"),
@@ -102,12 +102,14 @@ def make_cost(runs: Runs) -> Result:
     ranks = statistics.rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
-    lines["behind"] = lines.groupby(["cost", "rank"]).cumcount()  # of points at one place
+    means = lines["rank"].map(lambda rank: rank.value)
+    lines["behind"] = lines.groupby(["cost", means]).cumcount()  # of points at one place
     points = [
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
-        for line in lines.dropna(subset=["cost", "rank"]).itertuples()
+        for line in lines[lines["cost"].notna() & means.notna()].itertuples()
     ]
     costs = [f"{line.row}, {format.number(line.cost)} field values per ray" for line in lines.itertuples()]
+    ends = format.ends("Mean rank", dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
     panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(
@@ -115,7 +117,7 @@ def make_cost(runs: Runs) -> Result:
         "Robustness over cost.",
         "Mean rank of the breakdowns over the median, over axes, of the field values per ray at the mild end.",
         question="Is a robust renderer an expensive one?",
-        verdict=format.ends("Mean rank", dict(zip(costs, lines["rank"], strict=True)), f"{len(shades)} axes"),
+        verdict=f"{ends} {_alike(ranks)}".strip(),
         n=f"{len(shades)} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
         columns=COSTS,
@@ -279,11 +281,22 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
     return figure
 
 
-def _cost(cells: pd.DataFrame, row: str, mean: float) -> dict[str, Any]:
+def _alike(ranks: dict[str, statistics.Interval]) -> str:
+    """Which rows cannot be told from the one of the best rank; empty where no row has an interval."""
+    known = {row: rank for row, rank in ranks.items() if rank.known}
+    if not known:
+        return ""
+    best = min(known, key=lambda row: known[row].value)
+    found = statistics.as_good(known, best)
+    named = f": {', '.join(found)}" if found else ""
+    return f"The interval of the difference to {best} holds 0 for *{len(found)}* of the others{named}."
+
+
+def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:
     """The line of a renderer on the shared axes; where it breaks at once it may be cheap but find nothing."""
     ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
     cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
-    return {"row": row, "axes": len(cells), "rank": mean, **ends, "cost": cost}
+    return {"row": row, "axes": len(cells), "rank": rank, **ends, "cost": cost}
 
 
 def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:

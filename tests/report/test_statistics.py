@@ -7,6 +7,7 @@ from scipy import stats
 from bench.report.data.statistics import (
     FEWEST_SHAPES,
     Interval,
+    as_good,
     bootstrap,
     clopper_pearson,
     differ,
@@ -193,7 +194,7 @@ def test_a_share_counts_shapes_not_trials():
 def test_one_run_of_each_gives_no_probability_and_no_rank():
     assert np.isnan(front([point([1], [1]), point([2], [2])], seed=0)).all()
     assert front([point([1, 1], [1, 1]), point([2, 2], [2, 2])], seed=0) == [1, 0]
-    assert np.isnan(list(rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())).all()
+    assert all(math.isnan(found.value) for found in rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())
 
 
 def test_rank_worked_example():
@@ -203,9 +204,23 @@ def test_rank_worked_example():
         "c": {"cow": 3.0, "sofa": 5.0},
     }
     # cow 1.5, 1.5, 3; car 2, 1, fails; sofa fails, fails, 1; a hat nobody makes does not count; failing has rank 3
-    assert rank(table) == pytest.approx({"a": (1.5 + 2 + 3) / 3, "b": (1.5 + 1 + 3) / 3, "c": (3 + 3 + 1) / 3})
-    assert rank({"a": {"cow": None, "car": None}, "b": {}}) == {"a": 2, "b": 2}
+    expected = {"a": (1.5 + 2 + 3) / 3, "b": (1.5 + 1 + 3) / 3, "c": (3 + 3 + 1) / 3}
+    assert {name: found.value for name, found in rank(table).items()} == pytest.approx(expected)
+    assert [found.value for found in rank({"a": {"cow": None, "car": None}, "b": {}}).values()] == [2, 2]
     assert rank({}) == {}
+
+
+def test_a_rank_has_an_interval_over_shapes_and_those_that_do_not_differ_from_the_best_are_named():
+    places = range(12)
+    table = {
+        "best": {i: 1.0 for i in places},
+        "tied": {i: 0.5 if i % 2 else 2.0 for i in places},
+        "last": {i: 3.0 for i in places},
+    }
+    found = rank(table)
+    assert found["last"].value == found["last"].low == found["last"].high == 3
+    assert found["tied"].low < found["tied"].value == 1.5 < found["tied"].high
+    assert as_good(found, "best") == ["tied"]
 
 
 def test_dominated():

@@ -217,19 +217,32 @@ def clopper_pearson(value: float, n: float) -> Interval:
     return Interval(value, low, high)
 
 
-def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, float]:
-    """Each method's mean rank over the shapes, 1 is the best; equal errors share their mean rank.
+def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, Interval]:
+    """Each method's mean rank over the shapes with its bootstrap interval, 1 is the best; equal errors share a rank.
 
     A method without a finite error for a shape has the worst rank there: the number of methods. A shape at which all
-    methods fail is left out. From one shape no rank is given: nan.
+    methods fail is left out. From one shape no rank is given: nan. `Interval.points` are the ranks of the shapes.
 
     Args:
         table: the errors of each method by shape, or by anything else that is compared.
     """
-    if len({shape for errors in table.values() for shape in errors}) < 2:
-        return dict.fromkeys(table, math.nan)
+    worst, several_shapes = float(len(table)), len({shape for errors in table.values() for shape in errors}) > 1
     errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
-    return errors.rank(axis=1).fillna(len(table)).mean().fillna(len(table)).to_dict()
+    ranks = errors.rank(axis=1).fillna(worst)
+    if not several_shapes or ranks.empty:
+        return dict.fromkeys(table, Interval(worst if several_shapes else math.nan, math.nan, math.nan))
+    return {name: _mean_of(ranks[name].to_numpy()) for name in table}
+
+
+def _mean_of(values: np.ndarray) -> Interval:
+    return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1), seed=0)
+
+
+def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
+    """The other methods whose ranks do not differ from the best one's: the interval of the difference holds 0."""
+    first = np.array(ranks[best].points)
+    others = {name: _mean_of(np.array(found.points) - first) for name, found in ranks.items() if name != best}
+    return [name for name, found in others.items() if not found.excludes(0)]
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:
