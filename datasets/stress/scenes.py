@@ -7,7 +7,7 @@ renderer gets the same exams.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from math import asin, atan, cos, degrees, pi, radians, sin
+from math import asin, atan, cos, degrees, exp, pi, radians, sin
 from operator import or_
 
 import numpy as np
@@ -203,11 +203,31 @@ def nan_region(severity: float, draw: np.random.Generator, resolution: int) -> E
     return Exam(Shape(value, Kind.DISTANCE), exam.camera, exam.truth)
 
 
+def floaters(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+    """A dip of a width in the distance in front of a smaller cube, as in a network; it is a third of the picture wide.
+
+    The dip is a Gaussian half as deep again as the distance there: a small ball of its own, in a field that far from it
+    is the cube's distance.
+    """
+    cube, away = box((0.42,) * 3), 0.81
+    wide = 3 * 1.8 * severity  # the ball's radius is .9 of the Gaussian's
+    exam = _seen(cube, draw, resolution, field_of_view=2 * degrees(atan(wide / 2 / (DISTANCE - away))), **CORNER)
+    center = away * torch.nn.functional.normalize(exam.camera.center, dim=0)
+    depth = 1.5 * float(cube.field(center))
+
+    def value(points: Tensor) -> Tensor:
+        square = (points - center.to(points)).square().sum(dim=-1)
+        return cube.field(points) - depth * torch.exp(-square / (2 * severity**2))
+
+    steepest = 1 + depth / severity * exp(-0.5)
+    return Exam(Shape(value), exam.camera, ReferenceTruth(Shape(value), steepest, min(0.01, severity / 5)))
+
+
 SCENES: dict[str, Scene] = {
     scene.__name__: scene
     for scene in (
         thin_plate, wires, nested_shells, bumps, tiny_objects, gap, csg_difference, grazing_plane, near_camera,
-        camera_inside, empty_scene, nan_region,
+        camera_inside, empty_scene, nan_region, floaters,
     )
 }  # fmt: skip
 SCENES |= {name: _distorted(distortion) for name, distortion in distortions.DISTORTIONS.items()}

@@ -19,7 +19,7 @@ from bench.stress.judge import judge_gradient, judge_rendering, truth
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
 from bench.tables import choice, names
-from datasets.stress.scenes import SCENES
+from datasets.stress.scenes import DISTANCE, SCENES
 from datasets.stress.solids import box, half_space, rod, sphere_solid
 from renderers import reference
 from renderers.camera import Rays
@@ -100,6 +100,21 @@ def test_every_stress_has_the_same_trial_for_every_renderer(name):
     assert torch.equal(one.camera.world_to_camera, same.camera.world_to_camera)
     first, again = truth(one)[0], truth(same)[0]
     assert torch.equal(first.hit, again.hit)
+
+
+def test_a_floater_is_seen_by_samples_and_not_by_a_march():
+    """A ball of radius .9 x .03 in front of a cube, of .09 of the picture: 1.8 of 5.4 widths across."""
+    exam = SCENES["floaters"](0.03, drawn(), 48)
+    found = truth(exam)[0]
+    in_front = found.distance < DISTANCE - 0.81 + 0.03
+    assert in_front.double().mean() == pytest.approx(np.pi / 4 / 9, rel=0.3)
+    rays = exam.camera.rays().flat()
+    share = {}
+    for name in ("dist", "newton", "dvr"):
+        rendering = load("renderer", name).render(exam.field, rays)
+        near = (rendering.distance - found.distance).abs() < 0.01
+        share[name] = float((rendering.hit & near)[in_front].double().mean())
+    assert share["dist"] < 0.1 and share["newton"] < 0.1 and share["dvr"] > 0.9
 
 
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
