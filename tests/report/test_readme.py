@@ -32,7 +32,7 @@ def test_the_results_page_follows_its_tables(tmp_path):
     (folder / "mine.json").write_text(replace(mine, rows=[["x", "1.5"]], notes=["A note"]).to_json())
     text = write_readme(tmp_path).read_text()
     assert (
-        "- [Whose?](#mine)" in text
+        "| [Whose?](#mine) | Of 1 run. |" in text
         and "Whose? **Of 1 run.**" in text
         and "Of one run." in text
         and ["x", "1.5"] in rows(text)

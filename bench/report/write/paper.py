@@ -16,7 +16,7 @@ from bench.records.read import PLAN
 from bench.records.record import leads_out, write_text
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.caption import SMOKE
-from bench.report.write.result import Result, Shown, markdown, read_shown, write
+from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
@@ -181,7 +181,7 @@ def write_readme(results_dir: Path) -> Path | None:
     pages = [page for page in _in(results_dir) if page.shown.title]
     if not pages:
         return None
-    contents = [f"- [{page.shown.question or page.shown.title.rstrip('.')}](#{page.name})" for page in pages]
+    contents = ["| question | answer |", "|---|---|", *map(_answer, pages)]
     path = results_dir / "README.md"
     parts = [_section(page) for page in pages]
     write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
@@ -212,6 +212,12 @@ def link(*parts: str) -> str:
 def key_of(name: str) -> str:
     """The name of a script of data: letters and digits, whatever its run or table is called."""
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+
+def _answer(page: Found) -> str:
+    """A page's line in the table of all answers."""
+    asked = page.shown.question or page.shown.title.rstrip(".")
+    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.verdict.replace('*', ''))} |"
 
 
 def _section(page: Found) -> str:

@@ -197,16 +197,17 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
 
 def markdown(shown: Shown, name: str) -> str:
     """The Markdown text of a page: question and verdict, title, caption, table, picture and notes."""
-    asked = [f"{_md(shown.question)} **{_md(shown.verdict.replace('*', ''))}**"] if shown.verdict else []
-    parts = [*asked, f"**{_md(shown.title)}** {_md(shown.caption)}"]
+    verdict = as_markdown(shown.verdict.replace("*", ""))
+    asked = [f"{as_markdown(shown.question)} **{verdict}**"] if verdict else []
+    parts = [*asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
-        head, *rows = ([_md(cell) for cell in row] for row in (shown.columns, *shown.rows))
+        head, *rows = ([as_markdown(cell) for cell in row] for row in (shown.columns, *shown.rows))
         rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if shown.drawn:
-        parts.append(f"![{_md(shown.title)}]({name}.png)")
+        parts.append(f"![{as_markdown(shown.title)}]({name}.png)")
     if shown.notes:
-        parts.append("\n".join(f"- {_md(note)}" for note in shown.notes))
+        parts.append("\n".join(f"- {as_markdown(note)}" for note in shown.notes))
     return "\n\n".join(parts) + "\n"
 
 
@@ -241,7 +242,8 @@ def _tex(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in _flat(text))
 
 
-def _md(text: str) -> str:
+def as_markdown(text: str) -> str:
+    """A text on one line, in which nothing has a meaning in Markdown or HTML."""
     escaped = html.escape(_flat(text), quote=False)
     return "".join(c if c in _SPARED else _MARKDOWN.get(c, c) for c in escaped)
 
