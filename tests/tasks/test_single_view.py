@@ -209,11 +209,12 @@ def test_the_nearest_image_and_the_best_shape_are_those_of_the_same_shape(images
 
 def test_the_nearest_image_is_one_image_and_no_mean_over_a_shape(images):  # noqa: F811
     """Of two shapes one has the very image beside others that differ, the other has all of them a little off."""
-    given, black = images[0].image(0), torch.zeros_like(images[0].colours[:1])
-    very = replace(images[0].first(1), colours=torch.cat([images[0].colours[:1], black, black]))
-    very = replace(very, masks=very.masks[:1].repeat(3, 1, 1), cameras=very.cameras * 3)
-    near = (images[0].colours[:1].int() + 20).clamp(0, 255).to(torch.uint8)
-    all_near = replace(very, colours=near.repeat(3, 1, 1, 1))
+    one = images[0]
+    given, colours = one.image(0), one.colours[:1]
+    same = replace(one, masks=one.masks[:1].repeat(3, 1, 1))
+    very = replace(same, colours=torch.cat([colours, torch.zeros_like(colours), torch.zeros_like(colours)]))
+    near = (colours.int() + 20).clamp(0, 255).to(torch.uint8)
+    all_near = replace(same, colours=near.repeat(3, 1, 1, 1))
     assert most_alike(given, [all_near, very]) == 1
 
 
