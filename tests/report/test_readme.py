@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.report.write.paper import write_readme
-from bench.report.write.result import Shown
+from bench.report.write.result import Shown, read_shown
 from tests import readme
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,3 +46,16 @@ def test_the_table_of_the_readme_is_that_of_the_committed_results():
 
 def test_the_readme_is_short():
     assert readme.wrongs((ROOT / "README.md").read_text()) == []
+
+
+def test_each_number_of_an_answer_is_in_the_table_that_it_names():
+    answers = re.findall(
+        r"^\| .+\? \| .*results/README.md#(\w+)\)(.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    assert len(answers) >= 5
+    for name, text in answers:
+        shown = read_shown(PAPER / f"{name}.json")
+        known = [float(x) for x in re.findall(r"\d+\.\d+", shown.verdict + str(shown.rows))]
+        for number in re.findall(r"\d+\.\d+", text):
+            places = len(number.partition(".")[2])
+            assert any(round(x, places) == float(number) for x in known), (name, number)
