@@ -49,9 +49,8 @@ def test_the_readme_is_short():
 
 
 def test_each_number_of_an_answer_is_in_the_table_that_it_names():
-    answers = re.findall(
-        r"^\| .+\? \| .*results/README.md#(\w+)\)(.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE
-    )
+    line = r"^\| .+\? \| .*results/README.md#(\w+)\)(.*) \|$"
+    answers = re.findall(line, (ROOT / "README.md").read_text(), re.MULTILINE)
     assert len(answers) >= 5
     for name, text in answers:
         shown = read_shown(PAPER / f"{name}.json")
