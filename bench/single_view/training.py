@@ -214,7 +214,7 @@ def _keep(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Co
 def _restored(path: Path, model: SingleView, optimiser: torch.optim.Adam, course: Course) -> int:
     """Fills model, optimiser and course from a kept state, if there is a whole one; gives the number of its steps."""
     try:
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, UnpicklingError):  # none, or one that was cut short
         return 0
     model.load_state_dict(state["weights"])

@@ -95,6 +95,7 @@ class Capacity:
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
+            renderer, settings_notes = inputs.pixel_precise  # before the fits: it may be refused
             growth = grow(fitter, candidates, models.growth)
             fits: dict[str, Fitted] = {}
             for fitted in fit_all(fitter, candidates):
@@ -108,7 +109,6 @@ class Capacity:
             choice = choose(evidence, views.footprint, models.size)
             chosen = fits[choice.chosen.candidate]
             checked = check(chosen, list(fits.values()), views, self.checks, seed=inputs.seed)
-            renderer, settings_notes = inputs.pixel_precise
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
             metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
         result = evaluate(chosen.model.frozen(), inputs)

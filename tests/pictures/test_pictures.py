@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from PIL import Image
 
 from bench.config import load
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
-from bench.pictures.run_figures import ViewPair, _show_depth, save_gallery
+from bench.pictures.run_figures import ViewPair, _show_depth, draw_curve, save_gallery
 from bench.pictures.style import legend_below
+from bench.reconstruct.problem import ReconstructionProblem
+from bench.tasks.pose import TRACKED
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, View, see
 from renderers.fields.analytic import sphere
@@ -205,3 +208,11 @@ def test_a_legend_wider_than_the_figure_takes_fewer_columns():
         (legend,) = figure.legends
         assert legend._ncols == columns
         assert legend.get_window_extent().width <= figure.bbox.width or columns == 1
+
+
+def test_a_curve_has_terms_of_the_loss_and_no_error(drawn, tmp_path):
+    known = SimpleNamespace(subject=SimpleNamespace(truth=object()))
+    errors = dict.fromkeys((*TRACKED, *ReconstructionProblem.tracked.fget(known)), 1.0)  # type: ignore[misc]
+    line = {"iteration": 0, "seconds": 0.1, "value_evaluations": 9, "total": 2.0, "depth": 1.5}
+    draw_curve(tmp_path / "curve.png", [line | errors, line | {"iteration": 1}])
+    assert [shown.get_label() for shown in drawn[0].axes[0].lines] == ["total", "depth"]

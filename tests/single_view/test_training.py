@@ -217,6 +217,16 @@ def recipe(renderer, **changed) -> Recipe:
     return Recipe(Balls(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
 
 
+def test_a_training_goes_on_without_the_gpu_that_it_began_on(images, renderer, tmp_path, monkeypatch):
+    state, begun = tmp_path / "begun.state", []
+    with monkeypatch.context() as patch:
+        patch.setattr("torch.serialization.location_tag", lambda storage: "cuda:0")
+        trained(images, renderer, state, steps=2)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    trained(images, renderer, state, progress=lambda phase, done, *told: begun.append(done))
+    assert begun[0] == 3
+
+
 def test_a_step_that_is_no_number_keeps_the_last_state_and_has_a_record(renderer, tmp_path, monkeypatch):
     give = Lessons.give
 

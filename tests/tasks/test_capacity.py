@@ -43,6 +43,12 @@ def run(folder, compose_config, *overrides: str) -> Record:
     return record
 
 
+def test_steps_that_cannot_reach_pixel_precision_are_told_before_any_fit(compose_config, tmp_path):
+    record = run(tmp_path, compose_config, "task=capacity", "dataset=capsule", "renderer=dist", "renderer.alpha=2.5")
+    assert record.status != "ok" and "renderer.alpha must lie between 0 and 2" in record.reason
+    assert (tmp_path / "curve.jsonl").read_text() == ""
+
+
 def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     ladder = "models.candidates=[sphere,rounded_box]"
     better = ("models.fit.iterations=16", "models.fit.warm_iterations=120")

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.names import flat
-from bench.records.read import NO_TERMS, curve_lines
+from bench.records.read import ERRORS, NO_TERMS, curve_lines
 from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
@@ -65,7 +65,7 @@ def curve(folder: Folder) -> dict[str, Any] | None:
     sound = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
     if not sound:
         return None
-    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in NO_TERMS]
+    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in (*NO_TERMS, *ERRORS)]
     terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in sound)][:MOST_LINES]
     kept = [sound[place] for place in _kept(sound)]
     names = [*NO_TERMS, *terms]
