@@ -119,26 +119,11 @@ def finite(values: Any) -> list[float]:
     return [float(x) if isinstance(x, Real) and math.isfinite(x) else math.nan for x in values]
 
 
-def needs_log(values: Any, factor: float = 20.0) -> bool:
-    """Whether the positive values differ by more than a factor, too much for a linear axis."""
-    positive = [x for x in finite(values) if x > 0]
-    return bool(positive) and max(positive) > factor * min(positive)
-
-
-def labelled(*axes: Axes) -> dict[str, Any]:
-    """The legend's handle for each label of some axes, each label once."""
-    return {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
-
-
 def legend_below(figure: Figure, *axes: Axes, columns: int = 4) -> None:
     """Draws one legend of some axes below them, in so many columns, or in fewer where it is wider than the figure."""
-    legend_of(figure, labelled(*axes), columns=columns)
-
-
-def legend_of(figure: Figure, named: dict[str, Any], *, columns: int = 4, side: str = "center") -> None:
-    """As `legend_below`, of handles by name, at the `side` "left", "center" or "right"."""
+    named = {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
     for ncols in range(columns, 0, -1):
-        legend = figure.legend(named.values(), named.keys(), loc=f"outside lower {side}", ncols=ncols)
+        legend = figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=ncols)
         if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
             break
         legend.remove()
