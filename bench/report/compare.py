@@ -14,7 +14,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.records.read import read_plans
 from bench.report.data import statistics
-from bench.report.data.records import RunKey, by_shape, error, setting, shape
+from bench.report.data.records import SCALE, RunKey, by_shape, error, setting, shape
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, geometric_mean
 from bench.report.write import chart
@@ -324,7 +324,7 @@ class Compared:
             panels.append(chart.panel_data("", label, self.label, points))
         return panels
 
-    def draw_conditions(self, rows: Sequence[tuple[str, str]], marks: dict[str, float], mark: str = "") -> Figure:
+    def draw_conditions(self, rows: Sequence[tuple[str, str]], marks: dict[str, float], mark: str) -> Figure:
         """Draws a panel per family: the median of each of the rows over the conditions.
 
         Args:
@@ -373,15 +373,15 @@ def _end(found: Gap | None, end: str) -> float:
     return math.nan if found is None else getattr(found.ratio, end)
 
 
-def oracles(runs: Runs, metric: str, scale: float = 1000.0) -> dict[str, float]:
-    """The median Chamfer, times `scale`, of the prior's fit, of each family of which all shapes were fitted.
+def oracles(runs: Runs, metric: str) -> dict[str, float]:
+    """The median Chamfer x 1000 of the prior's fit, of each family of which all shapes were fitted.
 
     The fits must have been judged as the runs were: with the same split, prior, grid and number of points.
     """
     fits = runs.other(PRIORS)
     if fits is None or _judged(fits.requested()) != _judged(runs.requested()):
         return {}
-    found = {shape(record): scale * error(record, metric) for record in fits.records}
+    found = {shape(record): SCALE * error(record, metric) for record in fits.records}
     wanted = {name: {shape(record) for record in records} for name, records in runs.families().items()}
     complete = {name: shapes for name, shapes in wanted.items() if shapes <= set(found)}
     return {name: float(statistics.median([found[one] for one in shapes])) for name, shapes in complete.items()}

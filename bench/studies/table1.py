@@ -82,11 +82,8 @@ def _size(record: records.Record) -> str:
     status = "" if record["status"] == "ok" else record["status"]
     if size is not None and size == requested:
         return f"{requested} ({status})" if status else str(requested)
-    return (
-        f"{table.whole(size)} ({requested}: {record['status']})"
-        if requested
-        else f"{table.whole(size)} ({record['status']})"
-    )
+    asked = f"{requested}: " if requested else ""
+    return f"{table.whole(size)} ({asked}{record['status']})"
 
 
 def _step(record: records.Record) -> str:

@@ -45,10 +45,6 @@ class Interval:
         """Whether there is an interval."""
         return not math.isnan(self.low)
 
-    def excludes(self, value: float) -> bool:
-        """Whether there is an interval, and a value lies outside it."""
-        return self.known and not self.low <= value <= self.high
-
     def below(self, edge: float) -> "Interval":
         """The same with what is beyond the edge set to it, to be drawn."""
         value, low, high, *points = np.minimum([self.value, self.low, self.high, *self.points], edge).tolist()
