@@ -25,8 +25,8 @@ class Outcome(NamedTuple):
 def run_once(overrides: Sequence[str], choices: Mapping[str, Any]) -> Record:
     """Makes a run as `python -m bench` does, in a process of its own, or reuses the finished one; gives its record.
 
-    It needs no `if __name__ == "__main__"`, and works in a notebook. Results go to `results` in the working directory,
-    or to `results_dir`.
+    It needs no `if __name__ == "__main__"`, and works in a notebook. Results go to `results/local` in the working
+    directory, or to `results_dir`.
 
     >>> import bench
     >>> record = bench.run(task="completion", renderer="newton", scale="smoke", overrides=["task.points=50"])

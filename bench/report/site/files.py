@@ -10,8 +10,8 @@ SUFFIXES = (".png", ".gif", ".webp")  # of pictures
 ALT = {  # what the pictures of a run show
     "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",
     "strip.png": "The way from the start to the end, in frames",
-    "strip.gif": "The way from the start to the end, moving",
-    "strip.webp": "The way from the start to the end, moving",
+    "film.gif": "The way from the start to the end, moving",
+    "film.webp": "The way from the start to the end, moving",
     "curve.png": "Loss and error over the iterations",
     "input.png": "What was given",
     "failure.png": "The first failure: kinds of pixels, beside the true distance",
