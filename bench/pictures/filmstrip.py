@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.evaluate.evaluate import coloured_image, picture_view
-from bench.pictures.run_figures import normals_image, window
+from bench.pictures.run_figures import at_size, normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from bench.setup.inputs import RunInputs
 from datasets.scene import Truth, View, see
@@ -85,7 +85,7 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            view = picture_view(field, self._fine(camera), self.inputs)
+            view = picture_view(field, at_size(camera, self.inputs.evaluation.picture), self.inputs)
             colours = coloured_image(field, view, self.inputs.device) if isinstance(field, Coloured) else None
             self.frames[name] = Shown(view, colours)
 
@@ -107,9 +107,10 @@ class Filmstrip:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
     def _truth(self) -> Shown:
+        size = self.inputs.evaluation.picture
         if self.true is None:
-            return Shown(see(Truth(self.inputs.scene.mesh), self._fine(self.inputs.scene.view.camera)))
-        return self.true.enlarged(self._fine(self.true.view.camera))
+            return Shown(see(Truth(self.inputs.scene.mesh), at_size(self.inputs.scene.view.camera, size)))
+        return self.true.enlarged(at_size(self.true.view.camera, size))
 
     def _shown(self, chosen: str | None) -> dict[int | str, Shown]:
         """Evenly spaced frames, with the chosen one; without a checkpoint one iteration before the last."""
@@ -122,10 +123,6 @@ class Filmstrip:
             inner = places[1:-1]
             inner[np.abs(inner - names.index(chosen)).argmin()] = names.index(chosen)
         return {names[place]: self.frames[names[place]] for place in places}
-
-    def _fine(self, camera: Camera) -> Camera:
-        larger = self.inputs.evaluation.picture / max(camera.height, camera.width)
-        return camera.resized(round(larger * camera.height), round(larger * camera.width))
 
 
 def _strip(frames: dict[int | str, Shown], truth: Shown, title: str, chosen: str | None) -> Figure:

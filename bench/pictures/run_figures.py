@@ -225,6 +225,12 @@ def _cameras(inputs: RunInputs, size: int) -> tuple[Camera, Camera]:
     return camera.resized(size, size), behind
 
 
+def at_size(camera: Camera, longest: int) -> Camera:
+    """The camera with so many pixels on the longer side."""
+    larger = longest / max(camera.height, camera.width)
+    return camera.resized(round(larger * camera.height), round(larger * camera.width))
+
+
 def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
     columns = {
         "depth": _show_depth,

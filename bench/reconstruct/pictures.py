@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.evaluate import coloured_image, picture_view
-from bench.pictures.run_figures import draw_curve, normals_image, picture_normals
+from bench.pictures.run_figures import at_size, draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.judge import judge_mesh, judged_pixels
 from bench.reconstruct.subject import Subject
@@ -97,11 +97,11 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
     shot = subject.held_out[len(subject.held_out) // 2]
-    arrays = {"photograph": shot.colours} | _seen_arrays(seen, _larger(shot.camera, inputs.evaluation.picture))
+    arrays = {"photograph": shot.colours} | _seen_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
     if len(subject.given) == 1:
         arrays["given"] = subject.given[0].colours
     if subject.truth is not None:
-        behind = turned(_larger(shot.camera, inputs.evaluation.picture), np.pi)
+        behind = turned(at_size(shot.camera, inputs.evaluation.picture), np.pi)
         true = normals_image(see(Truth(subject.truth), behind))
         arrays |= _seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
     if inputs.evaluation.gallery is not None:
@@ -112,8 +112,8 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
 
 def _rendered_again(seen: Seen, camera: Camera, largest: int) -> dict[str, Tensor]:
     """Pictures of a shape in several sizes, size_0_... and so on, and at the last from other sides, turned_0_..."""
-    cameras = {f"size_{place}_": _larger(camera, largest // smaller) for place, smaller in enumerate(SMALLER)}
-    at_last = _larger(camera, largest)
+    cameras = {f"size_{place}_": at_size(camera, largest // smaller) for place, smaller in enumerate(SMALLER)}
+    at_last = at_size(camera, largest)
     cameras |= {f"turned_{place}_": turned(at_last, np.radians(angle)) for place, angle in enumerate(TURNS)}
     return {k: v for prefix, one in cameras.items() for k, v in _seen_arrays(seen, one, prefix).items()}
 
@@ -125,12 +125,6 @@ def _seen_arrays(seen: Seen, camera: Camera, prefix: str = "") -> dict[str, Tens
     return {prefix + name: part for name, part in parts.items()}
 
 
-def _larger(camera: Camera, size: int) -> Camera:
-    """The camera with so many pixels on the longer side."""
-    larger = size / max(camera.height, camera.width)
-    return camera.resized(round(larger * camera.height), round(larger * camera.width))
-
-
 def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:
     """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
     shots = spread(subject.held_out, MOST_HELD_OUT)
@@ -138,7 +132,7 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     figure = Figure(figsize=(9.6, 2.35 * tall * len(shots) + 1.2), layout="compressed")
     axes = figure.subplots(len(shots), 4, squeeze=False)
     for row, shot in zip(axes, shots, strict=True):
-        view, image = seen(_larger(shot.camera, inputs.evaluation.picture))
+        view, image = seen(at_size(shot.camera, inputs.evaluation.picture))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
         row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
         shown = row[2].imshow(_error(seen, shot), cmap=ERRORS, vmin=0, vmax=WORST, interpolation="nearest")
