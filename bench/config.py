@@ -47,6 +47,13 @@ ROLES = {  # what the class of a node of the top level must be
     "tracker": "bench.trackers.Tracker",
     "supervision": "bench.single_view.training.Supervision",
 }
+TARGETS = {  # classes of nodes without a _target_
+    "view": "datasets.views.ViewSampler",
+    "auto": "bench.setup.auto.AutoSettings",
+    "prior": "bench.shape_prior.PriorSettings",
+    "models": "bench.setup.fields.ModelSettings",
+    "evaluation": "bench.config.EvaluationSettings",
+}
 WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 
@@ -285,22 +292,19 @@ def _lacking(cls: type, role: type) -> str:
     return f"it lacks {', '.join(missing)}: see {role.__module__}" if missing else ""
 
 
-def build_once(
-    nodes: Mapping[str, Any], packages: Sequence[str], targets: Mapping[str, str], built: dict[str, Any]
-) -> list[Any]:
+def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[str, Any]) -> list[Any]:
     """The objects of nodes by name, as `build` makes them; equal nodes are built once.
 
     Args:
         nodes: the nodes.
         packages: that a `_target_` may name, besides ours.
-        targets: classes of nodes without a `_target_`, by name.
         built: objects and errors by the text of their nodes, which is extended.
     """
     texts = {name: json.dumps([name, packages, node], sort_keys=True, default=str) for name, node in nodes.items()}
     for name, text in texts.items():
         if text not in built:
             try:
-                built[text] = build(nodes[name], name, packages, targets.get(name, ""))
+                built[text] = build(nodes[name], name, packages, TARGETS.get(name, ""))
             except ValueError as error:
                 built[text] = error
         if isinstance(built[text], ValueError):

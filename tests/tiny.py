@@ -118,6 +118,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
         make_scene=lambda: scene,
         views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
         make_prior=lambda: prior,
+        make_pixel_precise=lambda: (renderer, []),
         evaluation=EvaluationSettings(
             grid=16, points=50, fscore_threshold=0.02, picture=8, gallery=None, every=None, film=None
         ),

@@ -28,13 +28,6 @@ from renderers.rendering import Renderer, final_notes
 
 WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
 ALL_THREADS = torch.get_num_threads()  # that PyTorch takes by itself
-TARGETS = {  # classes of nodes without a _target_
-    "view": "datasets.views.ViewSampler",
-    "auto": "bench.setup.auto.AutoSettings",
-    "prior": "bench.shape_prior.PriorSettings",
-    "models": "bench.setup.fields.ModelSettings",
-    "evaluation": "bench.config.EvaluationSettings",
-}
 Noted = tuple[Renderer, list[str]]  # a renderer, and notes on its settings with the value `auto`
 
 
@@ -47,6 +40,7 @@ class RunInputs:
     scene_name: str
     make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
+    make_pixel_precise: Callable[[], Noted]  # the renderer at pixel precision, with no more steps than that takes
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
@@ -54,7 +48,6 @@ class RunInputs:
     field: FieldChoice  # what an unknown shape is made of
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
-    make_pixel_precise: Callable[[], Noted] | None = None
     trained: int | None = None  # number of the scene's shape in the prior's training; None where it was not in it
 
     @property
@@ -66,11 +59,6 @@ class RunInputs:
     def scene(self) -> Scene:
         """The scene, made at its first use: not every task needs one."""
         return self.make_scene()
-
-    @cached_property
-    def pixel_precise(self) -> Noted:
-        """The renderer at pixel precision, with no more steps than that takes, and notes on these settings."""
-        return (self.renderer, []) if self.make_pixel_precise is None else self.make_pixel_precise()
 
     @property
     def last_notes(self) -> list[str]:
@@ -188,7 +176,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     packages, built = list(config["packages"]), {} if built is None else built
 
     def parts(*names: str, **nodes: Any) -> list[Any]:
-        return build_once({name: config[name] for name in names} | nodes, packages, TARGETS, built)
+        return build_once({name: config[name] for name in names} | nodes, packages, built)
 
     def renderer(requested: Node) -> Noted:
         """A renderer from its node, with a number for each `auto`, and notes on these."""
@@ -217,6 +205,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         scene_name=dataset.name if isinstance(dataset, Photographed) else scene_name(dataset, split, index),
         make_scene=lambda: make_scene(dataset, view, split=split, index=index),
         make_prior=make_prior,
+        make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
         evaluation=evaluation,
         seed=config["seed"],
         device=device,
@@ -224,7 +213,6 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         field=FieldChoice(config["field"], models),
         dataset=dataset,
         notes=tuple(notes),
-        make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
         trained=index if split == Split.TRAIN and index < prior.shapes else None,
     )
     _check(task, inputs, index)

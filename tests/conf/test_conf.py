@@ -9,7 +9,7 @@ import yaml
 from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, build, check_draw, check_names, load
+from bench.config import CONF, TARGETS, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import combinations
@@ -39,7 +39,6 @@ SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweep
 COMPARING = {"table1": 22, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
 COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
-TARGETS = {"prior": "bench.shape_prior.PriorSettings"}  # nodes whose class the code knows
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))
 
