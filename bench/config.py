@@ -296,7 +296,6 @@ def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[st
     """The objects of nodes by name, as `build` makes them; equal nodes are built once.
 
     Args:
-        nodes: the nodes.
         packages: that a `_target_` may name, besides ours.
         built: objects and errors by the text of their nodes, which is extended.
     """

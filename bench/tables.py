@@ -236,7 +236,6 @@ def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[
     """A resolved `renderer` node without `_rows_`, its look, and a `_label_` inherited from what it builds on.
 
     Args:
-        renderer: the node.
         choice: the name of its file or row.
         runtime: `hydra.runtime`, which has the folders of configurations.
     """

@@ -55,7 +55,6 @@ def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "hei
 
     Args:
         mesh: without colours, it is grey.
-        frames: their number.
         size: of each part, in pixels.
 
     Raises:

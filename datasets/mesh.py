@@ -177,7 +177,6 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
     A distance or a bound is evaluated only near its surface, see `_near_values`; a level set everywhere.
 
     Args:
-        field: what to sample.
         grid: samples per axis.
         reach: half the side of the sampled cube about the origin. A surface that leaves it is left open.
         device: where the field's tensors are.

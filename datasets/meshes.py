@@ -60,7 +60,6 @@ def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = No
     closed surface is shrunk around it.
 
     Args:
-        path: the file.
         close: see `repair`.
 
     Raises:

@@ -27,7 +27,6 @@ def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Me
     Where that changes its area or volume by more than `CHANGED`, the first entry of `repairs` is a warning.
 
     Args:
-        mesh: any mesh.
         close: another way to close a mesh whose holes cannot be closed, tried before it is wrapped.
 
     Raises:
@@ -195,8 +194,6 @@ def _warned(before: Mesh, after: Mesh, closed: Mesh | None = None) -> Mesh:
     """The repaired mesh, with a warning where its area or volume changed much.
 
     Args:
-        before: the mesh as read.
-        after: the repaired mesh.
         closed: the mesh before overlapping parts were merged, which counts overlaps twice: the smaller change counts.
     """
     if after.repairs == before.repairs:

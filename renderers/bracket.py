@@ -71,7 +71,6 @@ def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: in
         field: where it has no finite value it counts as occupied.
         rays: n rays, as many as the bracket has.
         method: "secant", where the line through both ends meets zero, or "bisection", the middle.
-        steps: number of repetitions.
     """
     near, far, near_value, far_value = bracket.near, bracket.far, bracket.near_value, bracket.far_value
     for _ in range(steps):

@@ -36,7 +36,6 @@ class SilhouetteLoss(Protocol):
 
         Args:
             renderer, field, rays: of which `rendering` is the outcome.
-            rendering: of the field.
             observed: the mask, and the distances that are given.
         """
         ...

@@ -252,7 +252,6 @@ def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "heig
     Args:
         mesh: with or without colours.
         truth: of the same mesh.
-        camera: that sees it.
     """
     colours = np.full_like(mesh.vertices, GREY) if mesh.colours is None else mesh.colours
     rays = camera.rays()

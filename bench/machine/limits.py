@@ -47,7 +47,6 @@ class Limits:
         """A field that evaluates `inner` until a limit is reached, counted from now.
 
         Args:
-            inner: the field.
             device: whose memory is watched.
             work: what is limited, named in the reason: "a step"; may be empty.
         """

@@ -110,7 +110,6 @@ def hold_out(
         share: of the rays with a known depth and of the others, from 0 to 1.
         whole: groups that are held out as a whole.
         footprint: half a pixel, in scene units.
-        seed: of the draw.
 
     Raises:
         BadInput: where too few depths are given to hold some out.

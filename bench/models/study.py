@@ -87,7 +87,6 @@ def shares(
         candidates: errors of all candidates.
         settings: the number of draws, and of views in each.
         footprint: half a pixel, in scene units: a choice with an error below it holds as well.
-        seed: of the draws.
     """
     draw, within, held = np.random.default_rng([seed, 4]), 0, 0
     for _ in range(settings.seeds):

@@ -68,7 +68,6 @@ class Filmstrip:
         """Begins without frames.
 
         Args:
-            inputs: of the run.
             over: what the frames' names mean, for the title.
             true: what frames are compared with; None for the scene's shape in its view.
         """
@@ -80,7 +79,6 @@ class Filmstrip:
 
         Args:
             name: its label, such as an iteration.
-            field: that is rendered.
             camera: of the frame; None for the scene's.
         """
         if self.inputs.evaluation.picture is not None:
@@ -94,8 +92,6 @@ class Filmstrip:
         """Writes strip.png into a run folder, and film.gif or film.webp where one is requested.
 
         Args:
-            folder: the run folder.
-            title: of the strip.
             chosen: the frame of the run's result, where that is not the last one: it is shown, with its name in bold.
         """
         if not self.frames:

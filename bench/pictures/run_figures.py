@@ -79,12 +79,7 @@ def draw_run(
     """Writes summary.png and curve.png of a run, at a higher resolution than in the run.
 
     Args:
-        folder: the run folder.
-        inputs: of the run.
         fields: before and after the optimisation.
-        given: the input of the run.
-        curve: lines of curve.jsonl.
-        title: of the summary.
     """
     front, back = _cameras(inputs, inputs.evaluation.picture)
     truth = Truth(inputs.scene.mesh)
@@ -137,10 +132,7 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
     """Writes images.npz and failure.png: rendered and true distances, and the kind of error of each pixel.
 
     Args:
-        folder: the run folder.
         images: "distance", "true_distance" and "kinds", a place in `PIXELS` for each pixel; all [height, width].
-        severity: of the trial.
-        title: of the picture.
     """
     np.savez_compressed(folder / "images.npz", severity=severity, **images)  # type: ignore[arg-type]
     figure = Figure(figsize=(9.2, 3.6), layout="constrained")
@@ -195,8 +187,6 @@ def save_gallery(
     its name, and of the truth, "true".
 
     Args:
-        folder: the run folder.
-        inputs: of the run.
         observed: pixels of the scene's view whose depth is given.
         meshes: by name; None shows nothing.
     """

@@ -59,7 +59,6 @@ def note_surface(
         run: its record and folder are filled.
         mesh: None where no surface was found.
         subject: that it is judged by.
-        scores: further metrics.
         history: of the loop that found it, where there was one.
     """
     after = judge_mesh(mesh, subject, run.inputs)

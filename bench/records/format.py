@@ -78,8 +78,6 @@ def ends(
     """A verdict: the least and the largest of known values, and whose they are; empty without a finite one.
 
     Args:
-        what: the quantity.
-        values: of each row.
         n: the sample in words.
         show: gives the text of a value.
         most: whether the largest is the best, and stands first.

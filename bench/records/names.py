@@ -24,7 +24,6 @@ def differences(
     name has a key only where runs that would else have the same name differ in it.
 
     Args:
-        records: of the runs.
         apart: what tells runs apart without being in their names, such as shape and seed; None for nothing.
         asked: of each run, the keys and values that its sweep asked for, which come before other settings.
     """

@@ -261,8 +261,6 @@ class Compared:
         """The page of the comparison: a line per family and row, with the front of error over cost.
 
         Args:
-            title: as a sentence.
-            question: that its verdict answers.
             changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; `ratio`, the
                 heading of the ratios; and `filled`, see `front`.
         """
@@ -328,9 +326,7 @@ class Compared:
         """Draws a panel per family: the median of each of the rows over the conditions.
 
         Args:
-            rows: to draw.
             marks: a value of each family, drawn as a line; none for others.
-            mark: what that value is.
         """
         places, panels = range(len(self.conditions)), []
         for name in self.families:

@@ -245,7 +245,6 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     """Draws blocks one above the other.
 
     Args:
-        blocks: to draw.
         across: pictures side by side in a cell.
         largest: degrees at the end of the scale of `differences`, which then has a colour bar and a legend.
     """

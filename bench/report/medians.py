@@ -65,7 +65,6 @@ def draw_runs(runs: Runs, panels: Mapping[str, pd.Series], *, log: bool = True) 
     """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
-        runs: of the rows.
         panels: of each measure its values by the label of its axis; nan is not drawn, infinite is at the edge.
         log: whether an axis whose values differ by a factor is logarithmic.
     """

@@ -49,7 +49,6 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     """Composes the configuration of the command line and gives what it describes to `job`, in a sweep once a cell.
 
     Args:
-        job: what the command does.
         runs: whether the cells of a sweep are runs, so that they have a plan.
 
     Returns:

@@ -53,7 +53,6 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
 
     Args:
         job: its record has the configuration.
-        progress: receives the progress.
         checkpoint: receives the record as soon as the machine is known.
 
     Raises:

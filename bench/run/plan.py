@@ -48,7 +48,6 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """Checks all cells of a sweep, before it is written down.
 
     Args:
-        plan: the sweep.
         launcher: the choice of `hydra/launcher`; another machine may have a GPU where this one has none.
         reused: ids of the cells whose finished run is there already, so that they need not be checked.
 

@@ -164,8 +164,6 @@ def _carry_out(job: Job, limits: RunLimits, progress: Report, ready: Callable[[]
     """Does the job in a child process or, for debugging, in this one, and fills its record with what is known.
 
     Args:
-        job: the run.
-        limits: of the child.
         progress: is told of each step.
         ready: is called when the child has imported what it needs.
     """

@@ -52,8 +52,6 @@ def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
     """Prints the outcome of a sweep, the plan's folder last, and gives the status of every planned cell.
 
     Args:
-        plan: the sweep.
-        index: the report's page.
         table: that of the sweep, if it has one of its own.
     """
     statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]

@@ -115,7 +115,6 @@ def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
     It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
 
     Args:
-        plan: the sweep.
         reused: ids of cells that take no time, since their finished run is there already.
     """
     with display() as shown:

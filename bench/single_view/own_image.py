@@ -24,7 +24,6 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
     """A picture as encoders take it, cut so that the object fills a share of it; and what is doubtful about it.
 
     Args:
-        path: of the picture.
         mask: of its mask; None for the picture's alpha channel.
         pixels: height and width of what is given back.
         filled: see `filled_share`.

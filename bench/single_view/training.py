@@ -119,10 +119,8 @@ class Lessons:
         """Trains a network; a training that was stopped goes on from `state`, and ends with the same weights.
 
         Args:
-            network: its sizes.
             state: file of the state of the training, also of one that has ended, until the caller has stored the
                 network.
-            progress: of its steps.
 
         Raises:
             Failed: where the loss or its gradient is not finite; `state` stays.

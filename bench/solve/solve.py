@@ -85,11 +85,7 @@ class Problem(Objective, Protocol):
         """Writes the pictures of the run into its folder.
 
         Args:
-            inputs: of the run.
-            folder: the run folder.
             first: the field before the optimisation.
-            curve: lines of curve.jsonl.
-            title: of the summary.
         """
         ...
 
@@ -134,8 +130,6 @@ def solve(
     """Makes a problem, solves it, fills the run's record and folder, and gives the problem in its final state.
 
     Args:
-        make_problem: makes it.
-        settings: iterations and learning rate.
         run: its record has the definitions of its numbers also where it ends before it has a problem.
         definitions: of the metrics of the problem's `evaluate`.
         gallery: whether pictures for galleries are written, where the configuration asks for them.
@@ -192,9 +186,7 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
     """Writes pictures and filmstrip of a run whose result is noted.
 
     Args:
-        run: its folder is filled.
         draw_pictures: writes the pictures under a title; not called where pictures are off.
-        filmstrip: with all frames.
     """
     record = run.record
     if run.inputs.evaluation.picture is not None:
@@ -208,9 +200,6 @@ def descend(
     """Runs the optimisation loop; writes its curve line by line, and its costs to the record, also if it is stopped.
 
     Args:
-        problem: that is solved.
-        settings: iterations and learning rate.
-        run: its record is filled.
         errors_at: gives the errors of the current state before an iteration, outside the timed part. A line has the
             loss before its step; its errors are of the same parameters.
     """

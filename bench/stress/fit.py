@@ -102,10 +102,7 @@ def judge_fit(
 
     Args:
         name: of the fit, in `FITS`.
-        severity: of what it names.
         draw: of spheres, camera and disturbance.
-        renderer: that is tested.
-        conditions: of all trials.
 
     Raises:
         Unsupported: where the renderer has no gradient towards the field.

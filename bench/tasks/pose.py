@@ -89,7 +89,6 @@ class PoseTask(ABC):
         """The metrics of the pose and of its view; a note where it was not found, which changes no status.
 
         Args:
-            found: the found camera.
             scene: the known mesh and the given view.
             own: what the renderer under test sees from the found camera, where there is one.
         """

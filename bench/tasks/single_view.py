@@ -121,7 +121,6 @@ class OneImage:
         """What determines the network that a run's configuration asks for.
 
         Args:
-            inputs: of the run.
             config: resolved, as plain data.
         """
         check_field_gradient(inputs.renderer)

@@ -53,8 +53,6 @@ def read_image(
     """Colours and mask of an image, each from 0 to 1; the mask is a file's, or the image's alpha channel, or None.
 
     Args:
-        path: of the image.
-        mask: of its mask.
         longest: most pixels along the longer side.
 
     Raises:

@@ -37,7 +37,6 @@ def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.Da
     which another run has no value are left out.
 
     Args:
-        runs: the curves.
         failed: for each run, whether it did not end ok.
         quantity: a column of the curves.
 

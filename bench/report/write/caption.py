@@ -24,7 +24,6 @@ def caption(runs: Runs, plotted: str, *, n: str = "", interval: str = "") -> str
     """The caption of a page, in four sentences, behind a warning where its runs are of scale=smoke.
 
     Args:
-        runs: what the page shows.
         plotted: what is plotted, as a sentence; `OVER` in it becomes that over which runs vary.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval, likewise; empty for none.
@@ -52,8 +51,6 @@ def kind(interval: str, shown: Iterable[Interval], *, drawn: bool) -> str:
     """The kind of interval of the estimates that are shown; that there is none where shapes are fewer than six.
 
     Args:
-        interval: the kind.
-        shown: the estimates.
         drawn: whether a figure draws points in place of intervals.
     """
     known = [estimate.known for estimate in shown]

@@ -20,9 +20,6 @@ def series(name: str, preset: str, x: Iterable[float], y: Iterable[float | Inter
     """Points with the colour and marker that their preset has in every figure; of estimates with their intervals.
 
     Args:
-        name: of the legend.
-        preset: of the row.
-        x: the positions.
         y: the values, or estimates: where one has no interval, the points of its shapes are drawn, small.
         more: what the page reads as well, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
@@ -52,9 +49,7 @@ def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) ->
     """A panel of a chart; an axis is logarithmic where its values are positive and span a factor above 3.
 
     Args:
-        title: its title.
         x, y: what its axes carry, with the unit.
-        series: what is drawn.
         more: what the page reads as well; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
     """
     axes = {}
@@ -78,9 +73,6 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     """Draws panels as a figure of that height in inches, so many lines of them, with one legend below.
 
     Args:
-        panels: to draw.
-        height: of the figure.
-        lines: of panels.
         legend: the columns of the legend; 0 for none.
         how: the width of the figure and what its axes share, see `sheet`.
     """

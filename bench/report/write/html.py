@@ -43,7 +43,6 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
     """Writes `index.html` and the folder `page` beside it from all run folders in `results_dir/runs`; gives the page.
 
     Args:
-        results_dir: the results folder.
         meshes: of how many runs, the newest first, the mesh is made ready for the page; None for all.
 
     Raises:
