@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bench.evaluate.evaluate import REACH
 from bench.models.model import FLOAT, Candidate, Model, Seen
 from bench.setup.fields import FREE, parsed
 from bench.shape_prior import initialise_to_sphere
@@ -32,7 +33,6 @@ EXPONENTS = (1.0, 20.0)  # of a superquadric: 1 is an octahedron, 20 nearly a bo
 DEEP = 8  # layers from which on a skip connection feeds the points in again half-way, as in DeepSDF
 MAX_RATE, RATE_OF_WIDTH = 2e-3, 0.4  # Adam's rate: at most 2e-3, inversely as the width (Yang et al. 2021)
 START_RADIUS = 0.5  # of the sphere that a network is initialised to, in scene units
-REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
 BAND = 2.0  # cells to both sides of the surface whose samples are fitted
 GRID_RATE = 2e-3  # scene units
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.evaluate.evaluate import REACH
 from bench.models.growth import Trials, climb
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
@@ -27,7 +28,6 @@ from renderers.checks import BadInput, check_at_least, check_positive, check_sha
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 
 FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
-REACH = 1.05  # half the side of a grid's cube: the unit sphere and a margin
 ASIDE = 8  # of so many given photographs one is set aside for the trials
 DEFINITIONS = {
     "field": "the field that field=auto ended on",

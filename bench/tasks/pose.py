@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
+from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, REACH, Evaluation, render_view, view_metrics
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
@@ -25,7 +25,6 @@ from renderers.fields.grid import Grid
 from renderers.rendering import Observed, Renderer, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
-REACH = 1.05  # half the side of the cube of a known shape's samples: the unit sphere with a margin
 DEFINITIONS = {
     "rotation_error_deg": "angle of the rotation between the found and the true camera, in degrees",
     "translation_error": "distance between the object's origin in the coordinates of the found and of the true camera,"
@@ -149,8 +148,8 @@ class Pose(PoseTask):
             Unsupported: where the renderer has no gradient towards rays, or does not support the shape's field.
         """
         inputs, view = run.inputs, run.inputs.scene.view
-        name = type(inputs.renderer).__name__
         if not inputs.renderer.capabilities.ray_gradient:
+            name = type(inputs.renderer).__name__
             raise Unsupported(f"{name} has no gradient towards rays, so none towards a camera")
         known = known_shape(self, inputs)
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
