@@ -61,7 +61,7 @@ class Photography:
         if self.texture in ONE_COLOUR and self.shading == "unlit":
             raise ValueError("a texture of one colour without shading has nothing to compare: set shading=lambertian")
         for name in ("noise", "blur", "exposure"):
-            check_at_least(f"{name}", getattr(self, name), 0, f"{name}=0 switches it off")
+            check_at_least(name, getattr(self, name), 0, f"{name}=0 switches it off")
 
     def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Shot]:
         """The photographs of a mesh.

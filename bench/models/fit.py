@@ -180,11 +180,8 @@ class FitProblem:
 
     def loss(self, iteration: int) -> Terms:
         """The renderer's terms, the eikonal term, and their sum."""
-        counted, place, settings = (
-            Meter(self.model.field(), self.counts),
-            self.iterations_before + iteration,
-            self.settings,
-        )
+        counted, settings = Meter(self.model.field(), self.counts), self.settings
+        place = self.iterations_before + iteration
         self.error = self.error if iteration else inf  # iteration 0 runs twice: once as warm-up
         self.share = rays_share(settings.fewest_rays, self.observations.footprint, self.error)
         terms = self.observations.terms(counted, place, self.share)

@@ -89,7 +89,7 @@ class Stability:
         if trials.first_failure is not None:
             first, what = trials.first_failure, f"{record.name}, {record.scene}"
             kind = PIXEL_NAMES.get(first.outcome.failure or "", first.outcome.failure)
-            title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self._unit}"
+            title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self.stress.sweep.unit}"
             draw_failure(run.folder, first.outcome.images, first.severity, title)
 
     def _check(self, renderer: Renderer) -> None:
@@ -102,10 +102,6 @@ class Stability:
     @property
     def _settings(self) -> SearchSettings:
         return self.fit_search if self.stress.measure == "fit" else self.search
-
-    @property
-    def _unit(self) -> str:
-        return self.stress.sweep.unit
 
     def _metrics(self, search: Search | Bisection, trials: "_Trials") -> dict[str, float | None]:
         found = search.result()
