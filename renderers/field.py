@@ -273,13 +273,13 @@ def steepest(
         margin: see `STEEPEST_MARGIN`.
         like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
-    points = radius * points_in_ball(samples)
+    points = radius * points_in_sphere(samples)
     gradients = autograd_gradients(field, points if like is None else points.to(like))
     return margin * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
 
 
-def points_in_ball(count: int) -> Float[Tensor, "count 3"]:
-    """Points drawn evenly in the unit ball about the origin, the same ones each time, in float64 on the CPU."""
+def points_in_sphere(count: int) -> Float[Tensor, "count 3"]:
+    """Points drawn evenly in the unit sphere about the origin, the same ones each time, in float64 on the CPU."""
     draws = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
     direction = torch.nn.functional.normalize(torch.randn(count, 3, **draws), dim=-1)
     return torch.rand(count, 1, **draws) ** (1 / 3) * direction

@@ -216,7 +216,7 @@ class Reached:
         return child
 
 
-def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: float, error: float = 0.0) -> Reached:
+def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: float, error: float) -> Reached:
     """Marches all rays; those of an image coarse to fine (DIST, Sec. 3.2).
 
     A coarse ray stops before its empty sphere is too small to hold the finer rays next to it.

@@ -9,7 +9,7 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_ball
+from renderers.field import Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_sphere
 from renderers.gradients import crossing
 from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
@@ -345,7 +345,7 @@ def measured_steepness(values: Values, like: Float[Tensor, "*batch 3"], *, radiu
         like: points of the dtype and device at which values are asked.
         radius: of the sphere about the origin in which the points lie.
     """
-    points = radius * points_in_ball(PAIRS).to(like)
+    points = radius * points_in_sphere(PAIRS).to(like)
     towards = torch.nn.functional.normalize(points.roll(1, dims=0) - points, dim=-1)
     here, there = values(torch.cat([points, points + SPAN * radius * towards])).chunk(2)
     slopes = (here - there)[here.isfinite() & there.isfinite()].abs() / (SPAN * radius)

@@ -17,7 +17,7 @@ from torch.nn.functional import linear
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from renderers.checks import check_at_least
-from renderers.field import Coarse, Flops, Kind, Values, points_in_ball
+from renderers.field import Coarse, Flops, Kind, Values, points_in_sphere
 from renderers.fields.affine import segment_bounds
 
 CHUNK = 2048  # points per pass: keeps the activations in cache (measured on CPUs: 65,536 is 1.3 times slower)
@@ -293,7 +293,7 @@ def _product(weight: Tensor, bias: Tensor | None, activation: str) -> Callable[[
 
 def _largest_error(network: _Network, exact: Values, like: Tensor) -> float:
     """The largest error of the network's values near its surface, at points that are the same each time."""
-    points = points_in_ball(DRAWN).to(like)
+    points = points_in_sphere(DRAWN).to(like)
     values = network(points)
     near = values.abs() <= NEAR
     near = near | (near.sum() < FEWEST)

@@ -112,7 +112,8 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     flat = rays.flat()
     entry, leave, meets = (part.detach() for part in sphere_span(flat, radius))
     queried = meets.nonzero().squeeze(-1)
-    parts = [_Part.of(field, flat, some, (entry, leave), search, passing) for some in _blocks(queried)]
+    blocks = queried.split(BLOCK // 256)  # bounds the memory of a search; one block, even of no rays
+    parts = [_Part.of(field, flat, some, (entry, leave), search, passing) for some in blocks]
     whole = _Part(*(torch.cat(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
     inside = whole.begun_inside
     hit = (whole.opacity.detach() > SEEN) & ~inside
@@ -273,8 +274,3 @@ def _between(samples: Samples, distance: Float[Tensor, " n"]) -> Float[Tensor, "
     )
     part = (distance - near) / (far - near).clamp_min(torch.finfo(near.dtype).tiny)
     return low + part.clamp(0, 1) * (high - low)
-
-
-def _blocks(queried: Int[Tensor, " n"]) -> tuple[Tensor, ...]:
-    """The rays in blocks, whose samples bound the memory of a search; one block, even of no rays."""
-    return queried.split(max(BLOCK // 256, 1))
