@@ -30,7 +30,7 @@ class Depths:
     """Which depths are given, and how true they are.
 
     Args:
-        points: "none"; or the amount in each photograph, see `datasets.observe.observed_pixels`.
+        points: "none"; or the amount in each photograph, see `datasets.views.observed_pixels`.
         noise: standard deviation of a depth, in scene units.
     """
 

@@ -55,7 +55,7 @@ class CodeProblem:
         rays_per_iteration: their number.
         device: of all tensors.
         initial: codes, one per start; None is code zero, the mean shape.
-        misplaced: initial similarities, one per start, see `renderers.fields.moved.Moved`; None keeps the shape.
+        misplaced: initial similarities, one per start, see `renderers.field.Moved`; None keeps the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the given ones, for pictures.
         compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.

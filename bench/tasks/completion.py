@@ -32,7 +32,7 @@ class Completion:
     """Shape from one sparse depth image, with or without its mask.
 
     Args:
-        points: amount of depth that is given; see `datasets.observe.observed_pixels`. Dense depth implies the mask.
+        points: amount of depth that is given; see `datasets.views.observed_pixels`. Dense depth implies the mask.
         depths: "measured", those of a scanner where the dataset has one; "exact", those of the mesh at the same pixels.
         mask: whether the silhouette is given.
         depth_loss: over pixels that are observed and hit, the mean of "depth", the error of the camera's depth (DIST,

@@ -25,7 +25,7 @@ class DeepSDF:
     renderer takes no part in the optimisation: it renders only the pictures and the evaluated images.
 
     Args:
-        points: amount of depth that is given; see `datasets.observe.observed_pixels`.
+        points: amount of depth that is given; see `datasets.views.observed_pixels`.
         offset: distance of the samples from the surface, in scene units.
         distance_weight: of the mean absolute error of the distances.
         code: penalty on the code.
