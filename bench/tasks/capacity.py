@@ -95,7 +95,7 @@ class Capacity:
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
-            renderer, settings_notes = inputs.pixel_precise  # before the fits: it may be refused
+            renderer, settings_notes = inputs.make_pixel_precise()  # before the fits: it may be refused
             growth = grow(fitter, candidates, models.growth)
             fits: dict[str, Fitted] = {}
             for fitted in fit_all(fitter, candidates):

@@ -238,7 +238,7 @@ def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
     """The other methods whose ranks do not differ from the best one's: the interval of the difference holds 0."""
     first = np.array(ranks[best].points)
     others = {name: _mean_of(np.array(found.points) - first) for name, found in ranks.items() if name != best}
-    return [name for name, found in others.items() if not found.excludes(0)]
+    return [name for name, found in others.items() if not found.known or found.low <= 0 <= found.high]
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:
