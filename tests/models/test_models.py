@@ -1,6 +1,6 @@
 """Fields of the ladder: their formulas, their held-out error, what is chosen by it, and how they grow."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -16,7 +16,7 @@ from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
 from bench.models.observations import FREE, Views, hold_out, together
-from bench.models.study import choose
+from bench.models.study import choose, fit_all
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
@@ -418,3 +418,24 @@ def test_candidates_are_tried_in_the_order_of_the_measure():
     assert [one.name for one in by_size(names, "free")] == list(names)
     for measure in ("stored", "bytes"):
         assert [one.name for one in by_size(names, measure)] == list(by_stored)
+
+
+@dataclass(frozen=True)
+class Told:
+    """A fitter of candidates that are their errors; notes which one each begins from."""
+
+    begun: list[tuple[float, float | None]]
+    part: str = ""
+    settings: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(iterations=1))
+
+    def begin(self, candidate: float, previous: float | None) -> SimpleNamespace:
+        self.begun.append((candidate, previous))
+        return SimpleNamespace(failed=candidate < 0, evidence=SimpleNamespace(mean=candidate), model=candidate)
+
+    def fit(self, fitted: SimpleNamespace, iterations: int, *, checkpoints: bool) -> None: ...
+
+
+def test_a_candidate_begins_from_the_best_that_did_not_fail():
+    begun: list[tuple[float, float | None]] = []
+    list(fit_all(Told(begun), [0.5, 0.3, -1.0, 0.4, 0.1]))
+    assert begun == [(0.5, None), (0.3, 0.5), (-1.0, 0.3), (0.4, 0.3), (0.1, 0.3)]

@@ -26,7 +26,7 @@ from renderers.camera import Rays
 from renderers.rendering import Status
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import Blind
+from tests.tiny import Blind, camera_of
 
 CPU = torch.device("cpu")
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
@@ -115,6 +115,15 @@ def test_a_floater_is_seen_by_samples_and_not_by_a_march():
         near = (rendering.distance - found.distance).abs() < 0.01
         share[name] = float((rendering.hit & near)[in_front].double().mean())
     assert share["dist"] < 0.1 and share["newton"] < 0.1 and share["dvr"] > 0.9
+
+
+def test_errors_of_a_mask_are_of_both_kinds():
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[:, :20] = True
+    given = fit.Observation(camera_of(40), torch.ones(40, 40), mask, mask)
+    wrong = fit.mask_errors(given, 0.3, drawn()).mask ^ mask
+    assert wrong[:, :20].double().mean() == pytest.approx(0.3, abs=0.08)
+    assert wrong[:, 20:].double().mean() == pytest.approx(0.3, abs=0.08)
 
 
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
