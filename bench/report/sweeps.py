@@ -23,7 +23,7 @@ MOST_VALUES = 6  # of a swept key that the caption lists
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
 FAILURE = (
     "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: an "
-    "infinite error, or 0 of what is better higher. So medians are ∞ where half of the runs failed."
+    "infinite error, or 0 of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
