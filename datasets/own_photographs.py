@@ -133,17 +133,17 @@ def read_capture(
         raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
     given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
     if layout.sphere:
-        centre, radius = layout.sphere
-        sphere = Sphere(centre - middle, radius, "as the format states")
+        sphere = Sphere(*layout.sphere, "as the format states")
     else:
-        sphere = sphere_of(given)
+        found = sphere_of(given)
+        sphere = replace(found, centre=found.centre + middle)
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
     whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
     return Capture(
         layout.format,
-        tuple(shot.within(sphere.centre, sphere.radius) for shot in shots),
+        tuple(shot.within(sphere.centre - middle, sphere.radius) for shot in shots),
         source if masked else "",
-        replace(sphere, centre=sphere.centre + middle),
+        sphere,
         (*layout.notes, *whole),
     )

@@ -282,12 +282,11 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
 
 
 def _alike(ranks: dict[str, statistics.Interval]) -> str:
-    """Which rows cannot be told from the one of the best rank; empty where no row has an interval."""
-    known = {row: rank for row, rank in ranks.items() if rank.known}
-    if not known:
+    """Which rows cannot be told from the one of the best rank; empty without intervals, which all have or none."""
+    best = min(ranks, key=lambda row: ranks[row].value)
+    if not ranks[best].known:
         return ""
-    best = min(known, key=lambda row: known[row].value)
-    found = statistics.as_good(known, best)
+    found = statistics.as_good(ranks, best)
     named = f": {', '.join(found)}" if found else ""
     return f"The interval of the difference to {best} holds 0 for *{len(found)}* of the others{named}."
 

@@ -116,7 +116,7 @@ def typical(groups: Groups) -> Interval:
     Returns:
         nan ends below `FEWEST_SHAPES`; the median and the ends may be infinite.
     """
-    return _of_median(np.array([np.mean(_logs(group)) for group in groups]))
+    return _of_median(_of_shapes(groups))
 
 
 def ratio(first: Groups, second: Groups) -> Interval:
@@ -129,9 +129,7 @@ def ratio(first: Groups, second: Groups) -> Interval:
     """
     if _sizes(first) != _sizes(second):
         raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
-    pairs = zip(first, second, strict=True)
-    means = [(float(np.mean(_logs(a))), float(np.mean(_logs(b)))) for a, b in pairs]
-    return _of_median(np.array([0.0 if one == other else one - other for one, other in means]))
+    return _of_median(_ratio(_of_shapes(first), _of_shapes(second)))
 
 
 def differ(ratios: Sequence[Interval]) -> list[bool]:
@@ -152,16 +150,16 @@ def _sign_test(points: Sequence[float]) -> float:
     return float(stats.binomtest(below, below + above).pvalue) if below + above else 1.0
 
 
-def _logs(group: Any) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        return np.log(_checked(flat([group])))
+def _of_shapes(groups: Groups) -> np.ndarray:
+    """The geometric mean of each shape's runs."""
+    return np.array([geometric_mean(flat([group])) for group in groups])
 
 
-def _of_median(logs: np.ndarray) -> Interval:
+def _of_median(points: np.ndarray) -> Interval:
     """The median of shapes' values; beyond its ends lie as many as a sign test allows."""
-    n, points = len(logs), np.exp(logs)
-    with np.errstate(invalid="ignore"):  # where each fails where the other does not, neither is known to be better
-        middle = math.exp(np.median(logs))
+    n = len(points)
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 and inf beside each other: neither is known to be better
+        middle = math.exp(np.median(np.log(points)))
     if n < FEWEST_SHAPES:
         return Interval(middle, math.nan, math.nan, tuple(points.tolist()))
     beyond, ordered = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5)) - 1, np.sort(points)
@@ -238,7 +236,7 @@ def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
     """The other methods whose ranks do not differ from the best one's: the interval of the difference holds 0."""
     first = np.array(ranks[best].points)
     others = {name: _mean_of(np.array(found.points) - first) for name, found in ranks.items() if name != best}
-    return [name for name, found in others.items() if not found.known or found.low <= 0 <= found.high]
+    return [name for name, found in others.items() if found.low <= 0 <= found.high]
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:

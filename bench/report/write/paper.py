@@ -217,7 +217,7 @@ def key_of(name: str) -> str:
 def _answer(page: Found) -> str:
     """A page's line in the table of all answers."""
     asked = page.shown.question or page.shown.title.rstrip(".")
-    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.verdict.replace('*', ''))} |"
+    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.answer)} |"
 
 
 def _section(page: Found) -> str:

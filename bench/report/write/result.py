@@ -148,6 +148,11 @@ class Shown:
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
 
+    @property
+    def answer(self) -> str:
+        """The verdict without stars about its numbers."""
+        return self.verdict.replace("*", "")
+
     def to_json(self) -> str:
         """Its content, a line per part; infinite numbers of a chart become null."""
         parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
@@ -197,8 +202,7 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
 
 def markdown(shown: Shown, name: str) -> str:
     """The Markdown text of a page: question and verdict, title, caption, table, picture and notes."""
-    verdict = as_markdown(shown.verdict.replace("*", ""))
-    asked = [f"{as_markdown(shown.question)} **{verdict}**"] if verdict else []
+    asked = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
     parts = [*asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
         head, *rows = ([as_markdown(cell) for cell in row] for row in (shown.columns, *shown.rows))
