@@ -10,6 +10,7 @@ def main() -> int:
     """Finds or trains the prior; prints its path."""
 
     def train(run: Identity) -> None:
+        from bench.machine.environment import flushing_denormals
         from bench.progress import run_progress
         from bench.setup.inputs import cell_of
         from bench.shape_prior import find, make_prior
@@ -18,7 +19,7 @@ def main() -> int:
         dataset, settings, folder = cell.inputs.dataset, cell.prior, cell.inputs.cache
         path = find(dataset, settings, folder)
         if path is None:
-            with run_progress("prior") as progress:
+            with flushing_denormals(), run_progress("prior") as progress:
                 path = make_prior(dataset, settings, folder, cell.inputs.device, progress)
         print(path)
 

@@ -10,6 +10,7 @@ def main() -> int:
     """Finds or trains the network; prints its path. A training that was stopped goes on where it was."""
 
     def train(run: Identity) -> None:
+        from bench.machine.environment import flushing_denormals
         from bench.progress import run_progress
         from bench.setup.inputs import cell_of
         from bench.tasks.single_view import OneImage, told
@@ -20,7 +21,7 @@ def main() -> int:
                 "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
                 "dataset=car; python -m bench.prior trains a prior"
             )
-        with run_progress("single_view") as progress:
+        with flushing_denormals(), run_progress("single_view") as progress:
             cell.start()
             inputs = cell.inputs
             recipe = cell.task.recipe(inputs, run.config)

@@ -5,6 +5,7 @@ import hashlib
 import os
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +23,8 @@ GEMM_SIZE = 1024  # of the square matrices whose product is timed
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
 CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
+DENORMAL = 1e-39  # a number too small for float32's full precision
+PER_THREAD = 2**15  # numbers of an operation that PyTorch leaves to one thread
 IMPOSSIBLE = 1.2  # times the machine's matrix product rate: above it, the clock did not wait for the device
 
 
@@ -51,6 +54,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
+        "denormals_flushed": _denormals_flushed(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
@@ -76,6 +80,27 @@ def using_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def flushing_denormals() -> Iterator[None]:
+    """Within it, this thread takes numbers too small for full precision as 0: processors are many times slower at them.
+
+    Threads that it starts meanwhile do the same, those of PyTorch's operations among them. So does the backward pass,
+    which on a CPU runs in the thread that asks for it. Where the processor cannot, nothing changes.
+    """
+    before = sys.float_info.min / 2 == 0.0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
+
+
+def _denormals_flushed() -> bool:
+    """Whether all threads of PyTorch's operations take numbers too small for full precision as 0."""
+    small = torch.full((PER_THREAD * torch.get_num_threads(),), DENORMAL, device="cpu")
+    return not bool((small * 0.5).view(torch.int32).any())  # as integers: a comparison would take them as 0 itself
 
 
 def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32, repeats: int = 5) -> float:

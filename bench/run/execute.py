@@ -48,6 +48,7 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     channel.send(Ended())
 
 
+@environment.flushing_denormals()
 def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
     """Runs a job, whose record gets a status, and a reason where that is not ok.
 

@@ -3,9 +3,11 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
+import torch
 
 from bench.machine import environment
 from bench.records.record import Record
@@ -61,3 +63,38 @@ def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
     monkeypatch.setattr(environment, "scheduled", lambda: (500, 20))
     assert environment.waited_share((1000, 10)) is None
     assert environment.waited_share((400, 15)) == 5 / 105
+
+
+def products() -> set[float]:
+    """Of a denormal number and one, in each thread of an operation."""
+    small = torch.full((environment.PER_THREAD * torch.get_num_threads(),), environment.DENORMAL)
+    return set((small * 1.0).view(torch.int32).tolist())
+
+
+@pytest.mark.skipif(not torch.set_flush_denormal(False), reason="this processor does not round denormals to 0")
+def test_within_it_forward_and_backward_threads_take_denormals_as_0():
+    found = {}
+
+    class Noting(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            found["forward"] = products()
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, *gradients):
+            found["backward"] = products()
+            return gradients[0]
+
+    def work():  # in a thread whose operations have no threads yet, as those of a run's process
+        with environment.flushing_denormals():
+            Noting.apply(torch.ones(1, requires_grad=True)).backward()
+            found["said"] = environment.describe(torch.device("cpu"))["denormals_flushed"]
+        found["this thread after"] = sys.float_info.min / 2 > 0
+
+    with environment.using_threads(2):
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert found == {"forward": {0}, "backward": {0}, "said": True, "this thread after": True}
+    assert not environment.describe(torch.device("cpu"))["denormals_flushed"]
