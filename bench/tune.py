@@ -2,7 +2,8 @@
 
 It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
 on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice. With
-`--experiment tuning_one_loss` the draw that is best over all methods is written, as one row for all of them.
+`--experiment tuning_one_loss` the draw that is best over all methods is written, as one row for all of them; with
+`--experiment tuning_photographs` each renderer's of reconstruction, by the Chamfer distance of what is seen.
 """
 
 import argparse
@@ -20,7 +21,9 @@ from bench.records.record import is_plain_name, write_text
 from bench.report.data.records import Record
 from bench.report.data.runs import Runs, choose, shared_loss
 from bench.report.tuning import (
+    CHAMFER,
     ONE_LOSS,
+    PHOTOGRAPHS,
     SPACE,
     TUNING,
     Tuning,
@@ -31,12 +34,13 @@ from bench.report.tuning import (
 )
 from bench.tables import read_yaml
 
-SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS)}
+SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS, PHOTOGRAPHS)}
+ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that a draw is chosen by, where it is not the usual one
 SHARED = "_one_loss"  # the row with the setting that all methods share
 HEAD = "# Settings of methods, chosen on validation shapes. Written by `python -m bench.tune`; do not edit.\n"
 WIDTH = 118  # of its lines
 CHOSEN = (
-    "draw {draw} of {draws} of {space}: geometric mean of Chamfer x 1000 {over} at scale={scale} of {families}{loss}: "
+    "draw {draw} of {draws} of {space}: geometric mean of {error} x 1000 {over} at scale={scale} of {families}{loss}: "
     "{best}, of the median draw {middle}; runs of commit {commit}"
 )
 
@@ -59,7 +63,8 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
         raise ValueError(
             f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
         )
-    found = tunings(experiment)
+    metric = ERRORS.get(name, CHAMFER)
+    found = tunings(experiment, metric)
     if not found:
         raise ValueError("no draw has a run on every shape for every method: sweep over them all")
     if len(found[0].draws) < 2:
@@ -70,7 +75,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     for method in found:
         if not is_plain_name(method.method):
             raise ValueError(f"runs name the method {method.method!r}, which is no name of a row: leave these runs out")
-    new = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment) for m in found]
+    new = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment, metric) for m in found]
     rows = (read_yaml(path) if path.is_file() else {}) | {row: said | settings for row, said, settings in new}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, HEAD + yaml.safe_dump(rows, sort_keys=False, width=WIDTH))
@@ -78,11 +83,12 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     return left_out(experiment, found) + [f"{path}: {row}: {text}" for row, text in told.items()]
 
 
-def _own(method: Tuning, experiment: Runs) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _own(method: Tuning, experiment: Runs, metric: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """The name of a method's row, what it says, and its settings by dotted key."""
-    records = [record for record in experiment.records if record["method"] == SPACE + method.method]
+    records = [record for record in experiment.records if record["method"].removeprefix(SPACE) == method.method]
     over = f"on {method.validation.shape[1]} validation runs"
-    chosen = _chosen(method, records, space=f"space/{method.method}", over=over)
+    space = records[0]["method"] if records[0]["method"].startswith(SPACE) else experiment.selection.experiment
+    chosen = _chosen(method, records, space=space, over=over, metric=metric)
     said = {"chosen": chosen, "base": f"/method/{method.method}", "label": f"{method.label}, tuned"}
     return method.method, said, method.settings[method.best]
 
@@ -91,15 +97,16 @@ def _shared(methods: list[Tuning], experiment: Runs) -> tuple[str, dict[str, Any
     """The same of the row of all methods."""
     all_of_them = pooled(methods)
     over = f"on {methods[0].validation.shape[1]} validation runs of each of {all_of_them.method},"
-    chosen = _chosen(all_of_them, experiment.records, space="_drawn", over=over)
+    chosen = _chosen(all_of_them, experiment.records, space="_drawn", over=over, metric=CHAMFER)
     return SHARED, {"chosen": chosen}, all_of_them.settings[all_of_them.best]
 
 
-def _chosen(method: Tuning, records: list[Record], *, space: str, over: str) -> str:
+def _chosen(method: Tuning, records: list[Record], *, space: str, over: str, metric: str) -> str:
     """What was drawn, chosen, and from which runs."""
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
     return CHOSEN.format(
         **{"draw": method.draws[method.best], "draws": len(method.draws), "space": space, "over": over},
+        error="Chamfer" if metric == CHAMFER else metric,
         best=number(np.exp(method.scores[method.best])),
         middle=number(np.exp(np.median(method.scores))),
         scale=_names(record["config"]["scale"]["name"] for record in records),

@@ -26,7 +26,9 @@ from bench.report.data.records import (
 from bench.report.data.runs import Runs, Selection
 
 TUNING = Selection("tuning", ("split",))
-ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone
+ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone, as the next
+PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")
+CHAMFER = "chamfer_l2"
 SPACE = "space/"  # before the names of methods whose settings are drawn
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
@@ -100,7 +102,7 @@ def unfinished(runs: Runs) -> int:
     return sum(record["status"] in UNFINISHED for record in runs.records)
 
 
-def tunings(runs: Runs) -> list[Tuning]:
+def tunings(runs: Runs, metric: str = CHAMFER) -> list[Tuning]:
     """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
 
     Validation shapes are enough: without test shapes `test` has no columns.
@@ -108,7 +110,7 @@ def tunings(runs: Runs) -> list[Tuning]:
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
     keys = sorted({run_key(record) for record in ended})
-    cells = pd.DataFrame([_cell(record, keys) for record in ended])
+    cells = pd.DataFrame([_cell(record, keys, metric) for record in ended])
     if cells.empty:
         return []
     cells = cells[cells.groupby(["split", "draw", "run"]).method.transform("nunique") == len(by_method)]
@@ -153,13 +155,13 @@ def left_out(runs: Runs, methods: list[Tuning]) -> list[str]:
     return [f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, draws))}."] if draws else []
 
 
-def _cell(record: Record, keys: list[RunKey]) -> dict[str, Any]:
+def _cell(record: Record, keys: list[RunKey], metric: str) -> dict[str, Any]:
     """A line of the table of runs, with the place of its shape and seed among all."""
     config, ok = record["config"], record["status"] == "ok"
     return {
         **{"method": record["method"], "split": config["split"], "draw": config["draw"]},
         **{"run": keys.index(run_key(record)), "failed": not ok, "record": record},
-        **{"error": SCALE * error(record, "chamfer_l2"), "values": value_evaluations(record) if ok else None},
+        **{"error": SCALE * error(record, metric), "values": value_evaluations(record) if ok else None},
     }
 
 

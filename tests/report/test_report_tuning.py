@@ -152,6 +152,17 @@ def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
     assert node["renderer"]["steps"] == 11 and set(node) == {"label", "task", "renderer"}
 
 
+def test_renderers_of_photographs_are_chosen_by_what_is_seen(tmp_path):
+    drawn(tmp_path, experiment="tuning_photographs", method="rgb_dist", errors={"validation": VALIDATION})
+    for path in tmp_path.glob("runs/*/record.json"):  # the experiment draws, and not the method's space
+        text = path.read_text().replace("space/rgb_dist", "rgb_dist").replace("chamfer_l2", "seen_chamfer_l1")
+        path.write_text(text)
+    write(tmp_path, tmp_path / "tuned.yaml", name="tuning_photographs")
+    row = read_yaml(tmp_path / "tuned.yaml")["rgb_dist"]
+    assert row["chosen"].startswith("draw 1 of 4 of tuning_photographs: geometric mean of seen_chamfer_l1 x 1000 on 6")
+    assert (row["base"], row["task.optimiser.learning_rate"]) == ("/method/rgb_dist", 0.01)
+
+
 def test_the_shipped_settings_are_as_the_command_writes_them():
     text = (CONF / "tuned.yaml").read_text()
     assert text == HEAD + yaml.safe_dump(yaml.safe_load(text), sort_keys=False, width=WIDTH)
