@@ -113,7 +113,7 @@ def _conditions(runs: Runs) -> str:
 
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, one row of those that look alike."""
-    rows = [row for row in runs.rows() if row.preset not in ALIKE] or list(runs.rows())
+    rows = [row for row in runs.rows() if row.preset.removeprefix("tuned/") not in ALIKE] or list(runs.rows())
     every = grouped(runs.records, medians.scene_of)
     shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
     scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
