@@ -95,10 +95,10 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     true = sample_surface(subject.truth, count, inputs.seed)
     found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
     whole = surface_metrics(found, true, threshold=threshold)
-    visible = subject.seen(subject.truth, true.points)
+    visible = subject.seen(subject.truth, true)
     part = judged = None
     if mesh is not None and found is not None:
-        there = subject.seen(mesh, found.points)
+        there = subject.seen(mesh, found)
         part, judged = found.some(there), (found, there)
     seen = surface_metrics(part, true.some(visible), threshold=threshold)
     rough = roughness_scores(judged, (true, visible))

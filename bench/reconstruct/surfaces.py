@@ -12,7 +12,7 @@ from bench.evaluate.evaluate import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import visible
 from datasets.mesh import Mesh
-from datasets.scene import Truth, View, see
+from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
 
@@ -91,7 +91,7 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
     for shot in shots:
         towards = shot.camera.center.double().numpy() - mesh.vertices
         cosine = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        weight = (visible(scene, shot, mesh.vertices) * cosine.clip(0) ** FACING)[:, None]
+        weight = (visible(scene, shot, Surface(mesh.vertices, normals)) * cosine.clip(0) ** FACING)[:, None]
         pixels = shot.camera.project(torch.from_numpy(mesh.vertices).float())[0].double().numpy() - 0.5
         places = np.nan_to_num(pixels).T[::-1]
         image = shot.colours.numpy()
