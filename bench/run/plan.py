@@ -5,16 +5,17 @@ A configuration is built by the code that its run builds it with, `bench.setup.i
 
 import io
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from statistics import median
 from typing import Any
 
+from bench.config import Isolation
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_records
 from bench.records.record import row_name
-from bench.run.process import reason_of
+from bench.run.process import beside, reason_of
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
@@ -44,6 +45,21 @@ def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> s
     return ""
 
 
+def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """For each configuration, why its run would be refused; empty where it would not.
+
+    Torch is loaded in the process of runs alone, unless a run takes place in this one.
+    """
+    if not configs or any(config["isolation"] == Isolation.off for config in configs):
+        return _refusals(configs)
+    return beside(_refusals, configs) or [""] * len(configs)  # a class that ends its process does so in its run too
+
+
+def _refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    built: dict[str, Any] = {}  # what they share
+    return [refusal(config, built) for config in configs]
+
+
 def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """Checks all cells of a sweep, before it is written down.
 
@@ -56,8 +72,7 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """
     away = {} if launcher in HERE else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
-    built: dict[str, Any] = {}  # what they share
-    found = [refusal(cell.config | away, built) for cell in cells]
+    found = refusals([cell.config | away for cell in cells])
     bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]
     if bad:
         raise ValueError(_of_sweep(plan, *bad[0], len(bad)))

@@ -96,7 +96,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
 
 
 def test_no_yaml_sets_the_mode_of_hydra():
-    assert composed(hydra=True).hydra.mode is None  # the fixture `asked_once` of the tests says so to Hydra
+    assert composed(hydra=True).hydra.mode is None  # `bench.run.command.mode_of_options` says so to Hydra
     for path in CONF.rglob("*.yaml"):
         assert "mode" not in (read_yaml(path).get("hydra") or {}), path
 

@@ -11,7 +11,7 @@ from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
 from bench.run import run as run_module
-from bench.run.plan import check_plan, kind, refusal, times
+from bench.run.plan import check_plan, kind, refusal, refusals, times
 from bench.train import main as train_main
 from tests import tiny
 from tests.run.driving import command
@@ -31,7 +31,7 @@ class Mine:
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusal", lambda config: "")
+    monkeypatch.setattr(run_module, "refusals", lambda configs: [""])
     return tmp_path / "r"
 
 
@@ -185,6 +185,22 @@ def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plai
         (tmp_path / f"{module}.py").write_text(CODE.format(act=act))
         assert refusal(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
     assert capsys.readouterr().out == ""
+
+
+def test_a_class_that_ends_its_process_is_left_to_its_run(plain, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / f"ends_{tmp_path.name}.py").write_text("import os\n" + CODE.format(act="os._exit(3)"))
+    wrong, ends = plain("renderer.steps=0"), plain("renderer=custom", f"renderer._target_=ends_{tmp_path.name}.Mine")
+    assert refusals([wrong]) == [refusal(wrong)] != [""]
+    assert refusals([wrong, ends]) == ["", ""]
+
+
+def test_a_folder_of_the_users_may_say_that_an_experiment_is_a_sweep(results, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '0,1'}}}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    done = command("--config-dir", str(tmp_path), "+experiment=mine", "plan=true", *SMALL, f"results_dir={results}")
+    assert (done.code, done.out.splitlines()[-1][:9]) == (0, "2 planned"), done.err
 
 
 @pytest.fixture
