@@ -59,6 +59,7 @@ class CodeProblem:
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the given ones, for pictures.
         compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.
+        judged: gives of a field what must fall in place of the loss; None: the loss.
     """
 
     prior: Prior
@@ -72,6 +73,7 @@ class CodeProblem:
     trial: int = 1
     photographs: Float[np.ndarray, "views height width 3"] | None = None
     compared_at: int | None = None
+    judged: Callable[[Field], float] | None = None
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
@@ -138,10 +140,12 @@ class CodeProblem:
 
     @torch.no_grad()
     def objective(self) -> float | None:
-        """The current loss, at iteration `compared_at`, not counted; None where that is not set."""
+        """What `judged` gives, or the current loss at iteration `compared_at`, not counted; None without either."""
+        best = self.starts.best()
+        if self.judged is not None:
+            return self.judged(self._shape(best))
         if self.compared_at is None:
             return None
-        best = self.starts.best()
         terms = self.compare(self._shape(best), self.compared_at)
         return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
 

@@ -62,7 +62,7 @@ class Problem(Objective, Protocol):
         ...
 
     def objective(self) -> float | None:
-        """The current loss, not counted, where losses of different iterations are not comparable; else None."""
+        """What must fall, not counted, where losses of different iterations are not comparable; else None."""
         ...
 
     def field(self) -> Field:
@@ -195,13 +195,19 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
 
 
 def descend(
-    problem: Problem, settings: OptimiserSettings, run: RunContext, errors_at: Callable[[int], dict[str, float]]
+    problem: Problem,
+    settings: OptimiserSettings,
+    run: RunContext,
+    errors_at: Callable[[int], dict[str, float]],
+    *,
+    least_reference: float = 0.0,
 ) -> History:
     """Runs the optimisation loop; writes its curve line by line, and its costs to the record, also if it is stopped.
 
     Args:
         errors_at: gives the errors of the current state before an iteration, outside the timed part. A line has the
             loss before its step; its errors are of the same parameters.
+        least_reference: see `bench.solve.optimise.optimise`.
     """
     history = History()
     checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
@@ -228,7 +234,14 @@ def descend(
             check(0)
         try:
             note_objective()
-            optimise(problem, settings, run.inputs.device, history=history, on_step=on_step)
+            optimise(
+                problem,
+                settings,
+                run.inputs.device,
+                history=history,
+                on_step=on_step,
+                least_reference=least_reference,
+            )
             note_objective()
         except NotReached as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
@@ -297,6 +310,7 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
     if after.failure is not None:
         return after.failure
     first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
-    if last >= first and len(history.curve) > 1:
-        return RunStatus.NOT_REACHED, f"the loss did not fall: {first:.4g} at the start, {last:.4g} at the end"
+    if last >= first and last > 0 and len(history.curve) > 1:
+        what = "objective" if history.objectives else "loss"
+        return RunStatus.NOT_REACHED, f"the {what} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

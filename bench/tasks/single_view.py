@@ -234,7 +234,8 @@ class OneImage:
         inputs = run.inputs
         problem = self.search.problem(subject.given[0], inputs)
         check_kind(inputs.renderer, problem.field())
-        history = descend(problem, self.search.optimiser, run, lambda iteration: {})
+        settings, least = self.search.optimiser, self.search.least_reference
+        history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
         with run.off_clock():
             mesh = surface_of(problem.field(), inputs)
             mesh = None if mesh is None else with_colours(mesh, subject.given)
