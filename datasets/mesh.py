@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from skimage.measure import block_reduce, marching_cubes
 
 from renderers.field import Field, Kind
@@ -96,10 +98,9 @@ class Mesh:
     @cached_property
     def parts(self) -> Int[np.ndarray, " f"]:
         """Number of the connected part that each face belongs to, from 0."""
-        import trimesh
-
-        edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]])
-        labels = trimesh.graph.connected_component_labels(edges, node_count=len(self.vertices))
+        first, second = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]]).T
+        joined = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(len(self.vertices),) * 2)
+        labels = connected_components(joined, directed=False)[1]
         return np.unique(labels[self.faces[:, 0]], return_inverse=True)[1].reshape(-1)
 
     @property

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from bench.evaluate.evaluate import GREY, painted
+from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import visible
 from datasets.mesh import Mesh
@@ -101,6 +101,6 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
 
 
 def painter(mesh: Mesh) -> Callable[[Camera], tuple[View, Float[torch.Tensor, "height width 3"]]]:
-    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.evaluate.painted` has them."""
+    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.state.painted` has them."""
     scene = Truth(mesh, closed=False)
     return lambda camera: (see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float())

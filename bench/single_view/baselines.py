@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import REACH, surface_metrics
+from bench.evaluate.evaluate import surface_metrics
+from bench.evaluate.state import REACH
 from bench.progress import Report
 from bench.records.record import digest
 from bench.setup.inputs import RunInputs

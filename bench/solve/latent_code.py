@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
+from bench.evaluate.state import State
 from bench.pictures.run_figures import Given, draw_run
-from bench.setup.inputs import RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import NotReached, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
@@ -100,29 +100,28 @@ class CodeProblem:
     @property
     def similarity(self) -> Float[Tensor, "7"] | None:
         """The current similarity, where it is optimised."""
-        return self.similarities[self.starts.best()].detach() if self.similarities else None
+        return self.similarities[self.starts.best()].detach().clone() if self.similarities else None
 
     def field(self) -> Field:
         """The current shape."""
         shape = self.decoder.at(self.code.detach())
         return shape if self.similarity is None else Moved(shape, self.similarity)
 
-    def frame(self) -> tuple[Field, None]:
-        """The current shape, seen by the scene's camera."""
-        return self.field(), None
+    def camera(self) -> None:
+        """None: the scene's camera sees the shape."""
 
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The current shape against the truth."""
-        return evaluate(self.field(), inputs)
+        return evaluate(state)
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The Chamfer distance of the current shape."""
-        return chamfer_only(self.field(), inputs)
+        return chamfer_only(state)
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        given = Given(inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
-        draw_run(folder, inputs, (first, self.field()), given, curve, title)
+        given = Given(states[0].inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
+        draw_run(folder, states, given, curve, title)
 
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum."""

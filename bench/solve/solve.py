@@ -11,11 +11,12 @@ from torch import Tensor
 
 from bench.config import DOUBLING
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
+from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
-from bench.setup.inputs import RunContext, RunInputs
+from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.scene import Scene
@@ -66,26 +67,26 @@ class Problem(Objective, Protocol):
         ...
 
     def field(self) -> Field:
-        """The field of the current parameters; its evaluations are not counted."""
+        """The field of the current parameters, which does not change with them; its evaluations are not counted."""
         ...
 
-    def frame(self) -> tuple[Field, Camera | None]:
-        """The filmstrip's frame of the current state: a field, and the camera where it is not the scene's."""
+    def camera(self) -> Camera | None:
+        """The camera of the filmstrip's frame of the current state; None for the scene's."""
         ...
 
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The current state against the truth."""
         ...
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The `tracked` metrics of the current state alone."""
         ...
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run into its folder.
 
         Args:
-            first: the field before the optimisation.
+            states: before and after the optimisation.
         """
         ...
 
@@ -126,8 +127,8 @@ def solve(
     definitions: dict[str, str],
     *,
     gallery: bool = False,
-) -> Problem:
-    """Makes a problem, solves it, fills the run's record and folder, and gives the problem in its final state.
+) -> State:
+    """Makes a problem, solves it, fills the run's record and folder, and gives the final state.
 
     Args:
         run: its record has the definitions of its numbers also where it ends before it has a problem.
@@ -140,30 +141,36 @@ def solve(
     inputs, record = run.inputs, run.record
     record.definitions = definitions | COSTS
     problem = make_problem()
-    first = problem.field()
-    check_kind(inputs.renderer, first)
+    first = State(problem.field(), inputs)
+    check_kind(inputs.renderer, first.field)
     with run.off_clock():
-        before = problem.evaluate(inputs)
+        before = problem.evaluate(first)
     record.metrics_start = before.metrics
     filmstrip = Filmstrip(inputs, true=problem.shown)
 
+    def state() -> State:
+        field = problem.field()
+        return first if field is first.field else State(field, inputs)  # a shape that is known is extracted once
+
     def errors_at(iteration: int) -> dict[str, float]:
-        filmstrip.add(iteration, *problem.frame())
-        return problem.checkpoint(inputs) if iteration else {name: before.metrics[name] for name in problem.tracked}
+        current = state() if iteration else first
+        filmstrip.add(iteration, current, problem.camera())
+        return problem.checkpoint(current) if iteration else {name: before.metrics[name] for name in problem.tracked}
 
     history = descend(problem, settings, run, errors_at)
     with run.off_clock():
-        after = problem.evaluate(inputs)
+        last = state()
+        after = problem.evaluate(last)
         note_result(run, replace(after, failure=failure_of(history, after)))
-        filmstrip.add(len(history.curve), *problem.frame())
-        draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
+        filmstrip.add(len(history.curve), last, problem.camera())
+        draw(run, lambda title: problem.draw(run.folder, (first, last), history.curve, title), filmstrip)
         if gallery and inputs.evaluation.gallery is not None:
             save_gallery(run.folder, inputs, problem.observed, {"start": before.mesh, "found": after.mesh})
-    return problem
+    return last
 
 
-def solve_task(task: InverseTask, run: RunContext) -> Problem:
-    """Solves a task's inverse problem of a code, and gives it in its final state."""
+def solve_task(task: InverseTask, run: RunContext) -> State:
+    """Solves a task's inverse problem of a code, and gives the final state."""
     inputs = run.inputs
 
     def problem() -> Problem:

@@ -42,16 +42,16 @@ class Toy:
     def objective(self):
         return None
 
-    def frame(self):
-        return self.field(), None
+    def camera(self):
+        return None
 
-    def evaluate(self, inputs):
+    def evaluate(self, state):
         return Evaluation({"radius": self.radius.item()})
 
-    def checkpoint(self, inputs):
+    def checkpoint(self, state):
         return {}
 
-    def draw(self, inputs, folder, first, curve, title):
+    def draw(self, folder, states, curve, title):
         pass
 
     def loss(self, iteration):
