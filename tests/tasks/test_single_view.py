@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from bench.config import load
+from bench.evaluate.state import State
 from bench.records.read import read_records
 from bench.single_view import baselines, store
 from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
@@ -120,7 +121,7 @@ def test_a_search_has_succeeded_where_its_silhouette_is_nearer_to_the_mask_thoug
     shot = shot_of(Ball(torch.tensor(factor * 0.5), torch.zeros(3), PAINT), camera)
     problem = search.problem(shot, run.inputs)
     history = descend(problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference)
-    assert failure_of(history, problem.evaluate(run.inputs)) is None
+    assert failure_of(history, problem.evaluate(State(problem.field(), run.inputs))) is None
     first, last = history.objectives
     assert first == pytest.approx(abs(covered(radius) - covered(0.5)), abs=0.02) and last < 0.3 * first
     losses = [line["total"] for line in history.curve]
