@@ -345,9 +345,9 @@ def measured_steepness(values: Values, like: Float[Tensor, "*batch 3"], *, radiu
         like: points of the dtype and device at which values are asked.
         radius: of the sphere about the origin in which the points lie.
     """
-    points = radius * points_in_sphere(PAIRS).to(like)
+    points = radius * points_in_sphere(PAIRS, like)
     towards = torch.nn.functional.normalize(points.roll(1, dims=0) - points, dim=-1)
     here, there = values(torch.cat([points, points + SPAN * radius * towards])).chunk(2)
-    slopes = (here - there)[here.isfinite() & there.isfinite()].abs() / (SPAN * radius)
-    steepness = float(slopes.quantile(MOST)) if len(slopes) else 1.0
-    return steepness if steepness > STEEP else 1.0
+    slopes = (here - there).abs() / (SPAN * radius)
+    steepness = float(torch.where(here.isfinite() & there.isfinite(), slopes, torch.nan).nanquantile(MOST))
+    return steepness if steepness > STEEP else 1.0  # not a number where no value is finite

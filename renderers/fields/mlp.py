@@ -323,7 +323,7 @@ def _product(weight: Tensor, bias: Tensor | None, activation: str) -> Callable[[
 
 def _largest_error(network: _Network, exact: Values, like: Tensor) -> float:
     """The largest error of the network's values near its surface, at points that are the same each time."""
-    points = points_in_sphere(DRAWN).to(like)
+    points = points_in_sphere(DRAWN, like)
     values = network(points)
     near = values.abs() <= NEAR
     near = near | (near.sum() < FEWEST)
