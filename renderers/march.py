@@ -7,14 +7,14 @@ the graph instead.
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
-from renderers.field import Field
+from renderers.field import Values
 from renderers.rendering import Status
 
 PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
@@ -195,9 +195,9 @@ class Moving:
 
     def some(self, index: Int[Tensor, " k"]) -> "Moving":
         """The same of some of them."""
-        *columns, past = (getattr(self, field.name) for field in fields(self))
-        past = None if past is None else past.index_select(0, index)
-        return Moving(*(column.index_select(0, index) for column in columns), past)
+        columns: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        present = {name: column.index_select(0, index) for name, column in columns.items() if column is not None}
+        return Moving(**columns | present)
 
     def where(self, chosen: Bool[Tensor, " m"], other: "Moving") -> "Moving":
         """These where they are chosen, else the others."""
@@ -266,7 +266,9 @@ class Moving:
 Note = Callable[[Tensor, Tensor, Tensor], None]  # of rays: their places in the front, distances and values there
 
 
-def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note = lambda *_: None) -> None:
+def march(
+    values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note = lambda *_: None
+) -> None:
     """Moves the front of flat rays [n, 3] by at most `steps` steps, in place.
 
     Args:
@@ -280,7 +282,7 @@ def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int
     for step in range(steps):
         if moving.index.numel() == 0:
             break
-        value = field(moving.origins + moving.distance[:, None] * moving.directions)
+        value = values(moving.origins + moving.distance[:, None] * moving.directions)
         note(moving.index, moving.distance, value)
         after = moving.after(value, stepping, None if step else fresh)
         goes_on = after.goes_on(stepping)
@@ -297,7 +299,7 @@ def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int
 
 
 def march_coarse_to_fine(
-    field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
+    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
 ) -> Front:
     """Three steps with one ray per 4 x 4 pixels, three with one per 2 x 2, the rest with one per pixel (DIST, 3.2).
 
@@ -312,10 +314,10 @@ def march_coarse_to_fine(
     levels = pyramid(rays)
     front = Front.on_sphere(levels[0].coarse, radius=radius, samples=samples)
     for level in levels:
-        march(field, level.coarse, front, stepping, min(PYRAMID_STEPS, steps))
+        march(values, level.coarse, front, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
         front = front.split(level.parent, level.coarse, level.fine, radius=radius, careful=stepping.careful_split)
-    march(field, levels[-1].fine, front, stepping, steps)
+    march(values, levels[-1].fine, front, stepping, steps)
     return front
 
 
