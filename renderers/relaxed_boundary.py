@@ -66,7 +66,7 @@ class RelaxedBoundary(SurfaceRenderer):
             front, passed, least = self._march(field, flat)
         rendering = implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         distance, hit = rendering.distance.view(-1), (front.status == Status.HIT).nonzero().squeeze(-1)
-        near = (least.isfinite() & (front.status != Status.STARTED_INSIDE)).nonzero().squeeze(-1)
+        near = least.isfinite().nonzero().squeeze(-1)
         here = fixed_samples(field, flat[near], passed[near], least[near])
         coming = (here.detach() - here) / self.band
         behind = torch.ones_like(distance).index_put((near,), 1 - coming)[hit]
