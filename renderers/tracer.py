@@ -298,7 +298,8 @@ class Solved:
 
     def some(self, which: Bool[Tensor, " m"]) -> "Solved":
         """The same of some of them."""
-        return Solved(*(column[which] for column in self.columns))
+        index = which.nonzero().squeeze(-1)
+        return Solved(*(column.index_select(0, index) for column in self.columns))
 
     def among(self, index: Int[Tensor, " n"]) -> "Solved":
         """The same, with `index` counted among the n rays from which these were chosen by `index`."""
