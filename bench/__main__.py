@@ -1,14 +1,19 @@
 """`python -m bench task=completion renderer=dist`: one run, or with -m a sweep."""
 
-import sys
+from __future__ import annotations  # of a run's process, which imports this module again, nothing else is loaded
 
-from bench.records.folder import Identity
-from bench.run.command import FAILED, command_line
-from bench.run.sweep import Sweep
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from bench.records.folder import Identity
 
 
 def main() -> int:
     """Runs the command line; 0 if every run ended ok."""
+    from bench.run.command import FAILED, command_line
+    from bench.run.sweep import Sweep
+
     statuses: list[str] = []
 
     def one(run: Identity) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
@@ -29,4 +34,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    from bench.run.process import start_early
+
+    start_early(sys.argv[1:])
     sys.exit(main())

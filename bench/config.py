@@ -12,7 +12,6 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hints
 
-from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -140,7 +139,11 @@ def register(*folders: Path) -> None:
     Raises:
         ValueError: for a table that cannot be read.
     """
-    ConfigStore.instance().store(name="schema", node=Config)
+    from hydra.core.config_store import ConfigStore  # only here: runs do without Hydra
+
+    store = ConfigStore.instance()
+    store.store(name="schema", node=Config)
+    vars(store)["__deepcopy__"] = lambda _: store  # Hydra copies it, with all rows, for each composition
     register_rows(folders)
     register_resolvers()
 

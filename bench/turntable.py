@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.evaluate import painted
+from bench.evaluate.state import painted
 from bench.pictures.run_figures import LIGHT, normals_image, picture_normals
 from bench.records.record import leads_out, read_record
 from datasets.mesh import Mesh, normalise

@@ -3,21 +3,25 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
+from math import sqrt
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_dilation
-from skimage.measure import block_reduce, marching_cubes
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
 
 from renderers.field import Field, Kind
 
 BANDS = ("red", "green", "blue")
 LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float32
-BLOCKS = (4, 2)  # sides of the blocks, in samples, that are not divided further where the surface is far
-MARGIN = 2.0  # a field may exceed the distance by this factor before a part of its surface can be skipped
-STEEPER = 1.2  # the same, times its steepest slope between the middles of blocks, where that is more
+STRIDES = (4, 2, 1)  # of the lattices of samples
+SLOPE = 2.0  # a field may be so many times as steep as a distance before a part of its surface can be lost
+STEEPER = 1.2  # the same, times the largest slope between neighbouring samples, where that is more
+KEPT = 0.5  # of the slope times the stride: a sample is asked for finer ones where its value may be less
 CHUNK = 65536  # points per evaluation
 
 
@@ -96,10 +100,9 @@ class Mesh:
     @cached_property
     def parts(self) -> Int[np.ndarray, " f"]:
         """Number of the connected part that each face belongs to, from 0."""
-        import trimesh
-
-        edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]])
-        labels = trimesh.graph.connected_component_labels(edges, node_count=len(self.vertices))
+        first, second = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]]).T
+        joined = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(len(self.vertices),) * 2)
+        labels = connected_components(joined, directed=False)[1]
         return np.unique(labels[self.faces[:, 0]], return_inverse=True)[1].reshape(-1)
 
     @property
@@ -187,7 +190,7 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
         return torch.cat([field(chunk).float().cpu() for chunk in places.split(CHUNK)]).numpy()
 
     axis = torch.linspace(-reach, reach, grid).numpy()
-    if field.kind is Kind.LEVEL or grid < 2 * BLOCKS[0]:
+    if field.kind is Kind.LEVEL or grid <= 2 * STRIDES[0]:
         values = evaluate(_places(np.arange(grid**3), axis)).reshape(grid, grid, grid)
     else:
         values = _near_values(evaluate, axis)
@@ -198,38 +201,128 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
     return Mesh(vertices - reach, faces)
 
 
+class _Samples:
+    """Values on the samples of a cube, of those samples whose sign is not known by the values of others.
+
+    A sample is on the same side of the surface as another one whose value is above a bound of the field's slope times
+    the distance between the two. Lattices of samples are halved; one is asked where the last leaves the sign open.
+    """
+
+    def __init__(self, evaluate: Callable[[np.ndarray], np.ndarray], axis: Float[np.ndarray, " grid"]):
+        self.evaluate, self.spacing = evaluate, float(axis[1] - axis[0])
+        self.side = -(-(len(axis) - 1) // STRIDES[0]) * STRIDES[0] + 1
+        # The last sample is repeated until lattices end on it: so it is nearer than it counts, which is safe.
+        self.axis = np.append(axis, np.full(self.side - len(axis), axis[-1], axis.dtype))
+        self.values = np.zeros((self.side,) * 3, dtype=np.float32)
+        self.known = np.zeros_like(self.values, dtype=bool)
+        self.numbers = True  # whether no value is NaN
+
+    def refine(self, slope: float) -> None:
+        """Asks where signs are open if the field is at most so steep, and gives the others a value of their sign."""
+        above, below = (np.full(self.values[_every(STRIDES[0])].shape, -np.inf, dtype=np.float32) for _ in range(2))
+        for stride in STRIDES[:-1]:
+            fall = slope * self.spacing * stride
+            if stride < STRIDES[0]:
+                above, below = (_between(bound, fall) for bound in (above, below))
+            self._ask(~(above > KEPT * fall) & ~(below > KEPT * fall), stride)
+            values, known = self.values[_every(stride)], self.known[_every(stride)]
+            above, below = np.where(known, values, above), np.where(known, -values, below)
+        outside, inside = (_surely(bound, slope * self.spacing) for bound in (above, below))
+        self._ask(~outside & ~inside, 1)
+        np.copyto(self.values, np.where(inside, np.float32(-1), np.float32(1)), where=~self.known)
+
+    def steepest(self) -> float:
+        """The largest slope between samples that are neighbours in one of the lattices."""
+        slopes = [0.0]
+        for stride in STRIDES:
+            values, known = (np.ascontiguousarray(part[_every(stride)]) for part in (self.values, self.known))
+            side, index = len(values), np.flatnonzero(known)
+            values, known = values.ravel(), known.ravel()
+            for step in (1, side, side**2):
+                first = index[index // step % side < side - 1]
+                first = first[known[first + step]]
+                with np.errstate(invalid="ignore"):  # of two that are infinite
+                    changes = np.abs(values[first + step] - values[first])
+                slopes.append(float(changes[np.isfinite(changes)].max(initial=0.0)) / (stride * self.spacing))
+        return max(slopes)
+
+    def follow(self) -> None:
+        """Asks what is not known of the corners of all cells that the surface passes, also where that leads away."""
+        values, known = self.values.reshape(-1), self.known.reshape(-1)
+        inside = values < 0
+        while len(places := np.flatnonzero(self._next_to(inside) & self._next_to(~inside) & ~known)):
+            self._ask(places, 1)
+            turned = places[(values[places] < 0) != inside[places]]
+            inside[turned] = ~inside[turned]
+            if not len(turned):
+                break
+
+    def _ask(self, where: Bool[np.ndarray, "side side side"] | Int[np.ndarray, " n"], stride: int) -> None:
+        """Evaluates samples of a lattice that are not known, given by a mask or by their flat indices."""
+        values, known = self.values[_every(stride)], self.known[_every(stride)]
+        places = np.flatnonzero(where & ~known) if where.dtype == bool else where
+        if len(places) and self.numbers:
+            found = self.evaluate(_places(places, self.axis[::stride]))
+            values.flat[places], known.flat[places] = found, True
+            self.numbers = not np.isnan(found).any()
+
+    def _next_to(self, mask: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """A flat mask with all samples that share a cell with one of its own; at the cube's faces with some more."""
+        for step in (1, self.side, self.side**2):
+            grown = mask.copy()
+            grown[step:] |= mask[:-step]
+            grown[:-step] |= mask[step:]
+            mask = grown
+        return mask
+
+
 def _near_values(
     evaluate: Callable[[np.ndarray], np.ndarray], axis: Float[np.ndarray, " grid"]
 ) -> Float[np.ndarray, "grid grid grid"]:
-    """Values that are right near the surface and have the right sign elsewhere.
+    """Values that are right at the corners of all cells that the surface passes, and have the right sign elsewhere.
 
-    A block is not divided if its middle is farther from the surface than its corners are from its middle; it takes the
-    value of its middle. Where signs then differ across the side of a block, that block is sampled as well.
+    No part of the surface is lost where the field is at most `SLOPE` times as steep as a distance, or `STEEPER` times
+    as steep as between any two neighbours among the asked samples. A field that is far steeper is asked everywhere.
     """
-    spacing, parent, margin = axis[1] - axis[0], len(axis), MARGIN
-    values, near = np.zeros((1, 1, 1), dtype=np.float32), np.ones((1, 1, 1), dtype=bool)
-    for side in (*BLOCKS, 1):
-        middles = np.array([axis[start : start + side].mean() for start in range(0, len(axis), side)], dtype=axis.dtype)
-        parent_of = np.ix_(*(np.arange(len(middles)) * side // parent,) * 3)
-        values, known = values[parent_of], near
-        values[near[parent_of]] = evaluate(_places(np.flatnonzero(near[parent_of]), middles))
-        if side == BLOCKS[0]:
-            steps = [np.nan_to_num(np.abs(np.diff(values, axis=i)), posinf=0.0).max() for i in range(3)]
-            steepest = max(steps) / (side * spacing)
-            margin = max(MARGIN, STEEPER * steepest)
-        far = np.abs(values) > margin * np.sqrt(3) * (side + 1) / 2 * spacing  # NaN is not
-        near, parent = near[parent_of] & ~far, side
-    while (found := block_reduce(_beside_another_sign(values), BLOCKS[-1], np.any) & ~known).any():
-        wanted = found[parent_of]
-        values[wanted] = evaluate(_places(np.flatnonzero(wanted), axis))
-        known |= found
-    return values
+    samples, slope, steepest = _Samples(evaluate, axis), 0.0, SLOPE / STEEPER
+    while samples.numbers and STEEPER * steepest > slope:
+        slope = max(SLOPE, STEEPER * steepest)
+        samples.refine(slope)
+        steepest = samples.steepest()
+    samples.follow()
+    return samples.values[(slice(len(axis)),) * 3]
 
 
-def _beside_another_sign(values: Float[np.ndarray, "grid grid grid"]) -> Bool[np.ndarray, "grid grid grid"]:
-    """The samples that have a neighbour along an axis on the other side of the surface."""
-    inside = values < 0
-    return binary_dilation(inside) & binary_dilation(~inside)
+def _between(bound: Float[np.ndarray, "n n n"], fall: float) -> Float[np.ndarray, "m m m"]:
+    """Lower bounds on a lattice of half the stride, from those on a lattice; they fall by `fall` along its side."""
+    finer = np.empty((2 * len(bound) - 1,) * 3, dtype=bound.dtype)
+    for odd in product((0, 1), repeat=3):
+        around = bound
+        for axis in np.flatnonzero(odd):
+            around = np.maximum(*_neighbours(around, axis))
+        finer[tuple(slice(start, None, 2) for start in odd)] = around - fall * sqrt(sum(odd))
+    return finer
+
+
+def _surely(bound: Float[np.ndarray, "n n n"], fall: float) -> Bool[np.ndarray, "m m m"]:
+    """Where the bounds of `_between` are above 0."""
+    finer = np.empty((2 * len(bound) - 1,) * 3, dtype=bool)
+    for odd in product((0, 1), repeat=3):
+        around = bound > fall * sqrt(sum(odd))
+        for axis in np.flatnonzero(odd):
+            around = np.logical_or(*_neighbours(around, axis))
+        finer[tuple(slice(start, None, 2) for start in odd)] = around
+    return finer
+
+
+def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each two neighbours along an axis, the first ones and the second ones."""
+    before = (slice(None),) * axis
+    return values[(*before, slice(None, -1))], values[(*before, slice(1, None))]
+
+
+def _every(stride: int) -> tuple[slice, slice, slice]:
+    return (slice(None, None, stride),) * 3
 
 
 def _places(flat: Int[np.ndarray, " n"], axis: Float[np.ndarray, " grid"]) -> Float[np.ndarray, "n 3"]:

@@ -50,11 +50,15 @@ def seed_of(split: Split, index: int) -> int:
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of rays: distances along the unit rays (inf where nothing is hit) and outward unit normals."""
+    """First hits of rays: distances along the unit rays (inf where nothing is hit), outward unit normals, and faces.
+
+    `face` is the number of the face that is hit, without meaning where none is.
+    """
 
     distance: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
     hit: Bool[np.ndarray, " n"]
+    face: Int[np.ndarray, " n"]
 
 
 class Surface(NamedTuple):
@@ -108,7 +112,8 @@ class Truth:
         answer = self._scene.cast_rays(self._tensor(rays))
         distance = answer["t_hit"].numpy()
         normals = answer["primitive_normals"].numpy()
-        return Hits(distance=distance, normals=normals, hit=np.isfinite(distance))
+        face = answer["primitive_ids"].numpy().astype(np.int64)
+        return Hits(distance=distance, normals=normals, hit=np.isfinite(distance), face=face)
 
     def corners(
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]

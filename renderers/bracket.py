@@ -59,8 +59,9 @@ def first_crossing(
     """
     falls = (value[:, :-1] > 0) & (value[:, 1:] <= 0)
     found = falls.any(dim=1)
-    before = falls[found].to(torch.int8).argmax(dim=1, keepdim=True)
-    pick = [table[found].gather(1, index).squeeze(1) for table in (distance, value) for index in (before, before + 1)]
+    some = found.nonzero().squeeze(-1)
+    before = falls[some].to(torch.int8).argmax(dim=1, keepdim=True)
+    pick = [table[some].gather(1, index).squeeze(1) for table in (distance, value) for index in (before, before + 1)]
     return found, Bracket(pick[0], pick[1], pick[2], pick[3])
 
 

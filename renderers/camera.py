@@ -38,7 +38,7 @@ class Rays:
 
     def flat(self) -> "Rays":
         """The same rays in one row [n, 3]."""
-        return Rays(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
+        return _checked(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
 
     def at(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays 3"]:
         """The points at `distance` along the rays."""
@@ -49,22 +49,30 @@ class Rays:
         return self.origins[..., None, :] + distances[..., None] * self.directions[..., None, :]
 
     def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, " n"]) -> "Rays":
-        return Rays(self.origins[index], self.directions[index])
+        return _checked(self.origins[index], self.directions[index])
 
     def to(self, device: torch.device) -> "Rays":
         """The same rays on a device."""
-        return Rays(self.origins.to(device), self.directions.to(device), self.image)
+        return _checked(self.origins.to(device), self.directions.to(device), self.image)
 
     def coarser(self, factor: int) -> "Rays":
         """One ray for each block of factor x factor pixels, through its middle; image rays only.
 
         The last row and column of blocks are padded by repeating the image's edge.
         """
-        return Rays(
+        return _checked(
             _block_mean(self.origins, factor),
             torch.nn.functional.normalize(_block_mean(self.directions, factor), dim=-1),
             image=True,
         )
+
+
+def _checked(origins: Tensor, directions: Tensor, image: bool = False) -> Rays:
+    """Rays made of some that were checked: without a look at every number."""
+    rays = object.__new__(Rays)
+    for name, value in (("origins", origins), ("directions", directions), ("image", image)):
+        object.__setattr__(rays, name, value)
+    return rays
 
 
 @dataclass(frozen=True)

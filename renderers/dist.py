@@ -9,7 +9,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, steepest
+from renderers.field import PATIENT, Field, steepest, values_to_march_on
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
@@ -25,7 +25,8 @@ class DIST:
         right direction at each pixel and a wrong scale, alpha * K * cos(angle of incidence); see
         `gradients.approximate`. That of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
-    Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step` and `slope_samples` are ours.
+    Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step`, `slope_samples` and `coarse`
+        are ours.
         `step_clamp`, `silhouette_signed` and the average over violating pixels are as in the official code; Eq. 11
         states neither sign nor average. Each has a setting, which is off in the preset that follows the paper's text. A
         ray that begins at negative values stops at once with STARTED_INSIDE. Coarse to fine applies to rays of an
@@ -41,6 +42,9 @@ class DIST:
         n_gradient_samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.
+        coarse: march on the field's coarse values away from the surface, where it offers any, by at most `PATIENT`
+            times as many steps; see `field.values_to_march_on`. What is lost or found is what would be on values nearer
+            to 0 by twice their error; without a gradient a miss's `closest` is such a value.
     """
 
     steps: int
@@ -59,6 +63,7 @@ class DIST:
     sphere_radius: float
     silhouette_signed: bool
     silhouette_average: str
+    coarse: bool = False
 
     capabilities: ClassVar[Capabilities] = OF_LENGTHS
 
@@ -100,11 +105,13 @@ class DIST:
     def _trace(self, field: Field, rays: Rays) -> Front:
         given = {setting.name: getattr(self, setting.name) for setting in fields(Stepping) if setting.name != "slope"}
         stepping = Stepping(**given, slope=self._slope(field, rays))
+        values = values_to_march_on(field, self.coarse)
+        steps = self.steps if values is field else PATIENT * self.steps
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
-                field, rays, stepping, steps=self.steps, radius=self.sphere_radius, samples=self.n_gradient_samples
+                values, rays, stepping, steps=steps, radius=self.sphere_radius, samples=self.n_gradient_samples
             )
         flat = rays.flat()
         front = Front.on_sphere(flat, radius=self.sphere_radius, samples=self.n_gradient_samples)
-        march(field, flat, front, stepping, self.steps)
+        march(values, flat, front, stepping, steps)
         return front

@@ -2,18 +2,22 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
+from functools import lru_cache
 from math import log
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderers.camera import rigid
 
 PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
+PATIENT = (
+    2  # times the steps of a march on the field, of one on coarse values, whose steps are shorter near the surface
+)
 STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
 
 
@@ -81,6 +85,25 @@ def coarse_of(field: Field) -> Coarse | None:
     return getattr(field, "coarse", None)
 
 
+def values_to_march_on(field: Field, coarse: bool) -> Values:
+    """The values that a march asks for: with `coarse`, of the coarse ones that the field offers what is certain.
+
+    They are nearer to 0 by their error, so that no step is longer than the field's own value would have it. Where no
+    more than that error is left, or the coarse value is no number, the field itself is asked: a hit is one of its own.
+    """
+    offered = coarse_of(field) if coarse else None
+    if offered is None:
+        return field
+
+    def values(points: Tensor) -> Tensor:
+        found = offered.values(points)
+        certain = found.abs() - offered.error
+        near = (~(certain > offered.error)).nonzero().squeeze(-1)
+        return found.sign().mul_(certain).index_copy_(0, near, field(points.index_select(0, near)))
+
+    return values
+
+
 # From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.
 Bounds = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -103,6 +126,23 @@ def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
     return bounds
 
 
+class _Late:
+    """A number of `Counts`, 0 at first, that a device may still be counting: who reads it waits, who adds does not."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.place = f"_{name}"
+
+    def __get__(self, counts: "Counts | None", owner: type) -> int:
+        if counts is None:
+            return 0  # the default of the dataclass
+        number = int(vars(counts)[self.place])
+        vars(counts)[self.place] = number
+        return number
+
+    def __set__(self, counts: "Counts", number: int) -> None:
+        vars(counts)[self.place] = number
+
+
 @dataclass
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
@@ -112,9 +152,13 @@ class Counts:
     """
 
     value: int = 0
-    gradient: int = 0
+    gradient: int = cast(int, _Late())
     hits: int = field(default=0, repr=False, compare=False)
     coarse: int = 0
+
+    def add_gradient(self, number: Int[Tensor, ""]) -> None:
+        """Adds to `gradient` a number that a device may still be counting."""
+        vars(self)["_gradient"] = vars(self)["_gradient"] + number
 
     def flops(self, field: Field) -> int | None:
         """The floating-point operations of these evaluations, without coarse ones; None where the field has none."""
@@ -138,8 +182,8 @@ class Counts:
         return work / least if least else None
 
     def __sub__(self, other: "Counts") -> "Counts":
-        mine, others = vars(self), vars(other)
-        return Counts(**{name: mine[name] - others[name] for name in mine})
+        names = [one.name for one in fields(self)]
+        return Counts(**{name: getattr(self, name) - getattr(other, name) for name in names})
 
 
 class Wrapper(ABC):
@@ -199,7 +243,7 @@ class Meter(Wrapper):
         self.counts.coarse += points
 
     def _count_backward(self, gradient: Tensor) -> None:
-        self.counts.gradient += int(gradient.count_nonzero())
+        self.counts.add_gradient(gradient.count_nonzero())
 
 
 @dataclass(frozen=True)
@@ -273,16 +317,26 @@ def steepest(
         margin: see `STEEPEST_MARGIN`.
         like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
-    points = radius * points_in_sphere(samples)
-    gradients = autograd_gradients(field, points if like is None else points.to(like))
+    points = radius * points_in_sphere(samples, like)
+    gradients = autograd_gradients(field, points)
     return margin * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
 
 
-def points_in_sphere(count: int) -> Float[Tensor, "count 3"]:
-    """Points drawn evenly in the unit sphere about the origin, the same ones each time, in float64 on the CPU."""
+def points_in_sphere(count: int, like: Tensor | None = None) -> Float[Tensor, "count 3"]:
+    """Points drawn evenly in the unit sphere about the origin, the same ones each time.
+
+    Args:
+        like: a tensor of the dtype and device of the points; None for float64 on the CPU.
+    """
+    where = (torch.float64, torch.device("cpu")) if like is None else (like.dtype, like.device)
+    return _drawn_in_sphere(count, *where).clone()
+
+
+@lru_cache(maxsize=8)  # a renderer may ask at every rendering
+def _drawn_in_sphere(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "count 3"]:
     draws = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
     direction = torch.nn.functional.normalize(torch.randn(count, 3, **draws), dim=-1)
-    return torch.rand(count, 1, **draws) ** (1 / 3) * direction
+    return (torch.rand(count, 1, **draws) ** (1 / 3) * direction).to(device, dtype)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import torch
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field
+from renderers.field import PATIENT, Field, values_to_march_on
 from renderers.gradients import implicit_front
 from renderers.march import Front, Stepping, march
 from renderers.rendering import Rendering
@@ -28,10 +28,12 @@ class IDR(SurfaceRenderer):
         steps: most marching steps per ray.
         epsilon: a ray has converged where the field's magnitude is below this, in scene units.
         least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
+        coarse: see `dist.DIST`; ours.
     """
 
     steps: int
     epsilon: float
+    coarse: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -43,5 +45,7 @@ class IDR(SurfaceRenderer):
         flat = rays.flat()
         with torch.no_grad():
             front = Front.on_sphere(flat, radius=self.sphere_radius, samples=1)
-            march(field, flat, front, Stepping(self.epsilon), self.steps)
+            values = values_to_march_on(field, self.coarse)
+            steps = self.steps if values is field else PATIENT * self.steps
+            march(values, flat, front, Stepping(self.epsilon), steps)
         return implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)

@@ -4,16 +4,17 @@ Everything here runs without a graph; `gradients.py` says how a gradient is atta
 the graph instead.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
-from renderers.field import Field
+from renderers.field import Values
 from renderers.rendering import Status
 
 PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
@@ -61,13 +62,19 @@ class Stepping:
 
     def length(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """The signed step along the ray for a field value."""
-        value = value / self.slope
+        value = self.reach(value)
         if self.step_clamp is not None:
             value = value.clamp(-self.step_clamp, self.step_clamp)
+        if self.alpha == 1:
+            return value
         extra = (self.alpha - 1) * value
         if self.extra_step_cap is not None:
             extra = extra.clamp(-self.extra_step_cap, self.extra_step_cap)
         return value + extra
+
+    def reach(self, value: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+        """The signed length within which a field value says that there is no surface."""
+        return value if self.slope == 1 else value / self.slope
 
 
 @dataclass
@@ -84,15 +91,12 @@ class Front:
     value: Float[Tensor, " n"]
     sample_distance: Float[Tensor, "n samples"]
     sample_value: Float[Tensor, "n samples"]  # infinite where there is no such sample
-    safe: Float[Tensor, " n"]  # the step that the last value allowed, and the step taken
-    gone: Float[Tensor, " n"]
-    rise: Float[Tensor, " n"]  # the running slope of the values along the ray; see `Stepping.relaxation`
+    past: Float[Tensor, "n 3"]  # see `Moving`
 
     @staticmethod
     def on_sphere(rays: Rays, *, radius: float, samples: int) -> "Front":
         """Every ray where it enters the sphere of `radius` about the origin, or at its origin if that lies inside."""
         entry, leave, meets = sphere_span(rays, radius)
-        status = torch.where(meets, Status.OUT_OF_STEPS, Status.MISS).to(torch.int8)
         return Front(
             distance=entry,
             entry=entry.clone(),
@@ -100,13 +104,11 @@ class Front:
             meets=meets,
             active=meets.clone(),
             fresh=torch.ones_like(meets),
-            status=status,
+            status=torch.where(meets, Status.OUT_OF_STEPS, Status.MISS).to(torch.int8),
             value=torch.zeros_like(entry),
             sample_distance=entry[:, None].repeat(1, samples),
-            sample_value=torch.full_like(entry, torch.inf)[:, None].repeat(1, samples),
-            safe=torch.zeros_like(entry),
-            gone=torch.zeros_like(entry),
-            rise=torch.full_like(entry, STEEPEST_FALL),
+            sample_value=entry.new_full((len(entry), samples), torch.inf),
+            past=entry.new_tensor([0.0, 0.0, STEEPEST_FALL]).repeat(len(entry), 1),
         )
 
     def split(
@@ -119,39 +121,185 @@ class Front:
         behind the finer ray's start.
         """
         child = Front.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
-        inherits = self.meets[parent] & (self.status[parent] != Status.STARTED_INSIDE)
-        start = self.distance[parent]
+        status, start = self.status[parent], self.distance[parent]
+        least, closest = self.sample_value[parent], self.sample_distance[parent]
+        inherits = self.meets[parent] & (status != Status.STARTED_INSIDE)
         if careful:
-            closest, least = self.sample_distance[parent, 0], self.sample_value[parent, 0].abs()
-            apart = torch.linalg.vector_norm(coarse[parent].at(closest) - rays.at(closest), dim=-1)
-            start = torch.where(least <= CAREFUL * apart, closest, start)
+            apart = torch.linalg.vector_norm(coarse[parent].at(closest[:, 0]) - rays.at(closest[:, 0]), dim=-1)
+            start = torch.where(least[:, 0].abs() <= CAREFUL * apart, closest[:, 0], start)
         child.distance = torch.where(inherits, torch.maximum(start, child.distance), child.distance)
         child.fresh = ~inherits
-        gone = child.meets & inherits & (child.distance >= child.leave)
+        inherits = inherits & child.meets
+        gone = inherits & (child.distance >= child.leave)
         child.active &= ~gone
-        child.status[gone] = Status.MISS
-        child.value[gone] = self.value[parent[gone]]
-        keeps = child.meets & inherits & (self.status[parent] != Status.HIT)
-        child.sample_distance[keeps] = self.sample_distance[parent[keeps]]
-        child.sample_value[keeps] = self.sample_value[parent[keeps]]
+        child.status = torch.where(gone, Status.MISS, child.status).to(torch.int8)
+        child.value = torch.where(gone, self.value[parent], child.value)
+        keeps = (inherits & (status != Status.HIT))[:, None]
+        child.sample_distance = torch.where(keeps, closest, child.sample_distance)
+        child.sample_value = torch.where(keeps, least, child.sample_value)
         return child
 
+    def keep(self, moving: "Moving") -> None:
+        """Takes over where rays are that have moved."""
+        for name in CHANGING:
+            if (column := getattr(moving, name)) is not None:
+                getattr(self, name).index_copy_(0, moving.index, column)
 
-def march(field: Field, rays: Rays, front: Front, stepping: Stepping, steps: int) -> None:
-    """Moves the front of flat rays [n, 3] by at most `steps` steps, in place."""
-    for _ in range(steps):
-        queried = (front.active if stepping.active_only else front.meets).nonzero().squeeze(-1)
-        if queried.numel() == 0:
-            return
-        value = field(rays.origins[queried] + front.distance[queried, None] * rays.directions[queried])
-        if not stepping.active_only:
-            moving = front.active[queried]
-            queried, value = queried[moving], value[moving]
-        _advance(front, queried, value, stepping)
+    def finish(self, moved: Bool[Tensor, " n"], stepping: Stepping) -> None:
+        """Says of the rays that have `moved` where and how they ended, or that they go on."""
+        unsettled = _unsettled(self.value, self.past, stepping)
+        behind, left = self.distance < self.entry - stepping.epsilon, self.distance > self.leave
+        converged = ~unsettled & ~self.value.isnan()
+        status = torch.where(left, Status.MISS, Status.OUT_OF_STEPS)
+        status = torch.where(behind, Status.STARTED_INSIDE, torch.where(converged, Status.HIT, status))
+        self.status = torch.where(moved, status, self.status).to(torch.int8)
+        self.active, self.fresh = moved & unsettled & ~behind & ~left, self.fresh & ~moved
+        ends = torch.where(behind, self.entry, torch.where(left & ~converged, self.leave, self.distance))
+        self.distance = torch.where(moved, ends, self.distance)
+        self.value = self.value.nan_to_num(0.0)
+
+
+CHANGING = ("distance", "value", "sample_distance", "sample_value", "past")  # what a step changes
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Those m rays of a front that go on; a step makes others of them.
+
+    Args:
+        index: their places in the front.
+        earliest: where they enter the sphere, less the threshold of a hit.
+        past: the step that the last value allowed, infinite after a step back; the step taken; and the running slope of
+            the values along the ray (see `Stepping.relaxation`). None where steps are never taken back.
+    """
+
+    index: Int[Tensor, " m"]
+    origins: Float[Tensor, "m 3"]
+    directions: Float[Tensor, "m 3"]
+    earliest: Float[Tensor, " m"]
+    leave: Float[Tensor, " m"]
+    distance: Float[Tensor, " m"]
+    value: Float[Tensor, " m"]
+    sample_distance: Float[Tensor, "m samples"]
+    sample_value: Float[Tensor, "m samples"]
+    past: Float[Tensor, "m 3"] | None
+
+    @staticmethod
+    def of(front: Front, rays: Rays, stepping: Stepping, index: Int[Tensor, " m"]) -> "Moving":
+        """The rays of a front at these places."""
+        columns = (front.leave, front.distance, front.value, front.sample_distance, front.sample_value)
+        past = front.past if stepping.step_back else None
+        every = torch.arange(len(front.distance), device=index.device)
+        earliest = front.entry - stepping.epsilon
+        return Moving(every, rays.origins, rays.directions, earliest, *columns, past).some(index)
+
+    def some(self, index: Int[Tensor, " k"]) -> "Moving":
+        """The same of some of them."""
+        columns: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        present = {name: column.index_select(0, index) for name, column in columns.items() if column is not None}
+        return Moving(**columns | present)
+
+    def where(self, chosen: Bool[Tensor, " m"], other: "Moving") -> "Moving":
+        """These where they are chosen, else the others."""
+        changed = {}
+        for name in CHANGING:
+            if (mine := getattr(self, name)) is not None:
+                changed[name] = torch.where(chosen.view(-1, *[1] * (mine.dim() - 1)), mine, getattr(other, name))
+        return replace(self, **changed)
+
+    def after(self, value: Float[Tensor, " m"], stepping: Stepping, fresh: Bool[Tensor, " m"] | None) -> "Moving":
+        """The rays after a step by the field's values at their ends.
+
+        Where a value is not finite it becomes NaN, and the ray stays.
+
+        Args:
+            fresh: see `Front`; a ray that turns out to begin inside is put infinitely far back. None for no ray.
+        """
+        value = value.nan_to_num(torch.nan, torch.nan, torch.nan)
+        known, past = value.nan_to_num(0.0), self.past
+        length = stepping.length(known)
+        if stepping.relaxation and past is not None:
+            length, past = _relaxed(stepping.reach(known), past, stepping.relaxation)
+        if stepping.least_step:
+            onward = (known > 0) & (self.value >= 0)
+            length = torch.where(onward, length.clamp_min(stepping.least_step), length)
+        magnitude = value.abs()
+        converged = magnitude < stepping.epsilon
+        step = torch.where(converged, known, length)  # the last query moves the ray without alpha (DIST, Eq. 1)
+        if past is not None:
+            step, past = self._taken_back(stepping.reach(known), step, past)
+        moved = self.distance + step
+        if fresh is not None:
+            moved = torch.where(fresh & (value < 0) & ~converged, -torch.inf, moved)
+        places, values = self._least(value, magnitude)
+        return replace(self, distance=moved, value=value, sample_distance=places, sample_value=values, past=past)
+
+    def goes_on(self, stepping: Stepping) -> Bool[Tensor, " m"]:
+        """Which rays go on after a step."""
+        within = (self.distance <= self.leave) & (self.distance >= self.earliest)
+        return within & _unsettled(self.value, self.past, stepping)
+
+    def _taken_back(
+        self, reach: Float[Tensor, " m"], step: Float[Tensor, " m"], past: Float[Tensor, "m 3"]
+    ) -> tuple[Float[Tensor, " m"], Float[Tensor, "m 3"]]:
+        """The steps, with a step back where the last two empty spheres do not meet; and what is then past."""
+        safe, gone, rise = past.unbind(dim=1)
+        over = (self.distance + step > self.leave) & (self.distance + reach <= self.leave)
+        step = torch.where(over, reach, step)
+        apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
+        back = torch.where(apart, safe - gone, step)
+        safe = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
+        return back, torch.stack([safe, back, rise], dim=1)
+
+    def _least(
+        self, value: Float[Tensor, " m"], magnitude: Float[Tensor, " m"]
+    ) -> tuple[Float[Tensor, "m samples"], Float[Tensor, "m samples"]]:
+        """The distances and values of the samples, with the one at the ends where it is among the least."""
+        new, at, values, distances = value[:, None], self.distance[:, None], self.sample_value, self.sample_distance
+        closer = magnitude[:, None] < values.abs()
+        if values.shape[1] > 1:  # those behind move on by one
+            new = torch.cat([new, torch.where(closer[:, :-1], values[:, :-1], new)], dim=1)
+            at = torch.cat([at, torch.where(closer[:, :-1], distances[:, :-1], at)], dim=1)
+        return torch.where(closer, at, distances), torch.where(closer, new, values)
+
+
+Note = Callable[[Tensor, Tensor, Tensor], None]  # of rays: their places in the front, distances and values there
+
+
+def march(
+    values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note = lambda *_: None
+) -> None:
+    """Moves the front of flat rays [n, 3] by at most `steps` steps, in place.
+
+    Args:
+        note: is told of the values of each step.
+    """
+    if steps < 1:
+        return
+    moved, every = front.active, not stepping.active_only
+    index = (front.meets if every else moved).nonzero().squeeze(-1)
+    moving, going, fresh = Moving.of(front, rays, stepping, index), moved[index], front.fresh[index]
+    for step in range(steps):
+        if moving.index.numel() == 0:
+            break
+        value = values(moving.origins + moving.distance[:, None] * moving.directions)
+        note(moving.index, moving.distance, value)
+        after = moving.after(value, stepping, None if step else fresh)
+        goes_on = after.goes_on(stepping)
+        if every:
+            moving, going = after.where(going, moving), going & goes_on
+            continue
+        onward = goes_on.nonzero().squeeze(-1)
+        if len(onward) < len(goes_on):
+            front.keep(after)
+            after = after.some(onward)
+        moving = after
+    front.keep(moving)
+    front.finish(moved, stepping)
 
 
 def march_coarse_to_fine(
-    field: Field, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
+    values: Values, rays: Rays, stepping: Stepping, *, steps: int, radius: float, samples: int
 ) -> Front:
     """Three steps with one ray per 4 x 4 pixels, three with one per 2 x 2, the rest with one per pixel (DIST, 3.2).
 
@@ -166,10 +314,10 @@ def march_coarse_to_fine(
     levels = pyramid(rays)
     front = Front.on_sphere(levels[0].coarse, radius=radius, samples=samples)
     for level in levels:
-        march(field, level.coarse, front, stepping, min(PYRAMID_STEPS, steps))
+        march(values, level.coarse, front, stepping, min(PYRAMID_STEPS, steps))
         steps = max(steps - PYRAMID_STEPS, 0)
         front = front.split(level.parent, level.coarse, level.fine, radius=radius, careful=stepping.careful_split)
-    march(field, levels[-1].fine, front, stepping, steps)
+    march(values, levels[-1].fine, front, stepping, steps)
     return front
 
 
@@ -197,74 +345,23 @@ def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[
     return doubled[..., : fine[-2], : fine[-1]].reshape(-1)
 
 
-def _advance(front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], stepping: Stepping) -> None:
-    """Moves the active rays `queried` by their field values, in place."""
-    finite = value.isfinite()
-    value = torch.where(finite, value, 0.0)
-    converged = finite & (value.abs() < stepping.epsilon)
-    inside = finite & front.fresh[queried] & (value < 0) & ~converged
-    distance = front.distance[queried]
-    _keep_least(front, queried, torch.where(finite, value, torch.inf), distance)
-
-    # The last query moves the ray by the value itself, without alpha (DIST, Eq. 1).
-    length = _relaxed(front, queried, value, stepping) if stepping.relaxation else stepping.length(value)
-    onward = (value > 0) & (front.value[queried] >= 0)
-    length = torch.where(onward, length.clamp_min(stepping.least_step), length)
-    step = torch.where(converged, value, torch.where(inside, 0.0, length))
-    if stepping.step_back:
-        reach = value / stepping.slope
-        over = (distance + step > front.leave[queried]) & (distance + reach <= front.leave[queried])
-        step, apart = _taken_back(front, queried, reach, torch.where(over, reach, step))
-        converged &= ~apart
-    moved = distance + step
-    left = ~converged & (moved > front.leave[queried])
-    behind = moved < front.entry[queried] - stepping.epsilon
-    inside |= behind
-    converged &= ~behind
-    moved = torch.where(behind, front.entry[queried], moved)
-
-    status = torch.full_like(front.status[queried], Status.OUT_OF_STEPS)
-    status[left] = Status.MISS
-    status[converged] = Status.HIT
-    status[inside] = Status.STARTED_INSIDE
-    front.status[queried] = status
-    front.value[queried] = value
-    front.distance[queried] = torch.where(left, front.leave[queried], moved)
-    front.fresh[queried] = False
-    front.active[queried] = finite & ~converged & ~inside & ~left
-
-
-def _taken_back(
-    front: Front, queried: Int[Tensor, " m"], reach: Float[Tensor, " m"], step: Float[Tensor, " m"]
-) -> tuple[Float[Tensor, " m"], Bool[Tensor, " m"]]:
-    """The steps, with a step back where the last two empty spheres do not meet; and on which rays that is."""
-    safe, gone = front.safe[queried], front.gone[queried]
-    apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
-    back = torch.where(apart, safe - gone, step)
-    front.safe[queried] = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
-    front.gone[queried] = back
-    return back, apart
+def _unsettled(value: Float[Tensor, " n"], past: Float[Tensor, "n 3"] | None, stepping: Stepping) -> Bool[Tensor, " n"]:
+    """Which rays have a finite value and have not converged, or went back since."""
+    magnitude = value.abs()
+    unsettled = magnitude >= stepping.epsilon
+    if stepping.step_back and past is not None:
+        unsettled |= (magnitude < stepping.epsilon) & past[:, 0].isinf()
+    return unsettled
 
 
 def _relaxed(
-    front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], stepping: Stepping
-) -> Float[Tensor, " m"]:
-    """Steps to where the empty sphere of a plane that falls as the values do would touch this one; keeps the slope."""
-    gone, reach = front.gone[queried], value / stepping.slope
-    onward = (gone > 0) & front.safe[queried].isfinite()  # after a step back nothing is known of the slope
-    last = (reach - front.safe[queried]) / torch.where(onward, gone, 1.0)
-    running = torch.lerp(front.rise[queried], last.clamp(STEEPEST_FALL, -STEEPEST_FALL), stepping.relaxation)
+    reach: Float[Tensor, " n"], past: Float[Tensor, "n 3"], weight: float
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Steps to where the empty sphere of a plane that falls as the values do would touch this one; with its slope."""
+    safe, gone, rise = past.unbind(dim=1)
+    onward = (gone > 0) & safe.isfinite()  # after a step back nothing is known of the slope
+    last = (reach - safe) / torch.where(onward, gone, 1.0)
+    running = torch.lerp(rise, last.clamp(STEEPEST_FALL, -STEEPEST_FALL), weight)
     rise = torch.where(onward, running, STEEPEST_FALL)
-    front.rise[queried] = rise
-    return torch.where(value > 0, 2 * reach / (1 - rise.clamp_max(FASTEST_RISE)), reach)
-
-
-def _keep_least(
-    front: Front, queried: Int[Tensor, " m"], value: Float[Tensor, " m"], distance: Float[Tensor, " m"]
-) -> None:
-    """Keeps the samples of least magnitude of each ray, in rising order."""
-    values = torch.cat([front.sample_value[queried], value[:, None]], dim=1)
-    distances = torch.cat([front.sample_distance[queried], distance[:, None]], dim=1)
-    order = values.abs().argsort(dim=1, stable=True)[:, :-1]
-    front.sample_value[queried] = values.gather(1, order)
-    front.sample_distance[queried] = distances.gather(1, order)
+    length = torch.where(reach > 0, 2 * reach / (1 - rise.clamp_max(FASTEST_RISE)), reach)
+    return length, torch.stack([safe, gone, rise], dim=1)

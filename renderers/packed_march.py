@@ -6,6 +6,7 @@ The rays that go on are rows of one table, so that a step costs few operations. 
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -118,7 +119,7 @@ class Reached:
 
     def some(self, index: Int[Tensor, " m"]) -> "Reached":
         """The same of some of the rays, as a copy."""
-        return Reached(self.table[index])
+        return Reached(self.table.index_select(0, index))
 
     def begun_again(self, rays: Rays, anchored: Bool[Tensor, " n"], *, radius: float) -> "Reached":
         """The rays to be marched again, from their anchor where they are `anchored`, else from their beginning.
@@ -149,40 +150,14 @@ class Reached:
         self.least_distance = torch.where(closer, distance, self.least_distance)
         self.least = torch.where(closer, value, self.least)
 
-    def advance(self, value: Float[Tensor, " n"], stride: Stride) -> Bool[Tensor, " n"]:
-        """Moves all rays by the field's values where they are; which of them go on.
-
-        A ray that continues from its coarse ray may begin behind the surface: it goes back until the field is positive,
-        to where it begins at the most.
-        """
-        at, epsilon, safe = self.distance.clone(), stride.epsilon, self.free_value.clone()
-        went, finite, own, begins = at - self.free, value.isfinite(), safe.isfinite(), at <= self.entry
-        above, behind = (value > epsilon) & finite, value < -epsilon
-        too_far = finite & (went - safe - value.abs() > TOLERATED * stride.unseen)
-        from_behind = too_far & (value < 0)
-        self.keep_least(at, torch.where(from_behind, torch.inf, value))
-        self.wall = torch.where(from_behind, at, self.wall)
-        positive = above & ~too_far
-        left = positive & (at + value > self.leave) & self.wall.isinf()
-        goes_on = finite & (too_far | (behind & ~own & ~begins) | (above & ~left))
-        stop = torch.where(begins & (value < 0) & ~own, Stop.INSIDE, torch.where(behind, Stop.CROSSED, Stop.NEAR))
-        stop = torch.where(goes_on, Stop.ON_THE_WAY, torch.where(left, Stop.LEFT, stop))
-        slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
-        moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
-        moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, self.wall))
-        self.stop = torch.where(finite, stop, Stop.NOT_FINITE)
-        self.value = torch.where(finite, value, 0.0)
-        self.distance = torch.where(goes_on, moved, torch.where(left, at + value, at))
-        self.free = torch.where(positive, at, self.free)
-        self.free_value = torch.where(positive, value, safe)
-        rises = value > safe
-        lower = torch.where(rises, safe, value)
-        cleared = torch.where(left & (value <= CLEAR), self.leave, at)
-        self.cleared = torch.where(lower <= CLEAR, cleared, self.cleared)
-        self.anchor = torch.where(torch.minimum(self.passed, lower) > CLEAR, at, self.anchor)
-        risen = torch.where(rises | left, lower, torch.inf)
-        self.passed, self.grazed = torch.minimum(self.passed, risen), torch.minimum(self.grazed, risen)
-        return goes_on
+    def note_stops(self, epsilon: float) -> None:
+        """Says how each ray stopped, from where it did and the field's last value."""
+        value = self.value
+        inside = (value < 0) & self.free_value.isinf() & (self.distance <= self.entry)
+        stop = torch.where(inside, Stop.INSIDE, torch.where(value < -epsilon, Stop.CROSSED, Stop.NEAR))
+        stop = torch.where(self.distance > self.leave, Stop.LEFT, stop)
+        self.stop = torch.where(value.isfinite(), stop, Stop.NOT_FINITE)
+        self.value = value.nan_to_num(0.0, 0.0, 0.0)
 
     def split(
         self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], rays: Rays, *, radius: float, error: float
@@ -243,15 +218,85 @@ def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: 
 def march(values: Values, rays: Rays, reached: Reached, stride: Stride, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
-    origins, directions, moving = rays.origins[index], rays.directions[index], reached.some(index)
+    origins, directions, columns = rays.origins[index], rays.directions[index], reached.table[index].T.contiguous()
+    ended: list[tuple[Tensor, Tensor]] = []  # rays that have stopped, and their columns
     for _ in range(steps):
         if index.numel() == 0:
-            return
-        goes_on = moving.advance(values(origins + moving.distance[:, None] * directions), stride)
-        stopped, going = (~goes_on).nonzero().squeeze(-1), goes_on.nonzero().squeeze(-1)
-        reached.table[index[stopped]] = moving.table[stopped]
-        index, origins, directions, moving = index[going], origins[going], directions[going], moving.some(going)
-    reached.table[index] = moving.table
+            break
+        moving = Moving(*columns)
+        columns, goes_on = moving.after(values(origins + moving.distance[:, None] * directions), stride)
+        going = goes_on.nonzero().squeeze(-1)
+        if len(going) < len(index):
+            stopped = (~goes_on).nonzero().squeeze(-1)
+            ended.append((index[stopped], columns.index_select(1, stopped)))
+            index, origins, directions = (kept.index_select(0, going) for kept in (index, origins, directions))
+            columns = columns.index_select(1, going)
+    reached.table.index_copy_(0, index, columns.T)
+    if ended:
+        index, stopped = torch.cat([some for some, _ in ended]), Reached(torch.cat([rows for _, rows in ended], 1).T)
+        stopped.note_stops(stride.epsilon)
+        reached.table.index_copy_(0, index, stopped.table)
+
+
+class Moving(NamedTuple):
+    """The columns of `Reached.table`, in their order, of m rays that go on."""
+
+    distance: Tensor
+    value: Tensor
+    least_distance: Tensor
+    least: Tensor
+    free: Tensor
+    free_value: Tensor
+    entry: Tensor
+    leave: Tensor
+    stop: Tensor
+    passed: Tensor
+    anchor: Tensor
+    cleared: Tensor
+    grazed: Tensor
+    wall: Tensor
+
+    def after(self, value: Float[Tensor, " m"], stride: Stride) -> tuple[Float[Tensor, "14 m"], Bool[Tensor, " m"]]:
+        """The columns after a step by the field's values where the rays are, and which of them go on.
+
+        A ray that continues from its coarse ray may begin behind the surface: it goes back until the field is positive,
+        to where it begins at the most. That of a ray that stops is at the value's place; beyond the end if it has left.
+        """
+        at, safe, magnitude, negative = self.distance, self.free_value, value.abs(), value < 0
+        went, finite = at - self.free, magnitude < torch.inf
+        above, behind = (value > stride.epsilon) & finite, (value < -stride.epsilon) & finite
+        too_far = finite & (went - safe - magnitude > TOLERATED * stride.unseen)
+        from_behind = too_far & negative
+        closer = finite & ~from_behind & (magnitude < self.least.abs())
+        wall = torch.where(from_behind, at, self.wall)
+        positive, end = above & ~too_far, at + value
+        left = positive & (end > self.leave) & self.wall.isinf()
+        first = safe.isinf() & (at > self.entry)
+        goes_on = too_far | (behind & first) | (above & ~left)
+        slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
+        moved = torch.where(too_far, self.free + safe, at + stride.length(value, slope))
+        moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, wall))
+        rises = value > safe
+        lower = torch.where(rises, safe, value)
+        risen = torch.where(rises | left, lower, torch.inf)
+        cleared = torch.where(left & (value <= CLEAR), self.leave, at)
+        columns = Moving(
+            distance=torch.where(goes_on, moved, torch.where(left, end, at)),
+            value=value,
+            least_distance=torch.where(closer, at, self.least_distance),
+            least=torch.where(closer, value, self.least),
+            free=torch.where(positive, at, self.free),
+            free_value=torch.where(positive, value, safe),
+            entry=self.entry,
+            leave=self.leave,
+            stop=self.stop,
+            passed=torch.minimum(self.passed, risen),
+            anchor=torch.where(torch.minimum(self.passed, lower) > CLEAR, at, self.anchor),
+            cleared=torch.where(lower <= CLEAR, cleared, self.cleared),
+            grazed=torch.minimum(self.grazed, risen),
+            wall=wall,
+        )
+        return torch.stack(columns), goes_on
 
 
 def _apart(first: Rays, second: Rays, begin: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[Tensor, " n"]:

@@ -66,7 +66,7 @@ class RelaxedBoundary(SurfaceRenderer):
             front, passed, least = self._march(field, flat)
         rendering = implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         distance, hit = rendering.distance.view(-1), (front.status == Status.HIT).nonzero().squeeze(-1)
-        near = (least.isfinite() & (front.status != Status.STARTED_INSIDE)).nonzero().squeeze(-1)
+        near = least.isfinite().nonzero().squeeze(-1)
         here = fixed_samples(field, flat[near], passed[near], least[near])
         coming = (here.detach() - here) / self.band
         behind = torch.ones_like(distance).index_put((near,), 1 - coming)[hit]
@@ -76,23 +76,22 @@ class RelaxedBoundary(SurfaceRenderer):
     def _march(self, field: Field, rays: Rays) -> tuple[Front, Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The front; where each ray first passed a surface within the band, and the value there: infinite without."""
         front = Front.on_sphere(rays, radius=self.sphere_radius, samples=1)
-        stepping = Stepping(self.epsilon)
         passed, least = front.distance.clone(), torch.full_like(front.distance, torch.inf)
-        places = values = torch.full_like(least, torch.nan).expand(3, -1)  # of each ray's last three samples
-        for _ in range(self.steps):
-            if not bool(front.active.any()):
-                break
-            asked, before = front.active.clone(), front.distance.clone()
-            march(field, rays, front, stepping, 1)
-            places = torch.where(asked, torch.cat([places[1:], before[None]]), places)
-            values = torch.where(asked, torch.cat([values[1:], front.value[None]]), values)
-            dips = (values[1] < values[0]) & (values[1] < values[2]) & (values[1] > 0) & least.isinf()
-            near = (asked & dips & (values[1] < CANDIDATE * self.band)).nonzero().squeeze(-1)
+        last = passed.new_full((2, 3, len(passed)), torch.nan)  # of each ray: places and values of three samples
+
+        def look(asked: Tensor, distance: Tensor, value: Tensor) -> None:
+            """Asks the field where rays have just passed a least value."""
+            new = torch.stack([distance, value])[:, None]
+            places, values = last[:, :, asked] = torch.cat([last[:, 1:, asked], new], dim=1)
+            dips = (values[1] < values[0]) & (values[1] < values[2]) & (values[1] > 0)
+            near = (dips & (values[1] < CANDIDATE * self.band) & least[asked].isinf()).nonzero().squeeze(-1)
             if near.numel():
-                place = _lowest(places[:, near], values[:, near])
-                value = field(rays[near].at(place))
-                within = (value > self.epsilon) & (value < self.band + self.epsilon)
-                passed[near[within]], least[near[within]] = place[within], value[within]
+                place, near = _lowest(places[:, near], values[:, near]), asked[near]
+                there = field(rays[near].at(place))
+                within = (there > self.epsilon) & (there < self.band + self.epsilon)
+                passed[near[within]], least[near[within]] = place[within], there[within]
+
+        march(field, rays, front, Stepping(self.epsilon), self.steps, note=look)
         return front, passed, least
 
 

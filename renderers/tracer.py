@@ -9,7 +9,17 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_sphere
+from renderers.field import (
+    PATIENT,
+    Coarse,
+    Field,
+    Kind,
+    Values,
+    Wrapper,
+    carries_gradient,
+    coarse_of,
+    points_in_sphere,
+)
 from renderers.gradients import crossing
 from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble
@@ -17,7 +27,6 @@ from renderers.rendering import Deferred, Rendering, Status, assemble
 # Scene units, times the slope along the ray: after a longer Newton step the field is asked again, since a step is off
 # by its square over the slope, times half the field's curvature.
 LONGEST = 0.006
-PATIENT = 2  # times `steps`, where all rays are marched on coarse values, and for those in doubt on the field after it
 OF_BOUNDS = 5  # times `steps`, on a bound, whose values are a part of the distance
 NO_NEARER = 0.25  # times the error of coarse values: to how small ones rays are marched
 PAIRS, SPAN = 64, 0.1  # of points between which the steepness is measured; how far apart they are, in radii
@@ -31,7 +40,7 @@ class Tracer:
 
     Args:
         steps: most marching steps per ray, beside those of its coarse rays; rays that are left are searched densely.
-            See `PATIENT` and `OF_BOUNDS`.
+            `PATIENT` times as many on coarse values, and after it for those in doubt on the field; see `OF_BOUNDS`.
         march_epsilon: the march stops where the field's magnitude is at most this, in scene units; a Newton step does
             the rest. A value so little behind the surface is a hit, whatever its slope.
         unseen: of a ray, between the samples of the march; see `packed_march.Stride`.
@@ -289,7 +298,8 @@ class Solved:
 
     def some(self, which: Bool[Tensor, " m"]) -> "Solved":
         """The same of some of them."""
-        return Solved(*(column[which] for column in self.columns))
+        index = which.nonzero().squeeze(-1)
+        return Solved(*(column.index_select(0, index) for column in self.columns))
 
     def among(self, index: Int[Tensor, " n"]) -> "Solved":
         """The same, with `index` counted among the n rays from which these were chosen by `index`."""
@@ -345,9 +355,9 @@ def measured_steepness(values: Values, like: Float[Tensor, "*batch 3"], *, radiu
         like: points of the dtype and device at which values are asked.
         radius: of the sphere about the origin in which the points lie.
     """
-    points = radius * points_in_sphere(PAIRS).to(like)
+    points = radius * points_in_sphere(PAIRS, like)
     towards = torch.nn.functional.normalize(points.roll(1, dims=0) - points, dim=-1)
     here, there = values(torch.cat([points, points + SPAN * radius * towards])).chunk(2)
-    slopes = (here - there)[here.isfinite() & there.isfinite()].abs() / (SPAN * radius)
-    steepness = float(slopes.quantile(MOST)) if len(slopes) else 1.0
-    return steepness if steepness > STEEP else 1.0
+    slopes = (here - there).abs() / (SPAN * radius)
+    steepness = float(torch.where(here.isfinite() & there.isfinite(), slopes, torch.nan).nanquantile(MOST))
+    return steepness if steepness > STEEP else 1.0  # not a number where no value is finite

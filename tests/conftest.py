@@ -120,11 +120,9 @@ def forgotten_modules() -> Iterator[None]:
 def asked_once() -> Iterator[None]:
     """Caches, for runs in this process, what each run would find out anew; `tests.run.spared` is for runs in others.
 
-    These are what git says, the machine's matrix product rate, and `hydra.mode`, for which Hydra composes the
-    configuration of a command once more; a test in conf checks that no configuration sets it.
+    These are what git says, and the machine's matrix product rate.
     """
     import torch
-    from hydra._internal.hydra import Hydra
 
     from bench.machine import environment
     from bench.run import process
@@ -134,7 +132,6 @@ def asked_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(environment, "_git", cache(environment._git))
         patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
-        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
         loaded = [*process.preloaded(), "pytest", "tests.run.spared"]
         patch.setattr(process, "preloaded", lambda: loaded)

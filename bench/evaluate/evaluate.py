@@ -3,8 +3,8 @@
 The noise floor of a surface metric is the metric between two independent samples of the truth.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,22 +13,19 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bench.config import load
+from bench.evaluate.state import State, coloured_image, colours_at
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
-from datasets.mesh import Mesh, extract
-from datasets.scene import Surface, Truth, View, sample_surface, see
+from datasets.mesh import Mesh
+from datasets.scene import Surface, View, sample_surface
 from renderers.boundary import rendered
 from renderers.camera import Camera
-from renderers.field import Field, autograd_gradients, autograd_normals
-from renderers.fields.analytic import Shape, sphere
+from renderers.field import Field, autograd_normals
 from renderers.fields.coloured import Coloured
 from renderers.rendering import Renderer, Rendering
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
-GREY = 0.5  # of a mesh without colours
-CHUNK = 16_384  # points whose colours are asked for at once
-REACH = 1.05  # half the side of the sampled cube: the unit sphere and a margin
+BEHIND = 2.0  # spacings of the samples that give the mesh: a hit so far behind a part of it is of another part
 OF_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
 IMAGE = {
     "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
@@ -144,18 +141,46 @@ class Evaluation:
     notes: tuple[str, ...] = ()
 
 
-def evaluate(field: Field, inputs: RunInputs) -> Evaluation:
-    """Compares a field with a scene's truth: surface samples of both, and the images in the scene's view.
+def evaluate(state: State) -> Evaluation:
+    """Compares a state with a scene's truth: surface samples of both, and the images in the scene's view.
 
     Images are those of the extracted mesh, so that no renderer judges itself, and those of the run's renderer beside
-    them. The field is cut off at the unit sphere, since no prior was trained outside it.
+    them.
     """
-    truth = inputs.scene.view
-    mesh, metrics = _compare(field, inputs)
-    seen = unseen(truth.camera) if mesh is None else see(Truth(mesh, closed=False), truth.camera)
-    metrics |= view_metrics(seen, truth) | view_metrics(render_view(field, truth.camera, inputs), truth, OWN)
-    failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if mesh is None else None
-    return Evaluation(metrics, mesh, failure)
+    truth = state.inputs.scene.view
+    own = render_view(state.field, truth.camera, state.inputs)
+    metrics = _surface_scores(state) | view_metrics(state.seen(truth.camera), truth) | view_metrics(own, truth, OWN)
+    failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if state.mesh is None else None
+    return Evaluation(metrics, state.mesh, failure, unrendered(state, [own]))
+
+
+def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:
+    """A note on parts of the mesh that the renderer under test does not see; none where it sees all that it should.
+
+    A ray that first meets a part of the mesh, and ends without a hit or far behind, has missed it. A part is noted
+    where all rays that should hit it have. A distance field with a local dip has such a part: a march steps over it.
+
+    Args:
+        own: what the renderer sees from the cameras that judge it.
+    """
+    if state.mesh is None or state.cast_on is None:
+        return ()
+    parts = state.mesh.parts
+    meant, missed = np.zeros((2, parts.max() + 1), dtype=np.int64)
+    for view in own:
+        rays = view.camera.rays().flat()
+        hits = state.cast_on.cast(rays.origins.double().numpy(), rays.directions.double().numpy())
+        found = torch.where(view.mask, view.camera.distance(view.depth), torch.inf).flatten().numpy()
+        past = found[hits.hit] > hits.distance[hits.hit] + BEHIND * state.spacing
+        met = parts[hits.face[hits.hit]]
+        meant += np.bincount(met, minlength=len(meant))
+        missed += np.bincount(met[past], minlength=len(meant))
+    lost = np.flatnonzero((meant > 0) & (missed == meant))
+    if not len(lost):
+        return ()
+    sizes = [replace(state.mesh, faces=state.mesh.faces[parts == part]).diagonal for part in lost]
+    what = f"{len(lost)} part{'s' * (len(lost) > 1)} of the mesh, at most {max(sizes):.2g} scene units across,"
+    return (f"the renderer misses {what} which {meant[lost].sum()} of its rays should hit; the pictures show the mesh",)
 
 
 def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
@@ -164,28 +189,16 @@ def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
     return {prefix + name: value for name, value in found.items()}
 
 
-def unseen(camera: Camera) -> View:
-    """The view of a camera that sees no surface."""
-    shape = camera.height, camera.width
-    return View(camera, torch.zeros(shape), torch.zeros(*shape, 3), torch.zeros(shape, dtype=torch.bool))
+def chamfer_only(state: State) -> dict[str, float]:
+    """The state's `chamfer_l2` only, as in `evaluate`: for checkpoints."""
+    return {"chamfer_l2": _surface_scores(state)["chamfer_l2"]}
 
 
-def chamfer_only(field: Field, inputs: RunInputs) -> dict[str, float]:
-    """The field's `chamfer_l2` only, as in `evaluate`: for checkpoints."""
-    return {"chamfer_l2": _compare(field, inputs)[1]["chamfer_l2"]}
-
-
-def surface_of(field: Field, inputs: RunInputs) -> Mesh | None:
-    """The field's surface, cut off at the unit sphere."""
-    inside = Shape(field, field.kind) & sphere(1.0)
-    return extract(inside, grid=inputs.evaluation.grid, reach=REACH, device=inputs.device)
-
-
-def _compare(field: Field, inputs: RunInputs) -> tuple[Mesh | None, dict[str, float]]:
-    mesh = surface_of(field, inputs)
+def _surface_scores(state: State) -> dict[str, float]:
+    inputs, mesh = state.inputs, state.mesh
     found = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
     truth = true_surface(inputs, inputs.seed)
-    return mesh, surface_metrics(found, truth, threshold=inputs.evaluation.fscore_threshold)
+    return surface_metrics(found, truth, threshold=inputs.evaluation.fscore_threshold)
 
 
 def true_surface(inputs: RunInputs, seed: int) -> Surface:
@@ -196,18 +209,6 @@ def true_surface(inputs: RunInputs, seed: int) -> Surface:
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """Renders a field with the run's renderer from a camera, as a View on the CPU."""
     return view_of(render(inputs.renderer, field, camera, inputs.device), field, camera)
-
-
-def picture_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
-    """A field as pictures show it: by one fast renderer, whatever is under test, if the field is of its kind."""
-    fast = _fast()
-    renderer = fast if field.kind in fast.capabilities.needs else inputs.renderer
-    return view_of(render(renderer, field, camera, inputs.device), field, camera)
-
-
-@cache
-def _fast() -> Renderer:
-    return load("renderer", "newton", warm=False)
 
 
 def render(renderer: Renderer, field: Field, camera: Camera, device: torch.device) -> Rendering:
@@ -224,15 +225,6 @@ def view_of(rendering: Rendering, field: Field, camera: Camera) -> View:
     return View(camera, depth, normals.cpu(), rendering.hit.cpu())
 
 
-def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[Tensor, "height width 3"]:
-    """The field's colours where a view meets a surface; black elsewhere."""
-    image = torch.zeros(*view.mask.shape, 3)
-    rays = view.camera.rays()[view.mask]
-    points = rays.at(view.camera.distance(view.depth)[view.mask])
-    image[view.mask] = colours_at(field, points, rays.directions, device)
-    return image
-
-
 def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
     """What the run's renderer shows from a camera: its hits, and their colours or a volume's weighted sums."""
     rendering = render(inputs.renderer, field, camera, inputs.device)
@@ -244,39 +236,6 @@ def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[Vi
     some = rays[volume.ray]
     colours = colours_at(field, some.at(volume.distance), some.directions, inputs.device).to(inputs.device)
     return view, volume.summed(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
-
-
-def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "height width 3"]:
-    """The colours of a mesh's vertices, interpolated over its faces; grey without colours, black outside of it.
-
-    Args:
-        mesh: with or without colours.
-        truth: of the same mesh.
-    """
-    colours = np.full_like(mesh.vertices, GREY) if mesh.colours is None else mesh.colours
-    rays = camera.rays()
-    weights, corners = truth.corners(rays.flat().origins.double().numpy(), rays.flat().directions.double().numpy())
-    return np.einsum("nk,nkd->nd", weights, colours[corners]).reshape(*rays.shape, 3).clip(0, 1)
-
-
-def vertex_colours(field: Coloured, mesh: Mesh, device: torch.device) -> Float[np.ndarray, "v 3"]:
-    """The colours of a mesh's vertices, each seen from straight above."""
-    return colours_at(field, torch.from_numpy(mesh.vertices).float(), None, device).numpy()
-
-
-def colours_at(
-    field: Coloured, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"] | None, device: torch.device
-) -> Float[Tensor, "n 3"]:
-    """The colours of points of the surface, on the CPU; without directions each is seen from straight above."""
-    found = [points.new_zeros(0, 3)]
-    for start in range(0, len(points), CHUNK):
-        some = points[start : start + CHUNK].to(device)
-        slopes = autograd_gradients(field, some)
-        above = -torch.nn.functional.normalize(slopes, dim=-1)
-        towards = above if directions is None else directions[start : start + CHUNK].to(device)
-        with torch.no_grad():
-            found.append(field.colours(some, slopes, towards).cpu())
-    return torch.cat(found)
 
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:

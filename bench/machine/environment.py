@@ -48,7 +48,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "implicit_bench": _own_version(),
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
-        "torch": torch.__version__,  # with its build, which the package of some builds leaves out of its own version
+        "torch": str(torch.__version__),  # with its build; as its own class, it would load torch in the driver
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),

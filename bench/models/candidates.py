@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bench.evaluate.evaluate import REACH
+from bench.evaluate.state import REACH
 from bench.models.model import FLOAT, Candidate, Model, Seen
 from bench.setup.fields import FREE, parsed
 from bench.shape_prior import initialise_to_sphere

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
+from bench.evaluate.state import State
 from bench.models.candidates import by_size
 from bench.models.fit import FitProblem, Fitter
 from bench.models.growth import Growth, grow
@@ -60,15 +61,15 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
         growth = grow(fitter, by_size(choice.candidates, choice.models.size), choice.models.growth)
     note_fits(record, growth.tried, fitter)
     with run.off_clock():
-        first, last = growth.first, growth.fitted.model.frozen()
-        record.metrics_start, after = evaluate(first, inputs).metrics, evaluate(last, inputs)
-        metrics, notes = after.metrics | ended(growth), tuple(growth.summary(choice.name))
+        first, last = State(growth.first, inputs), State(growth.fitted.model.frozen(), inputs)
+        record.metrics_start, after = evaluate(first).metrics, evaluate(last)
+        metrics, notes = after.metrics | ended(growth), (*growth.summary(choice.name), *after.notes)
         note_result(run, Evaluation(metrics, after.mesh, failure_of(growth, after), notes))
         curve = rendered(lines, growth.fitted.evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")
         for name, field in growth.fields.items():
-            filmstrip.add(name, field)
-        draw(run, lambda title: draw_run(run.folder, inputs, (first, last), given, curve, title), filmstrip)
+            filmstrip.add(name, State(field, inputs))
+        draw(run, lambda title: draw_run(run.folder, (first, last), given, curve, title), filmstrip)
 
 
 def rendered(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:

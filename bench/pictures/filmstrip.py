@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.evaluate import coloured_image, picture_view
+from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, normals_image, window
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from bench.setup.inputs import RunInputs
 from datasets.scene import Truth, View, see
 from renderers.camera import Camera
-from renderers.field import Field
-from renderers.fields.coloured import Coloured
 
 MOST = 9  # columns of a strip
 SILHOUETTE = "silhouette error"  # a row of a strip
@@ -74,8 +72,8 @@ class Filmstrip:
         self.inputs, self.over, self.true = inputs, over, true
         self.frames: dict[int | str, Shown] = {}
 
-    def add(self, name: int | str, field: Field, camera: Camera | None = None) -> None:
-        """Adds a frame, rendered at the resolution of pictures.
+    def add(self, name: int | str, state: State, camera: Camera | None = None) -> None:
+        """Adds a frame, which shows the mesh of a state at the resolution of pictures.
 
         Args:
             name: its label, such as an iteration.
@@ -83,9 +81,8 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            view = picture_view(field, at_size(camera, self.inputs.evaluation.picture), self.inputs)
-            colours = coloured_image(field, view, self.inputs.device) if isinstance(field, Coloured) else None
-            self.frames[name] = Shown(view, colours)
+            camera = at_size(camera, self.inputs.evaluation.picture)
+            self.frames[name] = Shown(state.pictured(camera), state.colours(camera))
 
     @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from bench.evaluate.evaluate import picture_view, unseen
+from bench.evaluate.state import State, unseen
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
@@ -25,7 +25,6 @@ from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Truth, View, see
 from renderers.camera import Camera
-from renderers.field import Field
 
 LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes to the right, up, towards the camera
 BEHIND = 160.0  # degrees about the vertical axis from the given camera to the one behind
@@ -68,25 +67,19 @@ class Given:
 
 
 @rc_context(SCREEN)
-def draw_run(
-    folder: Path,
-    inputs: RunInputs,
-    fields: tuple[Field, Field],
-    given: Given,
-    curve: list[dict[str, Any]],
-    title: str,
-) -> None:
+def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: list[dict[str, Any]], title: str) -> None:
     """Writes summary.png and curve.png of a run, at a higher resolution than in the run.
 
     Args:
-        fields: before and after the optimisation.
+        states: before and after the optimisation.
     """
+    inputs = states[0].inputs
     front, back = _cameras(inputs, inputs.evaluation.picture)
     truth = Truth(inputs.scene.mesh)
     pairs = (
         *(
-            ViewPair(name, picture_view(field, front, inputs), picture_view(field, back, inputs))
-            for name, field in zip(("before", "after"), fields, strict=True)
+            ViewPair(name, state.pictured(front), state.pictured(back))
+            for name, state in zip(("before", "after"), states, strict=True)
         ),
         ViewPair("truth", see(truth, front), see(truth, back)),
     )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import REACH
+from bench.evaluate.state import REACH
 from bench.models.growth import Trials, climb
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size

@@ -15,24 +15,21 @@ from bench.evaluate.evaluate import (
     OWN,
     WORST_SURFACE,
     Evaluation,
-    coloured_image,
     mask_iou,
     render_image,
     surface_metrics,
-    surface_of,
-    unseen,
-    vertex_colours,
+    unrendered,
 )
+from bench.evaluate.state import State, coloured_image, unseen, vertex_colours
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness_scores
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
-from datasets.scene import Truth, View, sample_surface, see
+from datasets.scene import View, sample_surface
 from datasets.shot import Shot
 from renderers.camera import sphere_span
-from renderers.fields.coloured import Coloured
 
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
 SURFACE = tuple(WORST_SURFACE)  # their names
@@ -62,18 +59,23 @@ COLOURED_DEFINITIONS = {
 }
 
 
-def judge(field: Coloured, subject: Subject, inputs: RunInputs) -> Evaluation:
-    """Compares a field with the held-out photographs, and with the true surface where there is one."""
-    mesh = surface_of(field, inputs)
-    views = mesh_views(mesh, subject.held_out)
-    metrics = surface_scores(mesh, subject, inputs) | field_scores(field, views, subject.held_out, inputs.device)
-    metrics |= early_weight(field, views, inputs)
-    own = [render_image(field, shot.camera, inputs) for shot in subject.held_out]
-    scores = image_scores([view for view, _ in own], [image for _, image in own], subject.held_out)
+def judge(state: State, subject: Subject) -> Evaluation:
+    """Compares a state with the held-out photographs, and with the true surface where there is one.
+
+    Args:
+        state: whose field has colours.
+    """
+    field, inputs, shots = state.field, state.inputs, subject.held_out
+    metrics = surface_scores(state.mesh, subject, inputs) | field_scores(state, shots)
+    metrics |= early_weight(field, [state.seen(shot.camera) for shot in shots], inputs)
+    own = [render_image(field, shot.camera, inputs) for shot in shots]
+    views = [view for view, _ in own]
+    scores = image_scores(views, [image for _, image in own], shots)
     metrics |= {OWN + name: value for name, value in scores.items()}
-    if mesh is None:
+    if state.mesh is None:
         return Evaluation(metrics, None, (RunStatus.EMPTY, "the field has no surface in the unit sphere"))
-    return Evaluation(metrics, replace(mesh, colours=vertex_colours(field, mesh, inputs.device)))
+    coloured = replace(state.mesh, colours=vertex_colours(field, state.mesh, inputs.device))
+    return Evaluation(metrics, coloured, notes=unrendered(state, views))
 
 
 def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evaluation:
@@ -95,29 +97,20 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     true = sample_surface(subject.truth, count, inputs.seed)
     found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
     whole = surface_metrics(found, true, threshold=threshold)
-    visible = subject.seen(subject.truth, true.points)
+    visible = subject.seen(subject.truth, true)
     part = judged = None
     if mesh is not None and found is not None:
-        there = subject.seen(mesh, found.points)
+        there = subject.seen(mesh, found)
         part, judged = found.some(there), (found, there)
     seen = surface_metrics(part, true.some(visible), threshold=threshold)
     rough = roughness_scores(judged, (true, visible))
     return whole | {SEEN + name: value for name, value in seen.items()} | rough
 
 
-def mesh_views(mesh: Mesh | None, shots: Sequence[Shot]) -> list[View]:
-    """What the cameras of photographs see of a mesh, by exact first hits."""
-    if mesh is None:
-        return [unseen(shot.camera) for shot in shots]
-    scene = Truth(mesh, closed=False)
-    return [see(scene, shot.camera) for shot in shots]
-
-
-def field_scores(
-    field: Coloured, views: Sequence[View], shots: Sequence[Shot], device: torch.device
-) -> dict[str, float]:
-    """The metrics of `IMAGES` of a field's colours where views meet a surface."""
-    return image_scores(views, [coloured_image(field, view, device) for view in views], shots)
+def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:
+    """The metrics of `IMAGES` of a field's colours where views of its mesh meet a surface."""
+    views = [state.seen(shot.camera) for shot in shots]
+    return image_scores(views, [coloured_image(state.field, view, state.inputs.device) for view in views], shots)
 
 
 def image_scores(

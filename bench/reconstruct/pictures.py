@@ -12,7 +12,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from bench.evaluate.evaluate import coloured_image, picture_view
+from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, draw_curve, normals_image, picture_normals
 from bench.pictures.style import SCREEN, bare
 from bench.reconstruct.judge import judge_mesh, judged_pixels
@@ -26,7 +26,6 @@ from datasets.photographs import turned
 from datasets.scene import Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
-from renderers.fields.coloured import Coloured
 
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
 ERRORS = colormaps["magma_r"].with_extremes(bad="0.85")  # grey where nothing is judged
@@ -36,18 +35,19 @@ TURNS = (120.0, 240.0)  # degrees about the vertical axis
 WORST = 0.3  # mean difference of colours that is shown darkest
 
 
-def draw_reconstruction(
-    folder: Path, inputs: RunInputs, field: Coloured, subject: Subject, curve: list[dict[str, Any]], title: str
-) -> None:
-    """Writes summary.png, input.png, images.npz and, of a loop, curve.png."""
+def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: list[dict[str, Any]], title: str) -> None:
+    """Writes summary.png, input.png, images.npz and, of a loop, curve.png.
+
+    Args:
+        state: whose field has colours.
+    """
     if curve:
         draw_curve(folder / "curve.png", curve)
 
     def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-        view = picture_view(field, camera, inputs)
-        return view, coloured_image(field, view, inputs.device)
+        return state.pictured(camera), state.colours(camera)
 
-    _save(folder, seen, inputs, subject, title)
+    _save(folder, seen, state.inputs, subject, title)
 
 
 def note_surface(

@@ -83,17 +83,13 @@ class Stack:
         return Stack(pixels, useful.to(device), corners.to(device), width.to(device))
 
     def drawn(self, count: int, *, patches: bool, seed: int) -> Pixels:
-        """That many random pixels, or in patches of 2 x 2: four after one another, by rows."""
-        generator = torch.Generator("cpu").manual_seed(seed)
+        """That many random pixels, or in patches of 2 x 2: four after one another, by rows; drawn on their device."""
         places = self.corners if patches else self.useful
-        chosen = places[
-            torch.randint(len(places), (count // 4 if patches else count,), generator=generator, device="cpu").to(
-                places.device
-            )
-        ]
+        draws = {"generator": torch.Generator(places.device).manual_seed(seed), "device": places.device}
+        chosen = places[torch.randint(len(places), (count // 4 if patches else count,), **draws)]
         if patches:
-            right = torch.tensor([0, 1, 0, 1], device=chosen.device)
-            below = torch.tensor([0, 0, 1, 1], device=chosen.device)
+            corner = torch.arange(4, device=places.device)
+            right, below = corner % 2, corner // 2
             chosen = (chosen[:, None] + right + below * self.width[chosen, None]).flatten()
         return self.pixels[chosen]
 

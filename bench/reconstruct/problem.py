@@ -9,19 +9,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import Evaluation, colours_at, surface_of
+from bench.evaluate.evaluate import Evaluation
+from bench.evaluate.state import State, colours_at
 from bench.pictures.filmstrip import Shown
-from bench.reconstruct.judge import field_scores, judge, mesh_views, surface_scores
+from bench.reconstruct.judge import field_scores, judge, surface_scores
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.pictures import draw_reconstruction
 from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
-from bench.setup.inputs import RunInputs
 from bench.solve.latent_code import Terms
 from datasets.scene import View
 from renderers.boundary import rendered
 from renderers.camera import Camera
-from renderers.field import Counts, Field, Meter
+from renderers.field import Counts, Meter
 from renderers.fields.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
 from renderers.rendering import Renderer, at_iteration
 
@@ -73,26 +73,23 @@ class ReconstructionProblem:
         """The shape at the current parameters, which stays as it is; it counts operations as one that is learnt."""
         return deepcopy(self.model).field
 
-    def frame(self) -> tuple[Field, Camera]:
-        """The current shape, seen by the first held-out camera."""
-        return self.field(), self.subject.held_out[0].camera
+    def camera(self) -> Camera:
+        """The first held-out camera."""
+        return self.subject.held_out[0].camera
 
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The current shape against held-out photographs and the truth."""
-        return judge(self.field(), self.subject, inputs)
+        return judge(state, self.subject)
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The `tracked` metrics of the current shape."""
-        shape = self.field()
-        mesh = surface_of(shape, inputs)
-        views = mesh_views(mesh, self.subject.held_out)
-        scores = surface_scores(mesh, self.subject, inputs)
-        scores |= field_scores(shape, views, self.subject.held_out, inputs.device)
+        scores = surface_scores(state.mesh, self.subject, state.inputs)
+        scores |= field_scores(state, self.subject.held_out)
         return {name: scores[name] for name in self.tracked}
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        draw_reconstruction(folder, inputs, self.field(), self.subject, curve, title)
+        draw_reconstruction(folder, states[1], self.subject, curve, title)
 
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum, over pixels that are drawn anew in each iteration."""

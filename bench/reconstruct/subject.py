@@ -12,7 +12,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
-from datasets.scene import Truth, see
+from datasets.scene import Surface, Truth, see
 from datasets.shot import Shot
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
@@ -22,7 +22,7 @@ NO_HULL = "the visual hull needs a mask of each photograph: leave out dataset.ma
 NONE, GIVEN, HULL = "none", "given", "hull"  # where distances are known; see `Depths`
 GUIDES = (NONE, GIVEN, HULL)
 HULL_SAMPLES = 96  # per axis
-ON_SURFACE = 0.01  # scene units by which a point may lie behind the first hit of its ray, and still be seen
+ON_SURFACE = 0.01  # scene units that a point may lie behind the first hit of its ray, on its side, and be seen
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,22 @@ class Subject:
     truth: Mesh | None
     found: str
 
-    def seen(self, surface: Mesh, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points of a surface at least one given photograph sees; see `visible`."""
-        scene = Truth(surface, closed=False)
-        return np.any([visible(scene, shot, points) for shot in self.given], axis=0)
+    def seen(self, mesh: Mesh, sampled: Surface) -> Bool[np.ndarray, " n"]:
+        """Which points of a mesh's surface at least one given photograph sees; see `visible`."""
+        scene = Truth(mesh, closed=False)
+        return np.any([visible(scene, shot, sampled) for shot in self.given], axis=0)
 
 
-def visible(scene: Truth, shot: Shot, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which points of a surface a photograph sees: within it, and in front of everything else."""
-    centre = shot.camera.center.double().numpy()
+def visible(scene: Truth, shot: Shot, sampled: Surface) -> Bool[np.ndarray, " n"]:
+    """Which points of a surface a photograph sees: within it, in front of all else, on the side that is hit first.
+
+    The first hit may lie `ON_SURFACE` in front of a point; where its normal is opposed, it is the near side of a plate.
+    """
+    points, centre = sampled.points, shot.camera.center.double().numpy()
     inside = shot.camera.shows(torch.from_numpy(points).float()).numpy()
     hits = scene.cast(np.broadcast_to(centre, points.shape), points - centre)
-    return inside & (hits.distance > np.linalg.norm(points - centre, axis=1) - ON_SURFACE)
+    near = hits.distance > np.linalg.norm(points - centre, axis=1) - ON_SURFACE
+    return inside & near & ((hits.normals * sampled.normals).sum(axis=1) >= 0)
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from bench.evaluate.evaluate import GREY, painted
+from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import visible
 from datasets.mesh import Mesh
-from datasets.scene import Truth, View, see
+from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
 
@@ -91,7 +91,7 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
     for shot in shots:
         towards = shot.camera.center.double().numpy() - mesh.vertices
         cosine = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        weight = (visible(scene, shot, mesh.vertices) * cosine.clip(0) ** FACING)[:, None]
+        weight = (visible(scene, shot, Surface(mesh.vertices, normals)) * cosine.clip(0) ** FACING)[:, None]
         pixels = shot.camera.project(torch.from_numpy(mesh.vertices).float())[0].double().numpy() - 0.5
         places = np.nan_to_num(pixels).T[::-1]
         image = shot.colours.numpy()
@@ -101,6 +101,6 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
 
 
 def painter(mesh: Mesh) -> Callable[[Camera], tuple[View, Float[torch.Tensor, "height width 3"]]]:
-    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.evaluate.painted` has them."""
+    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.state.painted` has them."""
     scene = Truth(mesh, closed=False)
     return lambda camera: (see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float())

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
+from functools import cache, lru_cache
 from typing import Any
 
 from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
@@ -10,6 +11,12 @@ CHOICES = ("task", "method", "renderer", "dataset")  # fields of a record, whose
 WORDS = {"index": "shape", "dataset.path": "", "_target_": ""}  # what stands before the value in place of the key
 DEEPEST = 20  # levels of a configuration
 SKIPPED = NEUTRAL_KEYS | {"label", "packages"}
+
+
+class Node(dict):
+    """Settings that several records share. Nothing may change them, so that they are looked up by what they are."""
+
+    __hash__ = object.__hash__  # type: ignore[assignment]
 
 
 def differences(
@@ -81,10 +88,25 @@ def settings_of(config: dict[str, Any], without: Container[str] = SKIPPED) -> di
 def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
     """The values of nested settings by dotted keys; what lies deeper than `depth` levels is left out, as "…"."""
     values: dict[str, Any] = {}
-    for key, value in node.items():
-        name, inner = f"{prefix}{key}", isinstance(value, dict)
-        values |= flat(value, f"{name}.", depth - 1) if inner and depth else {name: "…" if inner else value}
+
+    def add(node: dict[str, Any], prefix: str, depth: int) -> None:
+        for key, value in node.items():
+            if not isinstance(value, dict):
+                values[f"{prefix}{key}"] = value
+            elif depth and type(value) is Node:
+                values.update(_flat(value, f"{prefix}{key}.", depth - 1))
+            elif depth:
+                add(value, f"{prefix}{key}.", depth - 1)
+            else:
+                values[f"{prefix}{key}"] = "…"
+
+    add(node, prefix, depth)
     return values
+
+
+@lru_cache(maxsize=10_000)
+def _flat(node: Node, prefix: str, depth: int) -> dict[str, Any]:
+    return flat(dict(node), prefix, depth)
 
 
 def _parts(
@@ -101,6 +123,7 @@ def _parts(
         yield from in_order(settings)
 
 
+@cache
 def _public(key: str) -> bool:
     """Whether a key is no mark of ours, such as `_label_`, which stands in the name of the row."""
     last = key.rpartition(".")[2]

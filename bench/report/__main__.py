@@ -3,15 +3,15 @@
 import sys
 from pathlib import Path
 
-from bench.records.read import RESULTS, read_records
-from bench.report.data.frame import to_frame
+from bench.records.read import RESULTS, check_results, read_records
+from bench.report.data.frame import write_csv
 from bench.report.sweeps import write_sweeps
-from bench.report.write.html import MOST_MESHES, write_index
+from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.paper import write_paper, write_readme
 
 USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
-  meshes        of how many runs, the newest first, the mesh turns on the page; 500 unless given, or all
+  meshes        of how many runs, the newest first, the mesh turns on the page; {MOST_MESHES} unless given, or all
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
 KEYS = {"results_dir": "results_dir=PATH", "meshes": "meshes=all", "ship": "ship=PATH"}  # and what to type
 
@@ -33,19 +33,27 @@ def main(arguments: list[str]) -> int:
 
 def _report(given: dict[str, str]) -> int:
     results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
-    records, unread = read_records(results_dir)
     if ship := given.get("ship"):
+        records, _ = read_records(results_dir)
         print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
         return 0
+    check_results(results_dir)
+    with page_lock(results_dir):
+        return _written(results_dir, meshes)
+
+
+def _written(results_dir: Path, meshes: int | None) -> int:
+    """Writes all that is written of a results folder; gives the exit status."""
+    records, unread = read_records(results_dir)
     table = results_dir / "runs.csv"
-    to_frame(records).to_csv(table, index=False)
+    write_csv(records, table)
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
     for path in (table, *papers, *write_sweeps(records, results_dir, broken)):
         print(path)
     for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
         print(problem, file=sys.stderr)
-    print(write_index(results_dir, meshes=meshes))
+    print(write_page(records, unread, results_dir, meshes))
     return 1 if broken else 0
 
 

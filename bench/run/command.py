@@ -4,11 +4,13 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -19,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import CONF, register, type_of, wrong_type
 from bench.records.folder import Identity, identify
 from bench.run.plan import Shown
-from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
+from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
 from bench.tables import names, nearest, register_resolvers
 from datasets.extras import install
@@ -77,13 +79,15 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     try:
         sys.argv[1:] = options_first(sys.argv[1:])
         register(*own_folders(sys.argv[1:]))
-        _call(program)
+        with mode_of_options(sys.argv[1:]):
+            _call(program)
         if raised:
             raise raised[0]
     except KeyboardInterrupt as error:
         before = "" if begun or Sweep.plan is not None else "; nothing was run"
         return _tell(stopped_by(error) + before, INTERRUPTED)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
+        leave_server()
         return _tell(_with_file(_explain(error)), USAGE)
     except BrokenPipeError:  # `| head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -176,6 +180,21 @@ def _call(program: Callable[[], None]) -> None:
         if isinstance(error, Refused):
             raise error.why from error.why.__cause__
         raise
+
+
+@contextmanager
+def mode_of_options(arguments: list[str]) -> Iterator[None]:
+    """Within it, -m alone decides whether a command is a sweep, unless the command or a folder of it may set that.
+
+    Else Hydra composes the configuration once more to read `hydra.mode`, which none of ours sets.
+    """
+    asked = Hydra.get_mode
+    if not own_folders(arguments) and not any("hydra.mode" in argument for argument in arguments):
+        Hydra.get_mode = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        Hydra.get_mode = asked
 
 
 def _tell(message: str, code: int = FAILED) -> int:

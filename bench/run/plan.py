@@ -4,20 +4,21 @@ A configuration is built by the code that its run builds it with, `bench.setup.i
 """
 
 import io
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict
+from itertools import islice
 from statistics import median
 from typing import Any
 
+from bench.config import Isolation
 from bench.records.format import plural, seconds
-from bench.records.read import Plan, PlannedCell, read_records
+from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import row_name
-from bench.run.process import reason_of
+from bench.run.process import beside, reason_of
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
+LIKE, MOST = 100, 300  # runs of one kind whose times are taken, and whose records are read
 HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
 
 
@@ -44,6 +45,21 @@ def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> s
     return ""
 
 
+def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """For each configuration, why its run would be refused; empty where it would not.
+
+    Torch is loaded in the process of runs alone, unless a run takes place in this one.
+    """
+    if not configs or any(config["isolation"] == Isolation.off for config in configs):
+        return _refusals(configs)
+    return beside(_refusals, configs) or [""] * len(configs)  # a class that ends its process does so in its run too
+
+
+def _refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    built: dict[str, Any] = {}  # what they share
+    return [refusal(config, built) for config in configs]
+
+
 def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """Checks all cells of a sweep, before it is written down.
 
@@ -56,8 +72,7 @@ def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
     """
     away = {} if launcher in HERE else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
-    built: dict[str, Any] = {}  # what they share
-    found = [refusal(cell.config | away, built) for cell in cells]
+    found = refusals([cell.config | away for cell in cells])
     bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]
     if bad:
         raise ValueError(_of_sweep(plan, *bad[0], len(bad)))
@@ -72,14 +87,38 @@ def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
     return f"cell {plan.cells.index(cell) + 1} of {len(plan.cells)} ({where}): {reason}{others}; nothing was run"
 
 
-def times(records: Iterable[dict[str, Any]]) -> dict[Any, list[float]]:
-    """The seconds of the runs that took their whole time, by `kind`."""
-    known: dict[Any, list[float]] = defaultdict(list)
-    for record in records:
-        total = record["seconds"].get("total")
-        if record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf"):
-            known[kind(record)].append(total)
+def times(plan: Plan, reused: set[str]) -> dict[Any, list[float]]:
+    """The seconds of runs like those of a plan that took their whole time, by `kind`: of `LIKE` runs of each at most.
+
+    A run's folder says whether it may be one of them; they are taken in the order of their hashes, as if by chance.
+
+    Args:
+        reused: ids of cells that will not run.
+    """
+    known: dict[Any, list[float]] = {kind(vars(cell)): [] for cell in plan.cells if cell.id not in reused}
+    folders = sorted(run_folders(plan.results_dir), key=lambda folder: folder.name.rpartition("-")[2])
+    for named in {like[:3] for like in known}:
+        kinds = [like for like in known if like[:3] == named]
+        for folder in islice((one for one in folders if _may_be(one.name, *named)), MOST * len(kinds)):
+            if all(len(known[like]) >= LIKE for like in kinds):
+                break
+            record, _ = read_run(folder, plan.results_dir)
+            if record is not None and kind(record) in kinds and (total := _whole_time(record)):
+                known[kind(record)].append(total)
     return known
+
+
+def _may_be(folder: str, task: str, renderer: str, method: str) -> bool:
+    """Whether a run's folder may be of a task, renderer and method, by its name; see `Identity.name`."""
+    task, renderer, method = (name.replace("/", "_") for name in (task, renderer, method))
+    return folder.startswith(f"{task}-{renderer}-") and (not method or f"-{method}-" in folder)
+
+
+def _whole_time(record: dict[str, Any]) -> float | None:
+    """The seconds of a run that took its whole time; None for others."""
+    total = record["seconds"].get("total")
+    measured = record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf")
+    return total if measured else None
 
 
 def kind(run: dict[str, Any]) -> Any:
@@ -91,8 +130,8 @@ def kind(run: dict[str, Any]) -> Any:
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     """Prints a line for each cell, and one for the whole plan."""
-    known = times(read_records(plan.results_dir)[0] if plan.results_dir.is_dir() else [])
-    taken = {cell.id: known.get(kind(asdict(cell)), []) for cell in plan.cells if cell.id not in reused}
+    known = times(plan, reused)
+    taken = {cell.id: known[kind(vars(cell))] for cell in plan.cells if cell.id not in reused}
     for number, cell in enumerate(plan.cells, 1):
         named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {cell.dataset}"
         about = "reused" if cell.id in reused else about_as_long(taken[cell.id])

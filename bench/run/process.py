@@ -2,9 +2,10 @@
 
 import errno
 import multiprocessing
+import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,6 +15,7 @@ from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from pkgutil import iter_modules
+from typing import Any
 
 import psutil
 
@@ -30,6 +32,7 @@ EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal
 # Signals are noted as well as raised: an interrupted library may swallow or replace the exception.
 _stopped = ""  # by which signal, in words
 _delayed = False  # within `signals_delayed`
+_early = False  # whether this command has started the server before it knew that it would need it
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,6 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     Returns:
         None where the child finished and sent its final record; else how it ended.
     """
-    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
-        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
     context = fork_server()
     channel, childs = context.Pipe()
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
@@ -143,6 +144,8 @@ def preloaded() -> list[str]:
 
 def fork_server() -> ForkServerContext:
     """The context of processes that branch off from a server, which has imported what is slow, once for all of them."""
+    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
+        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(preloaded())
     return context
@@ -153,6 +156,51 @@ def warm_up() -> None:
     fork_server()
     with signals_delayed():  # a request that breaks off would end the server
         forkserver.ensure_running()
+
+
+def start_early(arguments: Sequence[str]) -> None:
+    """Starts the server before the command line is read, where it seems to ask for runs in processes of their own.
+
+    Where it sets anything of Hydra's, which may set variables of the environment, the server starts after these.
+    """
+    global _early
+    plain = all(argument in ("-m", "--multirun") or argument[:1] != "-" for argument in arguments)
+    other = {"help", "list", "isolation=off"} & {*arguments}
+    if plain and not other and not any("hydra" in argument for argument in arguments):
+        _early = True
+        warm_up()
+
+
+def leave_server() -> None:
+    """Ends the server of a command that is refused, if it was started early: it would go on to load what is slow."""
+    number = getattr(forkserver._forkserver, "_forkserver_pid", None)
+    if _early and number is not None:
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
+
+
+def beside(work: Callable[[Any], Any], argument: Any) -> Any:
+    """What `work` gives for an argument, in a process that branches off from the server; None where that one dies."""
+    context = fork_server()
+    answers, answer = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(work, argument, answer))
+    with answers:
+        try:
+            with signals_delayed():
+                process.start()
+                answer.close()
+            return answers.recv()
+        except (EOFError, ConnectionError):
+            return None
+        finally:
+            if process.pid is not None:
+                process.kill()
+                process.join()
+
+
+def _work(work: Callable[[Any], Any], argument: Any, answer: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    answer.send(work(argument))
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:

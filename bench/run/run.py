@@ -18,7 +18,7 @@ from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
 from bench.run.command import unwritten
 from bench.run.compose import planned
-from bench.run.plan import refusal, show_plan
+from bench.run.plan import refusals, show_plan
 from bench.run.process import (
     Job,
     Message,
@@ -30,7 +30,6 @@ from bench.run.process import (
     run_isolated,
     signals_delayed,
     stopped_by,
-    warm_up,
 )
 from bench.run.summary import show
 from bench.trackers import Nothing, Tracker
@@ -92,9 +91,7 @@ def _check(identity: Identity) -> None:
     config = identity.config
     results_dir = Path(config["results_dir"])
     reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
-    if not reused and not config["plan"]:
-        warm_up()  # the server of processes loads what runs take, while this process loads what the check takes
-    if not reused and (reason := refusal(config)):
+    if not reused and (reason := refusals([config])[0]):
         raise ValueError(reason)
     if config["plan"]:
         cell = planned(identity)

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import REACH, surface_metrics
+from bench.evaluate.evaluate import surface_metrics
+from bench.evaluate.state import REACH
 from bench.progress import Report
 from bench.records.record import digest
 from bench.setup.inputs import RunInputs
@@ -22,7 +23,9 @@ from bench.solve.optimise import OptimiserSettings
 from datasets.mesh import Mesh, extract
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from datasets.shot import Shot
+from renderers.boundary import rendered
 from renderers.checks import check_at_least
+from renderers.field import Field
 from renderers.fields.grid import Grid
 from renderers.silhouette import SilhouetteLoss
 
@@ -80,15 +83,25 @@ class MaskSearch:
 
     depth_loss: ClassVar[str] = DEPTH
     depth_weight: ClassVar[float] = 0.0
+    least_reference: ClassVar[float] = 0.01  # see `optimise`: a start that covers the mask has next to no loss
 
     def __post_init__(self) -> None:
         check_at_least("task.search.silhouette_weight", self.silhouette_weight, 0, "10 works")
 
     def problem(self, shot: Shot, inputs: RunInputs) -> CodeProblem:
-        """The problem of an image with a mask; it starts from code zero, the mean shape."""
+        """The problem of an image with a mask; it starts from code zero, the mean shape.
+
+        The share of pixels whose hit differs from the mask must fall, not the loss: DIST's is a mean over wrong pixels,
+        of which a hit beside the mask weighs no more than the march's epsilon. So it is next to nothing for a mean
+        shape that covers the mask, and rises where these pixels are mended first.
+        """
         size = (shot.camera.height, shot.camera.width)
         none = torch.zeros(size, dtype=torch.bool, device="cpu")
         given = GivenView(self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask).to(
             inputs.device
         )
-        return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device)
+
+        def wrong(field: Field) -> float:
+            return float((rendered(inputs.renderer, field, given.rays).hit != given.mask).float().mean())
+
+        return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device, judged=wrong)

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
+from bench.evaluate.state import State
 from bench.pictures.run_figures import Given, draw_run
-from bench.setup.inputs import RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import NotReached, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
@@ -59,6 +59,7 @@ class CodeProblem:
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the given ones, for pictures.
         compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.
+        judged: gives of a field what must fall in place of the loss; None: the loss.
     """
 
     prior: Prior
@@ -72,6 +73,7 @@ class CodeProblem:
     trial: int = 1
     photographs: Float[np.ndarray, "views height width 3"] | None = None
     compared_at: int | None = None
+    judged: Callable[[Field], float] | None = None
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
@@ -98,29 +100,28 @@ class CodeProblem:
     @property
     def similarity(self) -> Float[Tensor, "7"] | None:
         """The current similarity, where it is optimised."""
-        return self.similarities[self.starts.best()].detach() if self.similarities else None
+        return self.similarities[self.starts.best()].detach().clone() if self.similarities else None
 
     def field(self) -> Field:
         """The current shape."""
         shape = self.decoder.at(self.code.detach())
         return shape if self.similarity is None else Moved(shape, self.similarity)
 
-    def frame(self) -> tuple[Field, None]:
-        """The current shape, seen by the scene's camera."""
-        return self.field(), None
+    def camera(self) -> None:
+        """None: the scene's camera sees the shape."""
 
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The current shape against the truth."""
-        return evaluate(self.field(), inputs)
+        return evaluate(state)
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The Chamfer distance of the current shape."""
-        return chamfer_only(self.field(), inputs)
+        return chamfer_only(state)
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        given = Given(inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
-        draw_run(folder, inputs, (first, self.field()), given, curve, title)
+        given = Given(states[0].inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
+        draw_run(folder, states, given, curve, title)
 
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum."""
@@ -138,10 +139,12 @@ class CodeProblem:
 
     @torch.no_grad()
     def objective(self) -> float | None:
-        """The current loss, at iteration `compared_at`, not counted; None where that is not set."""
+        """What `judged` gives, or the current loss at iteration `compared_at`, not counted; None without either."""
+        best = self.starts.best()
+        if self.judged is not None:
+            return self.judged(self._shape(best))
         if self.compared_at is None:
             return None
-        best = self.starts.best()
         terms = self.compare(self._shape(best), self.compared_at)
         return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
 

@@ -6,11 +6,12 @@ Several starts share one budget of iterations: successive halving keeps the bett
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import cos, inf, isnan, pi
+from math import cos, inf, isfinite, isnan, pi
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.nn.utils import get_total_norm
 from torch.optim.adam import adam
 
 from bench.machine.environment import MemoryPeak, synchronise
@@ -113,16 +114,17 @@ def optimise(
         history.seconds["forward"] += forward
         history.seconds["backward"] += backward
         history.counts = problem.counts - before
+        *numbers, largest = _read([*terms.values(), _largest(problem.parameters)])
         line = {
             "iteration": iteration,
             "seconds": history.seconds["forward"] + history.seconds["backward"],
             "value_evaluations": history.counts.value + history.counts.coarse,
             "gradient_evaluations": history.counts.gradient,
-            **{name: term.item() for name, term in terms.items()},
+            **dict(zip(terms, numbers, strict=True)),
         }
         history.curve.append(line)
         history.peak_memory_bytes = memory.growth()
-        over = _failed(history, problem, least_reference)
+        over = _failed(history, largest, least_reference)
         with memory.pause():
             on_step(line)
         if over:
@@ -152,12 +154,25 @@ class _Adam:
             adam(ones, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
 
 
-def _failed(history: History, problem: Objective, least_reference: float) -> bool:
-    """Whether the loop must end; notes the reason in the history."""
+def _largest(parameters: list[Tensor]) -> Tensor:
+    """The largest magnitude of any parameter: not finite where one is not."""
+    return get_total_norm([one.detach() for one in parameters], norm_type=inf)
+
+
+def _read(numbers: list[Tensor]) -> list[float]:
+    """Numbers of a device, in one wait for it."""
+    return torch.stack([number.detach().double() for number in numbers]).tolist()
+
+
+def _failed(history: History, largest: float, least_reference: float) -> bool:
+    """Whether the loop must end; notes the reason in the history.
+
+    Args:
+        largest: magnitude of any parameter.
+    """
     loss, first = history.curve[-1]["total"], max(history.curve[0]["total"], least_reference)
     iteration = history.curve[-1]["iteration"]
-    finite = all(bool(parameter.isfinite().all()) for parameter in problem.parameters)
-    if loss != loss or not finite:
+    if loss != loss or not isfinite(largest):
         what = "the loss" if loss != loss else "a parameter"
         history.status, history.reason = RunStatus.NAN, f"{what} is not a number at iteration {iteration}"
     elif loss > DIVERGED * first:

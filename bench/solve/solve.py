@@ -11,11 +11,12 @@ from torch import Tensor
 
 from bench.config import DOUBLING
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation
+from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
-from bench.setup.inputs import RunContext, RunInputs
+from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.scene import Scene
@@ -62,30 +63,30 @@ class Problem(Objective, Protocol):
         ...
 
     def objective(self) -> float | None:
-        """The current loss, not counted, where losses of different iterations are not comparable; else None."""
+        """What must fall, not counted, where losses of different iterations are not comparable; else None."""
         ...
 
     def field(self) -> Field:
-        """The field of the current parameters; its evaluations are not counted."""
+        """The field of the current parameters, which does not change with them; its evaluations are not counted."""
         ...
 
-    def frame(self) -> tuple[Field, Camera | None]:
-        """The filmstrip's frame of the current state: a field, and the camera where it is not the scene's."""
+    def camera(self) -> Camera | None:
+        """The camera of the filmstrip's frame of the current state; None for the scene's."""
         ...
 
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The current state against the truth."""
         ...
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The `tracked` metrics of the current state alone."""
         ...
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run into its folder.
 
         Args:
-            first: the field before the optimisation.
+            states: before and after the optimisation.
         """
         ...
 
@@ -126,8 +127,8 @@ def solve(
     definitions: dict[str, str],
     *,
     gallery: bool = False,
-) -> Problem:
-    """Makes a problem, solves it, fills the run's record and folder, and gives the problem in its final state.
+) -> State:
+    """Makes a problem, solves it, fills the run's record and folder, and gives the final state.
 
     Args:
         run: its record has the definitions of its numbers also where it ends before it has a problem.
@@ -140,30 +141,36 @@ def solve(
     inputs, record = run.inputs, run.record
     record.definitions = definitions | COSTS
     problem = make_problem()
-    first = problem.field()
-    check_kind(inputs.renderer, first)
+    first = State(problem.field(), inputs)
+    check_kind(inputs.renderer, first.field)
     with run.off_clock():
-        before = problem.evaluate(inputs)
+        before = problem.evaluate(first)
     record.metrics_start = before.metrics
     filmstrip = Filmstrip(inputs, true=problem.shown)
 
+    def state() -> State:
+        field = problem.field()
+        return first if field is first.field else State(field, inputs)  # a shape that is known is extracted once
+
     def errors_at(iteration: int) -> dict[str, float]:
-        filmstrip.add(iteration, *problem.frame())
-        return problem.checkpoint(inputs) if iteration else {name: before.metrics[name] for name in problem.tracked}
+        current = state() if iteration else first
+        filmstrip.add(iteration, current, problem.camera())
+        return problem.checkpoint(current) if iteration else {name: before.metrics[name] for name in problem.tracked}
 
     history = descend(problem, settings, run, errors_at)
     with run.off_clock():
-        after = problem.evaluate(inputs)
+        last = state()
+        after = problem.evaluate(last)
         note_result(run, replace(after, failure=failure_of(history, after)))
-        filmstrip.add(len(history.curve), *problem.frame())
-        draw(run, lambda title: problem.draw(inputs, run.folder, first, history.curve, title), filmstrip)
+        filmstrip.add(len(history.curve), last, problem.camera())
+        draw(run, lambda title: problem.draw(run.folder, (first, last), history.curve, title), filmstrip)
         if gallery and inputs.evaluation.gallery is not None:
             save_gallery(run.folder, inputs, problem.observed, {"start": before.mesh, "found": after.mesh})
-    return problem
+    return last
 
 
-def solve_task(task: InverseTask, run: RunContext) -> Problem:
-    """Solves a task's inverse problem of a code, and gives it in its final state."""
+def solve_task(task: InverseTask, run: RunContext) -> State:
+    """Solves a task's inverse problem of a code, and gives the final state."""
     inputs = run.inputs
 
     def problem() -> Problem:
@@ -195,13 +202,19 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
 
 
 def descend(
-    problem: Problem, settings: OptimiserSettings, run: RunContext, errors_at: Callable[[int], dict[str, float]]
+    problem: Problem,
+    settings: OptimiserSettings,
+    run: RunContext,
+    errors_at: Callable[[int], dict[str, float]],
+    *,
+    least_reference: float = 0.0,
 ) -> History:
     """Runs the optimisation loop; writes its curve line by line, and its costs to the record, also if it is stopped.
 
     Args:
         errors_at: gives the errors of the current state before an iteration, outside the timed part. A line has the
             loss before its step; its errors are of the same parameters.
+        least_reference: see `bench.solve.optimise.optimise`.
     """
     history = History()
     checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
@@ -228,7 +241,14 @@ def descend(
             check(0)
         try:
             note_objective()
-            optimise(problem, settings, run.inputs.device, history=history, on_step=on_step)
+            optimise(
+                problem,
+                settings,
+                run.inputs.device,
+                history=history,
+                on_step=on_step,
+                least_reference=least_reference,
+            )
             note_objective()
         except NotReached as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
@@ -297,6 +317,7 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
     if after.failure is not None:
         return after.failure
     first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
-    if last >= first and len(history.curve) > 1:
-        return RunStatus.NOT_REACHED, f"the loss did not fall: {first:.4g} at the start, {last:.4g} at the end"
+    if last >= first and last > 0 and len(history.curve) > 1:
+        what = "objective" if history.objectives else "loss"
+        return RunStatus.NOT_REACHED, f"the {what} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

@@ -125,7 +125,7 @@ def figures(runs: Runs) -> Result:
         f"Colours, and normals (right, up, towards the camera as red, green, blue), of {len(shown)} of "
         f"{format.plural(len(every), 'scene')}, seen by the camera of a held-out photograph.",
         remarks=(
-            "A mesh row shows its mesh with the colours of the photographs that see a vertex, another row its field.",
+            "A mesh row has the colours of the photographs that see a vertex, another row those of its field.",
             "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
             *gallery.missing(scenes.values()),
         ),

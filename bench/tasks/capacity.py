@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
+from bench.evaluate.state import State
 from bench.models.candidates import PAPERS, by_size, candidate
 from bench.models.field import SIZES, note_fits
 from bench.models.fit import Fitted, Fitter
@@ -102,7 +103,7 @@ class Capacity:
                 name = fitted.candidate.name
                 fits[name] = fitted
                 record.metrics |= costs(name, fitted.evidence)  # in case the run is stopped
-                filmstrip.add(name, fitted.model.frozen())
+                filmstrip.add(name, State(fitted.model.frozen(), inputs))
                 run.progress("fitting all candidates", len(fits), len(candidates), fitted.evidence.mean)
             evidence = [fitted.evidence for fitted in fits.values()]
             note_fits(record, [*growth.tried, *evidence], fitter)
@@ -111,11 +112,11 @@ class Capacity:
             checked = check(chosen, list(fits.values()), views, self.checks, seed=inputs.seed)
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
             metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
-        result = evaluate(chosen.model.frozen(), inputs)
+        result = evaluate(State(chosen.model.frozen(), inputs))
         metrics = result.metrics | {"footprint": views.footprint} | metrics
         saving = pixel_precision_summary(frugal, chosen.evidence)
         precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, saving]]
-        notes = summary(choice, growth), *final_notes(chosen.renderer), *precision_notes
+        notes = summary(choice, growth), *final_notes(chosen.renderer), *precision_notes, *result.notes
         note_result(run, replace(result, metrics=metrics, notes=notes))
         filmstrip.save(
             run.folder, f"{record.title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, REACH, Evaluation, render_view, view_metrics
+from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
+from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
@@ -208,20 +209,16 @@ class PoseProblem:
     def objective(self) -> None:
         """None: the losses of all iterations are comparable."""
 
-    def frame(self) -> tuple[Field, Camera]:
-        """The known shape and the current camera."""
-        return self.known, self.camera()
-
-    def evaluate(self, inputs: RunInputs) -> Evaluation:
+    def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
-        own = render_view(self.known, self.camera(), inputs)
-        return self.settings.evaluate(own.camera, inputs.scene, own)
+        own = render_view(self.known, self.camera(), state.inputs)
+        return self.settings.evaluate(own.camera, state.inputs.scene, own)
 
-    def checkpoint(self, inputs: RunInputs) -> dict[str, float]:
+    def checkpoint(self, state: State) -> dict[str, float]:
         """The errors of the current camera."""
         return self.settings.metrics(self.camera(), self.view.camera)
 
-    def draw(self, inputs: RunInputs, folder: Path, first: Field, curve: list[dict[str, Any]], title: str) -> None:
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the curve of the loss."""
         draw_curve(folder / "curve.png", curve)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from bench.evaluate.evaluate import picture_view, surface_metrics, true_surface
+from bench.evaluate.evaluate import surface_metrics, true_surface
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior, near_surface_first, sample_distances
@@ -54,17 +54,17 @@ class PriorFit:
     def execute(self, run: RunContext) -> None:
         """Fits the code, and evaluates the field as a surface and as a distance."""
         inputs, record = run.inputs, run.record
-        field = solve_task(self, run).field()
+        state = solve_task(self, run)
         record.definitions |= DEFINITIONS
         samples = true_surface(inputs, inputs.seed + 1), true_surface(inputs, inputs.seed)
         floor = surface_metrics(*samples, threshold=inputs.evaluation.fscore_threshold)
         points, distances = sample_distances(inputs.scene.mesh, self.distances, inputs.seed + 1)
         close = distances.abs() < NEAR
         points, distances = points[close].to(inputs.device), distances[close].to(inputs.device)
-        lengths = autograd_gradients(field, points).norm(dim=-1)
+        lengths = autograd_gradients(state.field, points).norm(dim=-1)
         middle, high = lengths.double().quantile(torch.tensor([0.5, 0.99], dtype=torch.float64).to(lengths.device))
         with torch.no_grad():
-            error = (field(points) - distances).abs().mean()
+            error = (state.field(points) - distances).abs().mean()
         record.metrics |= {
             "floor_chamfer_l2": floor["chamfer_l2"],
             "distance_error": error.item(),
@@ -73,7 +73,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        found, true = picture_view(field, camera, inputs), see(Truth(inputs.scene.mesh), camera)
+        found, true = state.pictured(camera), see(Truth(inputs.scene.mesh), camera)
         save_images(run.folder, found, true)
 
     def problem(

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import OWN, Evaluation, surface_of, vertex_colours
+from bench.evaluate.evaluate import OWN, Evaluation
+from bench.evaluate.state import State, vertex_colours
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
 from bench.reconstruct.subject import Subject
@@ -24,12 +25,10 @@ from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
 from bench.solve.solve import COSTS, check_field_gradient, check_kind, descend, note_result
-from datasets.mesh import Mesh
 from datasets.photographs import Photography
 from datasets.scene import Split, Truth
 from datasets.views import check_elevation
 from renderers.checks import BadInput, check_at_least, check_choice
-from renderers.fields.coloured import OccupancyOf
 
 NETWORK, CODE, MEAN, NEAREST, BEST = "network", "code", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
@@ -169,13 +168,12 @@ class OneImage:
         part = "took part in the training, and" if self.supervision.renders else "took no part in the training; it"
         record.notes = [*record.notes, f"the renderer {part} judges as own_"]
         with run.off_clock():
-            before = self._judged(model.at(mean), images, subject, inputs)
-            record.metrics_start = before.metrics
-        shape, _ = _inferred(run, model, images.image(self.given))
+            record.metrics_start = self._judged(State(model.at(mean), inputs), images, subject).metrics
+        state = _inferred(run, model, images.image(self.given))
         with run.off_clock():
-            note_result(run, self._judged(shape, images, subject, inputs))
+            note_result(run, self._judged(state, images, subject))
             if inputs.evaluation.picture is not None:
-                draw_reconstruction(run.folder, inputs, shape, subject, [], run.record.outcome)
+                draw_reconstruction(run.folder, state, subject, [], run.record.outcome)
 
     def _network(self, run: RunContext, recipe: Recipe) -> tuple[SingleView, dict[str, Any]]:
         """The network and the record of its training, which is told in the run's notes."""
@@ -207,13 +205,14 @@ class OneImage:
         mask = None if self.mask_path is None else Path(self.mask_path)
         picture, doubts = read_picture(path, mask, self.image_pixels, trained["filled"])
         record.notes = [*record.notes, *doubts]
-        shape, mesh = _inferred(run, model, picture)
+        state = _inferred(run, model, picture)
+        mesh = state.mesh
         with run.off_clock():
             if mesh is None:
                 note_result(run, Evaluation({FITTED: 0.0}, None, (RunStatus.EMPTY, "the field has no surface")))
                 return
             if self.knows_colours:
-                mesh = replace(mesh, colours=vertex_colours(shape, mesh, inputs.device))
+                mesh = replace(mesh, colours=vertex_colours(state.field, mesh, inputs.device))
             cameras = [recipe.imaging.sampler.draw(place) for place in range(TRIED)]
             camera, overlapping = best_view(mesh, cameras, picture[3] > 0.5, trained["filled"])
             note_result(run, Evaluation({FITTED: overlapping}, mesh))
@@ -221,22 +220,23 @@ class OneImage:
             if inputs.evaluation.picture is not None:
                 draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
 
-    def _judged(self, shape: OccupancyOf, images: ImagesOf, subject: Subject, inputs: RunInputs) -> Evaluation:
+    def _judged(self, state: State, images: ImagesOf, subject: Subject) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
-        found = judge(shape, subject, inputs)
+        found = judge(state, subject)
         scores = {
             name: x for name, x in found.metrics.items() if self.knows_colours or name.removeprefix(OWN) not in COLOURS
         }
-        return replace(found, metrics=scores | {"iou": overlap(shape, images, inputs.device)})
+        return replace(found, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 
     def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
         """The shape of the code that is found, with the colours of the given image."""
         inputs = run.inputs
         problem = self.search.problem(subject.given[0], inputs)
         check_kind(inputs.renderer, problem.field())
-        history = descend(problem, self.search.optimiser, run, lambda iteration: {})
+        settings, least = self.search.optimiser, self.search.least_reference
+        history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
         with run.off_clock():
-            mesh = surface_of(problem.field(), inputs)
+            mesh = State(problem.field(), inputs).mesh
             mesh = None if mesh is None else with_colours(mesh, subject.given)
             scores = {"iou": overlap(problem.field(), images, inputs.device)}
             note_surface(run, mesh, subject, scores, history)
@@ -267,14 +267,12 @@ class OneImage:
 
 
 @torch.no_grad()
-def _inferred(
-    run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]
-) -> tuple[OccupancyOf, Mesh | None]:
+def _inferred(run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]) -> State:
     """The shape that an image shows, with its mesh, on the run's clock."""
     with run.on_clock():
-        shape = model.at(model(image[None].to(run.inputs.device))[0])
-        mesh = surface_of(shape, run.inputs)
-    return shape, mesh
+        state = State(model.at(model(image[None].to(run.inputs.device))[0]), run.inputs)
+        _ = state.mesh
+    return state
 
 
 def subject_of(images: ImagesOf, given: int, inputs: RunInputs) -> Subject:

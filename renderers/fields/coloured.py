@@ -13,7 +13,7 @@ from torch.nn.functional import softplus
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Flops, Kind, OccupancyField
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import CHUNK
+from renderers.fields.mlp import passes
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
 
 SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
@@ -105,7 +105,7 @@ class ColouredDistance(nn.Module):
     def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The distances."""
         flat = points.reshape(-1, 3)
-        chunks = [flat] if torch.is_grad_enabled() else flat.split(CHUNK)
+        chunks = [flat] if torch.is_grad_enabled() else passes(flat, self.last.in_features)
         return torch.cat([self.last(self._hidden(chunk)) for chunk in chunks]).view(points.shape[:-1])
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
@@ -114,7 +114,7 @@ class ColouredDistance(nn.Module):
         features = torch.cat([self.features(self._hidden(points)), points, normals, *seen], dim=-1)
         *layers, last = self.colour
         for layer in layers:
-            features = torch.relu(layer(features))
+            features = layer(features).relu_()
         return torch.sigmoid(last(features))
 
     def _hidden(self, points: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from renderers.checks import check_at_least
 from renderers.field import Flops
+from renderers.fields.mlp import passes
 
 BLOCKS = 5  # DVR, Sec. 3.5
-CHUNK = 2048  # points per pass: bounds memory, does not change results
 
 
 class OccupancyNetwork(nn.Module):
@@ -73,7 +73,7 @@ class BoundOccupancy:
     def _outputs(self, points: Tensor, head: nn.Module) -> Tensor:
         if self.shifts and self.shifts[0].dim() > 1:
             return head(self._features(points))
-        chunks = [head(self._features(chunk)) for chunk in points.reshape(-1, 3).split(CHUNK)]
+        chunks = [head(self._features(chunk)) for chunk in passes(points.reshape(-1, 3), self.network.width)]
         outputs = torch.cat(chunks)
         return outputs.view(*points.shape[:-1], outputs.shape[-1])
 
@@ -84,7 +84,7 @@ class BoundOccupancy:
                 shift = self.shifts[index]
                 features = features + (shift if shift.dim() == 1 else shift[..., None, :])
             features = block(features)
-        return torch.relu(features)
+        return features.relu_()
 
 
 class _Block(nn.Module):
@@ -95,4 +95,4 @@ class _Block(nn.Module):
         self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
 
     def forward(self, features: Tensor) -> Tensor:
-        return features + self.outer(torch.relu(self.inner(torch.relu(features))))
+        return features + self.outer(self.inner(torch.relu(features)).relu_())

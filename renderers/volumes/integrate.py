@@ -42,7 +42,7 @@ class Samples:
         return Samples(distance, _finite(field(rays.at_each(distance))))
 
     def of_rays(self, index: Tensor) -> "Samples":
-        """Those of some of the rays, by their places or a mask."""
+        """Those of some of the rays, by their places."""
         return Samples(self.distance[index], self.value[index])
 
     def joined(self, other: "Samples") -> "Samples":
@@ -117,12 +117,12 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     whole = _Part(*(torch.cat(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
     inside = whole.begun_inside
     hit = (whole.opacity.detach() > SEEN) & ~inside
+    seen = hit.nonzero().squeeze(-1)
     status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
-    status[inside], status[hit] = Status.STARTED_INSIDE, Status.HIT
+    status = status.masked_fill(inside, Status.STARTED_INSIDE).masked_fill(hit, Status.HIT)
     ended = torch.where(hit, whole.mean, torch.where(inside, entry[queried], leave[queried]))
     least = whole.least.index_put(
-        (hit.nonzero().squeeze(-1),),
-        fixed_samples(field, flat[queried[hit]], whole.least_distance[hit], whole.least[hit]),
+        (seen,), fixed_samples(field, flat[queried[seen]], whole.least_distance[seen], whole.least[seen])
     )
     rendering = assemble(
         rays,

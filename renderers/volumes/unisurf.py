@@ -96,6 +96,6 @@ class UNISURF(VolumeRenderer):
         distance = evenly(entry, leave, self.free_samples + self.samples)
         about = [evenly(entry[hit], near, self.free_samples + 1)[:, :-1], evenly(near, far, self.samples)]
         samples = Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
-        crowded = hit[near <= entry[hit]]  # the interval begins with the ray: all free samples are at one place
-        samples.value[crowded, : self.free_samples] = self.sphere_radius
+        crowded = torch.zeros_like(found).index_put((hit,), near <= entry[hit])  # all free samples are at one place
+        samples.value[:, : self.free_samples].masked_fill_(crowded[:, None], self.sphere_radius)
         return samples

@@ -6,7 +6,7 @@ from math import log
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
@@ -101,10 +101,11 @@ class VolSDF(VolumeRenderer):
             bound = Bound.of(found)
             width = self._least_width(bound, width)
             ends = (width <= self.width).squeeze(1) | (number == self.rounds)
-            yield index[ends], found.of_rays(ends), width[ends]
-            if ends.all():
+            ended, on = _parted(ends)
+            yield index[ended], found.of_rays(ended), width[ended]
+            if not len(on):
                 return
-            index, found, width, bound = index[~ends], found.of_rays(~ends), width[~ends], bound.of_rays(~ends)
+            index, found, width, bound = index[on], found.of_rays(on), width[on], bound.of_rays(on)
             more = by_importance(found.distance, bound.errors(width), self.samples)
             found = found.joined(Samples.of(field, rays[index], more))
 
@@ -137,29 +138,36 @@ class VolSDF(VolumeRenderer):
 class Bound:
     """The bound on the error of the opacity along n rays, for any width (Theorem 1, Eq. 14).
 
-    `value` is that of the sample with which each interval begins, `spacing` its length, `clearance` how far it is from
-    the surface at least.
+    Of each interval `magnitude` is that of the value with which it begins, `inside` its length where that value is not
+    positive, else 0, `tail` half the length with the value's sign, `square` a quarter of the length's square, and
+    `clearance` how far it is from the surface at least.
     """
 
-    value: Float[Tensor, "n intervals"]
-    spacing: Float[Tensor, "n intervals"]
+    magnitude: Float[Tensor, "n intervals"]
+    inside: Float[Tensor, "n intervals"]
+    tail: Float[Tensor, "n intervals"]
+    square: Float[Tensor, "n intervals"]
     clearance: Float[Tensor, "n intervals"]
 
     @staticmethod
     def of(found: Samples) -> "Bound":
         """The bound of the rays' samples."""
-        return Bound(found.value[:, :-1], _spacing(found.distance), _clearance(found))
+        value, spacing = found.value[:, :-1], _spacing(found.distance)
+        free = value > 0
+        inside = torch.where(free, 0.0, spacing)
+        return Bound(value.abs(), inside, spacing / 2 - inside, spacing.square() / 4, _clearance(found))
 
     def of_rays(self, index: Tensor) -> "Bound":
-        """That of some of the rays, by their places or a mask."""
-        return Bound(self.value[index], self.spacing[index], self.clearance[index])
+        """That of some of the rays, by their places."""
+        return Bound(*(part[index] for part in vars(self).values()))
 
     def errors(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
         """Of the opacity at each interval (Theorem 1)."""
-        passed = (-density(self.value, width) * self.spacing).cumsum(dim=1)
-        before = torch.nn.functional.pad(passed, (1, 0))[:, :-1]
-        error = (self.spacing.square() * torch.exp(-self.clearance / width)).cumsum(dim=1) / (4 * width.square())
-        return before.exp() * torch.expm1(error.clamp_max(MOST_LOG))
+        rate = -1 / width
+        stopped = torch.addcmul(self.inside, self.tail, (self.magnitude * rate).exp_())  # `density` by length and width
+        before = (stopped.cumsum(dim=1) - stopped).mul_(rate)
+        error = (self.clearance * rate).exp_().mul_(self.square).cumsum(dim=1).mul_(rate.square())
+        return before.exp_().mul_(error.clamp_max_(MOST_LOG).expm1_())
 
     def greatest(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
         """The greatest of each ray (Eq. 14)."""
@@ -170,6 +178,12 @@ def density(value: Float[Tensor, "n samples"], width: Float[Tensor, "n 1"]) -> F
     """Eqs. 2, 3: the share of a Laplace distribution that lies below minus the value, over its width."""
     tail = torch.exp(-value.abs() / width) / 2
     return torch.where(value > 0, tail, 1 - tail) / width
+
+
+def _parted(which: Bool[Tensor, " n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " rest"]]:
+    """The places where it is true, and the others, in one wait for the device."""
+    order, count = (~which).to(torch.uint8).argsort(stable=True), int(which.sum())
+    return order[:count], order[count:]
 
 
 def _spacing(distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n intervals"]:

@@ -36,7 +36,7 @@ SINGLE = {"fitted"}  # of one run, and without a table or figure of its own
 # The table or figure of an experiment, where it has another name: one that joins several experiments.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
-COMPARING = {"table1": 22, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
+COMPARING = {"table1": 24, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
 COMPARING["crossing"] = 5
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
@@ -96,7 +96,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
 
 
 def test_no_yaml_sets_the_mode_of_hydra():
-    assert composed(hydra=True).hydra.mode is None  # the fixture `asked_once` of the tests says so to Hydra
+    assert composed(hydra=True).hydra.mode is None  # `bench.run.command.mode_of_options` says so to Hydra
     for path in CONF.rglob("*.yaml"):
         assert "mode" not in (read_yaml(path).get("hydra") or {}), path
 

@@ -42,27 +42,61 @@ def test_a_surface_that_leaves_the_cube_is_left_open():
     assert not mesh.watertight
 
 
-@each("scale", [0.2, 1.0, 3.0])
-def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_lost(scale):
-    # a thin plate and a small ball apart from it; a field three times too steep is followed from block to block
-    shape = box((0.8, 0.03, 0.6)) | sphere(0.1, (0.0, 0.7, 0.0))
-    counted = Meter(Shape(lambda p: scale * shape(p), Kind.BOUND))
-    near = extract(counted, grid=96, reach=1.05)
-    everywhere = extract(Shape(lambda p: scale * shape(p), Kind.LEVEL), grid=96, reach=1.05)
+def balls(count: int, largest: float) -> Shape:
+    """Small balls at random places, many of them between the samples."""
+    draw = np.random.default_rng(0)
+    places, radii = torch.from_numpy(draw.uniform(-0.9, 0.9, (count, 3))).float(), draw.uniform(0, largest, count)
+    return Shape(lambda p: (torch.cdist(p, places) - torch.from_numpy(radii).float()).amin(-1))
+
+
+def noise(points: torch.Tensor) -> torch.Tensor:
+    """A number from -1 to 1 of each point, which says nothing of its neighbours'."""
+    return torch.sin(1e4 * (points * torch.tensor([12.9898, 78.233, 37.719])).sum(-1))
+
+
+PLATE = box((0.8, 0.03, 0.6)) | sphere(0.1, (0.0, 0.7, 0.0))
+BALLS = balls(40, 0.05)
+NESTED = (sphere(0.8) - sphere(0.76)) | (sphere(0.5) - sphere(0.47)) | sphere(0.02)
+JUMP = box((0.8, 0.04, 0.6)).translate((0.0, 0.133, 0.0))  # between samples
+FIELDS = {
+    "thin": PLATE,
+    "nested": NESTED,
+    "solid": sphere(0.8),
+    "small, and twice as steep as a distance": Shape(lambda p: 2 * BALLS(p)),
+    "small, and twenty times as steep": Shape(lambda p: 20 * BALLS(p)),
+    "a bound": Shape(lambda p: 0.2 * PLATE(p)),
+    "noisy": Shape(lambda p: NESTED(p) + 0.05 * noise(p)),
+    "noise alone": Shape(noise),
+    "values that jump at the surface": Shape(lambda p: JUMP(p) + JUMP(p).sign() * 0.4 * (p[..., 0] + 0.6).clamp(0, 1)),
+    "infinite far away": Shape(lambda p: torch.where(PLATE(p) > 0.5, torch.inf, PLATE(p))),
+}
+
+
+@each("name", [*FIELDS])
+@each("grid", [64, 41])
+def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_lost(name, grid):
+    field = FIELDS[name]
+    counted = Meter(Shape(field, Kind.BOUND))
+    near = extract(counted, grid=grid, reach=0.95)
+    everywhere = extract(Shape(field, Kind.LEVEL), grid=grid, reach=0.95)
     assert np.array_equal(near.vertices, everywhere.vertices) and np.array_equal(near.faces, everywhere.faces)
-    assert scale < 1 or counted.counts.value < 96**3 / 8
+    assert counted.counts.value < grid**3 / 3 or name not in ("thin", "solid") or grid < 64
 
 
-def test_a_surface_that_leads_out_of_the_asked_blocks_is_followed():
-    # a plate between the middles of blocks; its values are distances at one end, and jump by more and more to the other
-    plate = box((0.8, 0.04, 0.6)).translate((0.0, 0.133, 0.0))
+@each("kind", [Kind.DISTANCE, Kind.LEVEL])
+def test_a_field_that_has_no_number_somewhere_has_no_surface_and_is_not_asked_further(kind):
+    counted = Meter(Shape(lambda p: torch.where(p[..., 0] > 0.4, torch.nan, PLATE(p)), kind))
+    assert extract(counted, grid=64, reach=1.0) is None
+    assert kind is Kind.LEVEL or counted.counts.value < 64**3 / 50
 
-    def jumping(points):
-        return plate(points) + plate(points).sign() * 0.4 * (points[..., 0] + 0.6).clamp(0, 1)
 
-    near, everywhere = (extract(Shape(jumping, kind), grid=64, reach=1.05) for kind in (Kind.BOUND, Kind.LEVEL))
-    assert near.vertices[:, 0].max() == pytest.approx(0.8, abs=0.04)
-    assert len(near.faces) > 0.98 * len(everywhere.faces)
+def test_a_dip_that_is_twice_as_steep_as_a_distance_is_found_wherever_it_is():
+    far = sphere(0.3, (-0.5, -0.5, -0.5))
+    for place in np.random.default_rng(0).uniform(0.0, 0.7, (12, 3)).tolist():
+        dip = sphere(0.022, tuple(place))  # whose values are below those of the rest next to it alone
+        field = Shape(lambda p, dip=dip: torch.minimum(far(p).clamp(max=0.1), 2 * dip(p)))
+        near, everywhere = (extract(Shape(field, kind), grid=81, reach=1.0) for kind in (Kind.BOUND, Kind.LEVEL))
+        assert near.parts.max() == 1 and np.array_equal(near.vertices, everywhere.vertices)
 
 
 def test_small_parts_are_found_by_values_that_are_far_too_large():

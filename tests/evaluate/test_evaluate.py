@@ -8,9 +8,10 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.evaluate.evaluate import DEFINITIONS, evaluate, picture_view, render_view
+from bench.evaluate.evaluate import DEFINITIONS, evaluate, render_view
+from bench.evaluate.state import State
 from bench.setup.inputs import RunInputs
-from renderers.field import Meter
+from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
 from tests.tiny import ball_prior, camera_of, run_of, scene_of
 
@@ -28,7 +29,7 @@ def inputs(tmp_path_factory) -> RunInputs:
 
 
 def test_the_truth_itself_scores_best(inputs):
-    judgement = evaluate(sphere(RADIUS), inputs)
+    judgement = evaluate(State(sphere(RADIUS), inputs))
     metrics = judgement.metrics
     assert set(metrics) == set(DEFINITIONS)
     floor = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
@@ -44,7 +45,7 @@ def test_the_truth_itself_scores_best(inputs):
 def test_no_renderer_judges_itself(inputs):
     """One that sees a fattened outline, as a large epsilon does, changes its own metrics and no other."""
     fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
-    thin, found = evaluate(sphere(RADIUS), inputs).metrics, evaluate(sphere(RADIUS), fat).metrics
+    thin, found = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
     differing = {name for name in thin if found[name] != thin[name]}
     assert differing == {"own_mask_iou", "own_depth_mae"}
     assert found["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
@@ -52,28 +53,72 @@ def test_no_renderer_judges_itself(inputs):
 
 def test_a_field_is_not_evaluated_outside_the_unit_sphere(inputs):
     corner = sphere(0.3, (1.0, 1.0, 1.0))
-    spoilt = evaluate(sphere(RADIUS) | corner, inputs)
-    assert spoilt.metrics == pytest.approx(evaluate(sphere(RADIUS), inputs).metrics)
+    spoilt = evaluate(State(sphere(RADIUS) | corner, inputs))
+    assert spoilt.metrics == pytest.approx(evaluate(State(sphere(RADIUS), inputs)).metrics)
     assert np.linalg.norm(spoilt.mesh.vertices, axis=1).max() < 1.0
 
 
 @pytest.mark.parametrize("value", [1.0, float("nan")])
 def test_a_field_without_a_surface_scores_worst(inputs, value):
-    judgement = evaluate(Shape(lambda p: torch.full_like(p[..., 0], value) + 0 * p.sum(-1)), inputs)
+    field = Shape(lambda p: torch.full_like(p[..., 0], value) + 0 * p.sum(-1))
+    judgement = evaluate(State(field, inputs))
     assert judgement.mesh is None
     assert judgement.metrics["chamfer_l2"] == judgement.metrics["depth_mae"] == np.inf
     assert judgement.metrics["fscore"] == judgement.metrics["mask_iou"] == 0.0
 
 
-def test_pictures_of_a_distance_ask_for_few_values_whatever_renderer_is_under_test(inputs):
-    slow = replace(inputs, renderer=load("renderer", "dvr"))
-    camera, counts = inputs.scene.view.camera, []
-    for view in (picture_view, render_view):
-        meter = Meter(sphere(RADIUS))
-        seen = view(meter, camera, slow)
-        counts.append(meter.counts.value / seen.mask.numel())
-        assert (seen.mask ^ inputs.scene.view.mask).sum() < 0.03 * seen.mask.sum()
-    assert counts[0] < 6 < 30 < counts[1]
+def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inputs):
+    meter = Meter(sphere(RADIUS))
+    state = State(meter, inputs)
+    evaluate(state)
+    asked = meter.counts.value
+    view = state.pictured(inputs.scene.view.camera)
+    assert meter.counts.value - asked == view.mask.sum() == inputs.scene.view.mask.sum()
+    assert state.pictured(replace(inputs.scene.view.camera)) is view
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inputs, scale):
+    squares = Shape(lambda p: scale * (p.square().sum(-1) - RADIUS**2), Kind.LEVEL)
+    camera = inputs.scene.view.camera
+    view, on_mesh = State(squares, inputs).pictured(camera), State(squares, inputs).seen(camera)
+    points = camera.rays().at(camera.distance(view.depth))[view.mask]
+    off = [
+        (camera.rays().at(camera.distance(one.depth))[one.mask].norm(dim=-1) - RADIUS).abs() for one in (view, on_mesh)
+    ]
+    assert off[0].median() < 1e-5 < 1e-4 < off[1].median()
+    assert off[0].max() < 0.01
+    normals = (view.normals[view.mask] * torch.nn.functional.normalize(points, dim=-1)).sum(-1)
+    assert normals.min() > 0.99
+    assert view.normals[~view.mask].abs().sum() == 0
+
+
+def dipped(place: tuple[float, float, float], width: float) -> Shape:
+    """The distance to a sphere, with a local dip: a small surface floats where the rest of the field says far."""
+    rest = sphere(RADIUS)
+
+    def value(points: torch.Tensor) -> torch.Tensor:
+        squares = (points - torch.tensor(place)).square().sum(-1)
+        return rest(points) - 0.5 * torch.exp(-squares / (2 * width**2))
+
+    return Shape(value, lipschitz=None)
+
+
+def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inputs):
+    fine = replace(inputs, renderer=load("renderer", "newton"), evaluation=replace(inputs.evaluation, grid=96))
+    camera = camera_of(128)
+    scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).seen(camera))
+    fine = replace(fine, make_scene=lambda: scene)
+    state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
+    found = evaluate(state)
+    assert state.mesh.parts.max() == 1
+    floating = state.pictured(camera).mask & ~scene.view.mask
+    assert floating.sum() > 8
+    assert not (render_view(state.field, camera, fine).mask & floating).any()
+    (note,) = found.notes
+    rays = int((state.seen(camera).mask & ~scene.view.mask).sum())
+    assert "misses 1 part of the mesh, at most 0.1" in note and f"{rays} of its rays" in note
+    assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):

@@ -13,6 +13,7 @@ from bench.machine import environment
 from bench.records.record import Record
 from tests.looped import each
 
+CPU = torch.device("cpu")
 HAS_COUNTS = environment.scheduled() is not None
 
 
@@ -89,7 +90,7 @@ def test_within_it_forward_and_backward_threads_take_denormals_as_0():
     def work():  # in a thread whose operations have no threads yet, as those of a run's process
         with environment.flushing_denormals():
             Noting.apply(torch.ones(1, requires_grad=True)).backward()
-            found["said"] = environment.describe(torch.device("cpu"))["denormals_flushed"]
+            found["said"] = environment.describe(CPU)["denormals_flushed"]
         found["this thread after"] = sys.float_info.min / 2 > 0
 
     with environment.using_threads(2):
@@ -97,4 +98,8 @@ def test_within_it_forward_and_backward_threads_take_denormals_as_0():
         thread.start()
         thread.join()
     assert found == {"forward": {0}, "backward": {0}, "said": True, "this thread after": True}
-    assert not environment.describe(torch.device("cpu"))["denormals_flushed"]
+    assert not environment.describe(CPU)["denormals_flushed"]
+
+
+def test_the_description_can_be_read_without_torch():
+    assert "torch" not in {type(value).__module__.partition(".")[0] for value in environment.describe(CPU).values()}

@@ -16,7 +16,7 @@ from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
 from bench.models.observations import FREE, Views, hold_out, together
-from bench.models.study import choose, fit_all
+from bench.models.study import choose, fit_all, refit
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
@@ -433,6 +433,14 @@ class Told:
         return SimpleNamespace(failed=candidate < 0, evidence=SimpleNamespace(mean=candidate), model=candidate)
 
     def fit(self, fitted: SimpleNamespace, iterations: int, *, checkpoints: bool) -> None: ...
+
+
+def test_a_refit_with_nothing_changed_is_the_fit():
+    fitter = fitter_of("capsule", iterations=6, warm_iterations=20)
+    fits = list(fit_all(fitter, [candidate("ellipsoid"), candidate("grid_8")]))
+    first, second = fits[1].evidence, refit(fits[1], fitter, DIST, fewest_rays=1.0)
+    assert fits[1].previous is fits[0].model
+    assert (second.mean, second.evaluations, second.flops) == (first.mean, first.evaluations, first.flops)
 
 
 def test_a_candidate_begins_from_the_best_that_did_not_fail():

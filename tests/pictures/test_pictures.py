@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bench.config import load
+from bench.evaluate.state import State
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
 from bench.pictures.run_figures import ViewPair, _show_depth, draw_curve, save_gallery
 from bench.pictures.style import legend_below
@@ -41,14 +42,14 @@ def inputs(tmp_path):
     mesh = Mesh(np.array(made.vertices), np.array(made.faces))
     scene = Scene("ball", mesh, see(Truth(mesh), CAMERA))
     inputs = run_of(tmp_path, load("renderer", "dist"), ball_prior(), CAMERA, make_scene=lambda: scene).inputs
-    return replace(inputs, evaluation=replace(inputs.evaluation, picture=24))
+    return replace(inputs, evaluation=replace(inputs.evaluation, picture=24, grid=48))
 
 
 @pytest.mark.parametrize("suffix", ["gif", "webp"])
 def test_an_animation_has_a_frame_per_checkpoint_and_a_longer_last_one(inputs, tmp_path, suffix):
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, film=suffix)))
     for iteration, radius in enumerate((0.3, 0.45, 0.6)):
-        filmstrip.add(iteration, sphere(radius), CAMERA)
+        filmstrip.add(iteration, State(sphere(radius), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert f"film.{suffix}" in ALT
     with Image.open(tmp_path / f"film.{suffix}") as moving:
@@ -66,7 +67,7 @@ def test_an_animation_has_a_frame_per_checkpoint_and_a_longer_last_one(inputs, t
 def test_a_strip_alone_is_the_default(inputs, tmp_path):
     filmstrip = Filmstrip(inputs)
     for iteration in range(3 * MOST):
-        filmstrip.add(iteration, sphere(0.5), CAMERA)
+        filmstrip.add(iteration, State(sphere(0.5), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert [path.name for path in tmp_path.glob("*.*")] == ["strip.png"]
     with Image.open(tmp_path / "strip.png") as strip:
@@ -76,7 +77,7 @@ def test_a_strip_alone_is_the_default(inputs, tmp_path):
 def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn):
     filmstrip = Filmstrip(inputs, "by rung")
     for name in range(3 * MOST):
-        filmstrip.add(f"rung_{name}", sphere(0.5), CAMERA)
+        filmstrip.add(f"rung_{name}", State(sphere(0.5), inputs), CAMERA)
     for own in (0, 1):
         filmstrip.save(tmp_path, "a ball", f"rung_{own}")
         labels = [tick.label2 for tick in drawn[-1].axes[0].xaxis.get_major_ticks()]  # those at the top
@@ -89,7 +90,7 @@ def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn
 
 def test_nothing_is_drawn_where_pictures_are_off(inputs, tmp_path):
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=None, film="gif")))
-    filmstrip.add(0, sphere(0.5), CAMERA)
+    filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert not list(tmp_path.glob("*.*"))
 
@@ -106,7 +107,7 @@ def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path
     true = photograph(*size, masked=masked)
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), true=true)
     for iteration, radius in enumerate((0.3, 0.7)):
-        filmstrip.add(iteration, cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), true.view.camera)
+        filmstrip.add(iteration, State(cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), inputs), true.view.camera)
     filmstrip.save(tmp_path, "a ball")
     (figure,) = drawn
     axis = figure.axes[0]
@@ -145,7 +146,7 @@ def test_a_photograph_is_enlarged_with_its_parts_in_place():
 def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
     for true in (None, photograph(16, 16)):
         filmstrip = Filmstrip(inputs, true=true)
-        filmstrip.add(0, sphere(0.5), CAMERA)
+        filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
         filmstrip.save(tmp_path, "a ball")
         labels = [label.get_text() for label in drawn[-1].axes[0].get_yticklabels()]
         assert labels == ["normals", SILHOUETTE]

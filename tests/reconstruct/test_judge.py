@@ -10,13 +10,14 @@ import trimesh
 
 from bench.config import load
 from bench.evaluate.evaluate import render, render_image
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, judge, mesh_views, surface_scores
+from bench.evaluate.state import State, unseen
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, judge, surface_scores
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness, roughness_scores
 from bench.records.record import RunStatus
 from datasets.mesh import Mesh
 from datasets.photographs import around
-from datasets.scene import Surface, View
+from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import sphere_span
 from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
@@ -50,7 +51,7 @@ def inputs(tmp_path):
 
 
 def test_the_truth_scores_high(subject, inputs):
-    found = judge(painted(), subject, inputs)
+    found = judge(State(painted(), inputs), subject)
     assert found.failure is None and set(found.metrics) == OF_HITS
     metrics = found.metrics
     assert metrics["own_psnr"] > 60 and metrics["own_ssim"] > 0.9999 and metrics["own_mask_iou"] == 1.0
@@ -63,7 +64,7 @@ def test_the_truth_scores_high(subject, inputs):
 
 def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inputs):
     shape = cast(ball(0.6, CENTRE), torch.float32)  # whose colours change with the direction
-    mesh = judge(shape, subject, inputs).mesh
+    mesh = judge(State(shape, inputs), subject).mesh
     assert mesh is not None and mesh.colours is not None
     points = torch.from_numpy(mesh.vertices).float()
     normals = torch.nn.functional.normalize(points - shape.centre, dim=-1)
@@ -72,7 +73,7 @@ def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inpu
 
 
 def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
-    metrics = judge(painted(red=0.2), subject, inputs).metrics
+    metrics = judge(State(painted(red=0.2), inputs), subject).metrics
     shares = [shot.mask.float().mean().item() for shot in subject.held_out]
     assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)  # of three colours one is wrong
     expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])
@@ -90,7 +91,7 @@ def test_the_seen_part_is_judged_alone(subject, inputs):
 
 
 def test_no_surface_is_empty_and_scores_worst(subject, inputs):
-    found = judge(painted(radius=-0.5), subject, inputs)
+    found = judge(State(painted(radius=-0.5), inputs), subject)
     assert found.mesh is None and found.failure is not None and found.failure[0] is RunStatus.EMPTY
     metrics = found.metrics
     assert set(metrics) == OF_HITS
@@ -180,12 +181,12 @@ def test_roughness_is_over_the_seen_and_the_unseen_part_and_less_that_of_the_tru
 
 @pytest.mark.parametrize(("sharpness", "least", "most"), [(400.0, 0.0, 0.01), (20.0, 0.2, 0.6)])
 def test_a_wide_blur_has_weight_before_the_surface(subject: Subject, inputs, sharpness, least, most):
-    views = mesh_views(subject.truth, subject.held_out[:1])
+    views = [see(Truth(subject.truth), subject.held_out[0].camera)]
     neus = load("renderer", "neus", sharpness=sharpness, sharpening=0)
     found = early_weight(painted(), views, replace(inputs, renderer=neus))
     assert least <= found["own_early_weight"] < most
 
 
 def test_a_renderer_of_hits_has_no_weight_before_the_surface(subject: Subject, inputs):
-    assert early_weight(painted(), mesh_views(subject.truth, subject.held_out[:1]), inputs) == {}
-    assert early_weight(painted(), mesh_views(None, subject.held_out), inputs) == {}
+    assert early_weight(painted(), [see(Truth(subject.truth), subject.held_out[0].camera)], inputs) == {}
+    assert early_weight(painted(), [unseen(shot.camera) for shot in subject.held_out], inputs) == {}

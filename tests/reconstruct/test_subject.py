@@ -19,7 +19,7 @@ from bench.reconstruct.subject import (
 from bench.tasks.surfaces import Hull
 from datasets.mesh import Mesh
 from datasets.photographs import around
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene, Surface, Truth, sample_surface, see
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
@@ -95,7 +95,7 @@ def test_depths_have_noise_of_the_standard_deviation():
 
 def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
     shots = tuple(shot_of(ball(), camera) for camera in cameras)
-    return Subject(shots, (), surface, "").seen(surface, points)
+    return Subject(shots, (), surface, "").seen(surface, Surface(points, np.tile([0.0, 0.0, 1.0], (len(points), 1))))
 
 
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
@@ -115,6 +115,18 @@ def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
     assert seen_by(camera, surface=front, points=points).tolist() == [True, True]
     within = points[:1] - [0.0, 0.0, 5 * ON_SURFACE]
     assert seen_by(narrow, surface=front, points=within).tolist() == [False]
+
+
+@each("wound", [1, -1])
+def test_the_far_side_of_a_plate_is_not_seen_however_thin_and_whichever_way_it_is_wound(wound):
+    box = trimesh.creation.box(extents=(0.8, 0.8, 0.9 * ON_SURFACE))
+    plate = Mesh(np.array(box.vertices), np.array(box.faces)[:, ::wound])
+    sampled = sample_surface(plate, 2000, 0)
+    towards = sampled.points[:, 2] > 0
+    sides = np.abs(sampled.points[:, :2]).max(axis=1) < 0.38  # beside the rim, through which a camera sees a little
+    for angle, expected in ((0.0, towards), (45.0, towards), (180.0, ~towards)):
+        seen = Subject((shot_of(ball(), camera_of(16, angles=(angle, 0.0))),), (), plate, "").seen(plate, sampled)
+        assert np.array_equal(seen[sides], expected[sides])
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench.evaluate.evaluate import GREY
+from bench.evaluate.state import GREY
 from bench.reconstruct import surfaces
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours

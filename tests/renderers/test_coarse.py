@@ -13,7 +13,7 @@ from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_of
 from renderers.fields import mlp
-from renderers.fields.analytic import capsule, plane, sphere, torus
+from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.packed_march import Stop
 from renderers.rendering import Status, at_iteration, fresh
@@ -21,6 +21,7 @@ from tests.looped import each
 from tests.renderers.test_newton import camera, exact
 
 NEWTON = load("renderer", "newton")
+MARCHES = {"newton": NEWTON, **{name: load("renderer", f"{name}_coarse") for name in ("dist", "idr")}}
 ERROR = 2.5e-3  # of the coarse values below, as of a network of 8 layers of 512; a sixth of a pixel
 SHAPES = {"ring": torus(0.5, 0.2), "rod": capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.1)}
 ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -49,35 +50,54 @@ class Offering(Wrapper):
 
 @each("off", ERRORS.values())
 @each("shape", SHAPES.values())
-def test_a_surface_is_found_where_it_is_whatever_coarse_values_say(shape, off):
+# Without coarse values the median of Newton's is 5e-7: its last steps are longer.
+@each("name, median, most", [("newton", 5e-6, 2e-4), ("dist", 2e-5, 8e-4), ("idr", 3e-5, 8e-4)])
+def test_a_surface_is_found_where_it_is_whatever_coarse_values_say(shape, off, name, median, most):
     truth = exact(shape)
     with torch.no_grad():
-        found = NEWTON.render(Offering(shape, off), camera().rays())
+        found = MARCHES[name].render(Offering(shape, off), camera().rays())
     error = (found.distance - truth.distance)[truth.hit & found.hit].abs()
     assert int((truth.hit ^ found.hit).sum()) <= 2
-    assert error.median() < 5e-6  # 5e-7 without coarse values: the last Newton steps are longer
-    assert error.quantile(0.99) < 2e-4
+    assert error.median() < median
+    assert error.quantile(0.99) < most
 
 
 @each("shape", SHAPES.values())
-def test_the_field_is_asked_near_the_surface_alone(shape):
+@each("name, share, more, gradients", [("newton", 0.6, 1.0, 2), ("dist", 0.5, 1.1, 0), ("idr", 0.35, 1.1, 0)])
+def test_the_field_is_asked_near_the_surface_alone(shape, name, share, more, gradients):
     meter, plain = Meter(Offering(shape, ERRORS["rippled"])), Meter(shape)
     with torch.no_grad():
-        hits = int(rendered(NEWTON, meter, camera().rays()).hit.sum())
-        rendered(NEWTON, plain, camera().rays())
-    assert meter.counts.value < 0.6 * plain.counts.value
-    assert hits <= meter.counts.gradient <= 2 * hits
-    assert meter.counts.coarse <= plain.counts.value
+        hits = int(rendered(MARCHES[name], meter, camera().rays()).hit.sum())
+        rendered(MARCHES[name], plain, camera().rays())
+    assert meter.counts.value < share * plain.counts.value
+    assert min(gradients, 1) * hits <= meter.counts.gradient <= gradients * hits
+    assert meter.counts.coarse <= more * plain.counts.value
 
 
+@each("name", MARCHES)
+def test_a_thin_plate_is_lost_no_more_often_than_without_coarse_values(name):
+    """A plate of four times the error of the values, seen at a slant, in front of a wall."""
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.0, 0.7], [0.0, 0.0, 0.0], [-0.7, 0.0, 0.0]]))
+    scene = box((0.5, 0.5, 2 * ERROR)).rotate(turn) | plane((0.0, 0.0, -1.0), -0.8)
+    truth = exact(scene)
+
+    def lost(field: Field) -> int:
+        with torch.no_grad():
+            found = MARCHES[name].render(field, camera().rays())
+        return int((truth.hit & ~(found.hit & (found.distance < truth.distance + 0.01))).sum())
+
+    assert all(lost(Offering(scene, off)) <= lost(scene) + 1 for off in ERRORS.values())
+
+
+@each("name", MARCHES)
 @each("x, status", [(0.0, Status.STARTED_INSIDE), (0.602, Status.MISS)])
-def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status):
+def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status, name):
     """Beside the surface, where coarse values say that it is inside, it looks away."""
     away = camera().rays()
     origins, directions = (torch.tensor([at, 0.0, 0.0]).expand_as(away.origins) for at in (x, 1.0))
     away = replace(away, origins=origins, directions=directions)
     with torch.no_grad():
-        found = NEWTON.render(Offering(sphere(0.6), ERRORS["too small"]), away)
+        found = MARCHES[name].render(Offering(sphere(0.6), ERRORS["too small"]), away)
     assert (found.status == status).all()
 
 
@@ -105,18 +125,19 @@ def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
 
 
 @each("behind", [2.0, 0.06])
-def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind):
+@each("name", MARCHES)
+def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind, name):
     """The edge of a small ball, before a wall, so near that coarse rays lie closer than coarse values are exact."""
     y, x = torch.meshgrid(0.047 + 1e-4 * torch.arange(64), 1e-4 * torch.arange(64), indexing="ij")
     origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
     near = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand_as(origins), image=True)
     scene = sphere(0.05) | plane((0.0, 0.0, -1.0), -behind)
     with torch.no_grad():
-        found = NEWTON.render(Offering(scene, ERRORS["too large"]), near)
+        found = MARCHES[name].render(Offering(scene, ERRORS["too large"]), near)
     inside = x.square() + y.square() < 0.05**2
     on_ball = found.hit & (found.distance < 2.05)
     assert inside.sum() > 1000
-    assert (on_ball ^ inside).sum() <= 0.02 * inside.sum()
+    assert (on_ball ^ inside).sum() <= (0.02 if name == "newton" else 0.03) * inside.sum()  # a ring of epsilon has 0.02
 
 
 def test_coarse_values_are_counted_apart_and_limited():
@@ -187,20 +208,23 @@ def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
     assert wide.at(code).coarse is None
 
 
-def test_the_gradient_of_a_network_is_that_of_its_field(wide):
+@each("name", MARCHES)
+def test_the_gradient_of_a_network_is_that_of_its_field(wide, name):
     """A network near a ball's distance: with coarse values and without, hits and their gradient towards the code."""
     from bench.shape_prior import initialise_to_sphere
 
     initialise_to_sphere(wide, radius=0.5)
-    found = []
-    for use in (True, False):
-        code = torch.zeros(8, requires_grad=True)
-        rendering = load("renderer", "newton", coarse=use).render(wide.at(code), camera().rays())
-        rendering.distance[rendering.hit].sum().backward()
-        found.append((rendering, code.grad))
-    (coarse, its), (plain, other) = found
-    assert int((coarse.hit ^ plain.hit).sum()) <= 1
+    codes = [torch.zeros(8, requires_grad=True) for _ in range(2)]
+    coarse, plain = (
+        replace(MARCHES[name], coarse=use).render(wide.at(code), camera().rays())
+        for use, code in zip((True, False), codes, strict=True)
+    )
     both = coarse.hit & plain.hit
     assert both.any()
-    assert (coarse.distance - plain.distance)[both].abs().median() < 1e-6
+    assert int((plain.hit & ~coarse.hit).sum()) <= 1
+    assert (coarse.distance - plain.distance)[both].abs().median() < (1e-6 if name == "newton" else 2e-5)
+    its, other = (
+        torch.autograd.grad(rendering.distance[both].sum(), code)[0]
+        for rendering, code in zip((coarse, plain), codes, strict=True)
+    )
     assert (its - other).norm() < 0.01 * other.norm()

@@ -4,10 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from bench.machine.environment import using_threads
 from renderers.field import Flops
 from renderers.fields import mlp
 from renderers.fields.mlp import Decoder
 from tests.looped import each
+from tests.operations import Operations
 
 NETWORKS = {
     "no-skip": {"layers": 3, "width": 8, "code_length": 4, "skip": 0, "narrow": False},
@@ -24,6 +26,11 @@ NETWORKS = {
 def make(name: str) -> Decoder:
     torch.manual_seed(0)
     return Decoder(**NETWORKS[name]).double()
+
+
+def in_sevens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mlp, "FEWEST_AT_ONCE", 7)
+    monkeypatch.setattr(mlp, "CACHED", 0)
 
 
 def plain(decoder: Decoder, code: Tensor, points: Tensor) -> Tensor:
@@ -86,13 +93,33 @@ def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
     sizes = []
     decoder_pass = mlp.BoundDecoder._forward
     monkeypatch.setattr(mlp.BoundDecoder, "_forward", lambda self, p: (sizes.append(len(p)), decoder_pass(self, p))[1])
-    monkeypatch.setattr(mlp, "CHUNK", 7)
+    in_sevens(monkeypatch)
     chunked = decoder.at(code)(points)
     torch.testing.assert_close(chunked, whole, rtol=0, atol=1e-14)
     assert sum(sizes) == count
     assert max(sizes) <= 7
     gradients = [torch.autograd.grad(values.square().sum(), (code, points)) for values in (whole, chunked)]
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-13)
+
+
+def test_a_pass_has_as_many_points_as_caches_hold_and_far_more_on_a_gpu():
+    one_mebibyte, gpu = 2**20, torch.device("cuda")
+    with using_threads(1):
+        for width, dtype, most in [(128, torch.float32, 2048), (512, torch.float32, 512), (512, torch.bfloat16, 1024)]:
+            assert (
+                mlp.points_at_once(width, dtype, torch.device("cpu")) == most == one_mebibyte / width / dtype.itemsize
+            )
+        assert mlp.points_at_once(2**16, torch.float64, torch.device("cpu")) == 256  # at least
+    assert mlp.points_at_once(128, torch.float32, gpu) == 2**18
+
+
+def test_a_pass_back_takes_the_memory_of_one_gradient_however_many_chunks_it_has(monkeypatch):
+    decoder, points = make("skip").requires_grad_(False), torch.rand(700, 3, dtype=torch.float64, requires_grad=True)
+    in_sevens(monkeypatch)
+    values = decoder.at(torch.zeros(4, dtype=torch.float64))(points)
+    with Operations() as counted:
+        values.sum().backward()
+    assert counted.made[700 * 3] <= 2  # and the leaf's own
 
 
 def test_flops_are_two_a_weight_without_the_code():
@@ -142,7 +169,7 @@ def through(decoder: Decoder, upstream: Tensor, dtype: torch.dtype) -> tuple[Ten
 @each("dtype, close", [(torch.float32, 1e-5), (torch.float64, 1e-13)])
 @each("share", [1.0, 0.0])
 def test_fixed_weights_change_nothing_but_the_cost(monkeypatch, dtype, close, share):
-    monkeypatch.setattr(mlp, "CHUNK", 7)
+    in_sevens(monkeypatch)
     upstream = share * torch.linspace(-1, 2, 50, dtype=dtype) * (torch.arange(50) % 3 > 0)  # a third are zero, or all
     for one, other in zip(*(through(decoder, upstream, dtype) for decoder in pair(dtype)), strict=True):
         torch.testing.assert_close(one, other, rtol=close, atol=close)

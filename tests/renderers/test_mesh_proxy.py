@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from bench.config import load
-from renderers.camera import Rays
+from renderers.camera import Rays, sphere_span
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Status
@@ -65,6 +65,22 @@ def test_a_grazing_hit_stays_where_it_is(slope=5e-4):
     rendering = RENDERER.render(Shape(lambda p: p[..., 2], Kind.DISTANCE, 1.0), ray)
     assert rendering.hit.item()
     assert rendering.points[0, 0].item() == pytest.approx(-1.0, abs=0.05)
+
+
+def test_a_ray_that_passes_a_shape_is_closest_where_it_is_and_one_behind_the_sphere_is_not_there():
+    ball, generator = sphere(0.2, (0.5, -0.1, 0.3)), torch.Generator().manual_seed(0)
+    origins = 2 * normalize(torch.randn(200, 3, dtype=torch.float64, generator=generator), dim=-1)
+    targets = 0.7 * normalize(torch.randn(200, 3, dtype=torch.float64, generator=generator), dim=-1)
+    rays = Rays(origins, normalize(targets - origins, dim=-1))
+    found = RENDERER.render(ball, rays)
+    entry, leave, _ = sphere_span(rays)
+    least = ball(rays.at_each(entry[:, None] + torch.linspace(0, 1, 2000) * (leave - entry)[:, None])).amin(dim=1)
+    passes = ~found.hit & (least > 0.01)
+    assert passes.sum() > 100
+    assert (found.closest - least)[passes].min() >= -1e-4
+    assert (found.closest - least)[passes].max() < 2 / RENDERER.ray_samples
+    beyond = RENDERER.render(sphere(0.1, (0.8, 0.8, 0.0)), Rays(origins, normalize(vector((0.8, 0.8, 0)) - origins)))
+    assert not beyond.hit.any()
 
 
 def test_the_cost_is_that_of_the_grid_whatever_the_rays():

@@ -282,6 +282,11 @@ def marched(*values: float) -> Reached:
     return reached
 
 
+def advance(reached: Reached, value: float, stride: Stride) -> None:
+    """Moves a ray that begins in the sphere's centre by one value."""
+    march(lambda points: points.new_full((1,), value), beam((0.0, 0.0, 0.0)), reached, stride, 1)
+
+
 def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unseen_before():
     assert marched(0.4, 0.58).stopped(Stop.ON_THE_WAY).item()  # at 0.4025: its step would lead behind the end
     assert marched(0.4, 0.6).stopped(Stop.LEFT).item()
@@ -301,10 +306,10 @@ def test_what_a_step_was_taken_back_from_is_no_closest_sample():
 
 def test_a_step_of_no_length_has_no_slope():
     at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
-    at.advance(torch.tensor([0.4]).double(), NEWTON.tracer.stride())
+    advance(at, 0.4, NEWTON.tracer.stride())
     first = at.distance.item()
     at.distance = at.free
-    at.advance(torch.tensor([0.4]).double(), NEWTON.tracer.stride())
+    advance(at, 0.4, NEWTON.tracer.stride())
     assert at.distance.item() == first
 
 
@@ -324,7 +329,7 @@ def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
     """Its coarse ray, which continued one itself, began behind the surface and is on its way back."""
     behind, parent, fine = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0), torch.tensor([0]), beam((0.03, 0.0, 0.0))
     behind.distance = behind.entry + 0.5
-    behind.advance(torch.tensor([-0.1]).double(), NEWTON.tracer.stride())
+    advance(behind, -0.1, NEWTON.tracer.stride())
     assert behind.stopped(Stop.ON_THE_WAY).item() and behind.least.item() < 0
     finer = behind.split(parent, torch.tensor([0.03]).double(), fine, radius=1.0, error=0.0)
     assert finer.least.isinf().item() and finer.stopped(Stop.ON_THE_WAY).item()
@@ -332,15 +337,15 @@ def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
 
 def test_a_step_whose_spheres_lie_apart_is_taken_back():
     at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
-    at.advance(torch.tensor([0.4]).double(), Stride(1e-3, 0.005))
+    advance(at, 0.4, Stride(1e-3, 0.005))
     assert at.distance.item() == pytest.approx(0.4025)  # (2 0.4 + 0.005) / (1 + 1)
-    at.advance(torch.tensor([0.2]).double(), Stride(1e-3, 0.005))
+    advance(at, 0.2, Stride(1e-3, 0.005))
     assert at.distance.item() == pytest.approx(0.4025 + 0.2 + FURTHER)
     free, free_value = at.free.item(), at.free_value.item()
-    at.advance(torch.tensor([0.005]).double(), Stride(1e-3, 0.005))  # FURTHER - 0.005 is more than 1.5 0.005
+    advance(at, 0.005, Stride(1e-3, 0.005))  # FURTHER - 0.005 is more than 1.5 0.005
     assert at.distance.item() == pytest.approx(0.4025 + 0.2)
     assert (at.free.item(), at.free_value.item()) == (free, free_value)
-    at.advance(torch.tensor([0.1]).double(), Stride(1e-3, 0.005))
+    advance(at, 0.1, Stride(1e-3, 0.005))
     slope = 0.1 / 0.2
     assert at.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + FURTHER))
 

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from bench.config import load
 from bench.machine.limits import Limits
 from renderers.camera import Rays
-from renderers.field import Counts, Meter, Moved, bounds_of, steepest
+from renderers.field import Counts, Kind, Meter, Moved, bounds_of, steepest
 from renderers.fields.affine import segment_bounds
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
@@ -91,6 +91,18 @@ def test_a_thin_plate_is_found():
     for thickness in (0.1, 0.01, 0.002):
         rendering = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
         assert rendering.hit.all()
+
+
+@each("share", [4.0, 0.05])
+def test_a_plate_in_values_that_are_no_lengths_is_found_where_they_state_their_bound(share):
+    """Half of the least segment is as deep in them as the plate, or the other way around."""
+    thickness = 0.02
+    plate = Shape(lambda p: share * box((0.5, 0.5, thickness / 2))(p), Kind.LEVEL, share)
+    rays = around(400)
+    truth = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
+    found = RENDERER.render(plate, rays)
+    assert truth.hit.sum() > 50 and torch.equal(found.hit, truth.hit)
+    torch.testing.assert_close(found.distance[found.hit], truth.distance[found.hit], rtol=0, atol=1e-6)
 
 
 def test_values_that_are_coarser_than_the_bounds_give_a_hit_where_they_change_sign(step=0.002):

@@ -24,7 +24,16 @@ from renderers.rendering import Blurred, Renderer, Rendering, Status, closest_va
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
 # Those with code of their own; the others have other numbers.
-VARIANTS = ["naive_practical", "dist_paper", "dist_slope_bound", "dist_auto_relaxed", "dvr_early_stop", "volsdf_budget"]
+VARIANTS = [
+    "naive_practical",
+    "dist_paper",
+    "dist_slope_bound",
+    "dist_auto_relaxed",
+    "dvr_early_stop",
+    "volsdf_budget",
+    "dist_coarse",
+    "idr_coarse",
+]
 
 
 @pytest.fixture(

@@ -191,6 +191,19 @@ def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
     assert (mixed & (rendering.volume.summed(rendering.volume.distance, 41) > 2.1)).any()
 
 
+@VOLUMES
+def test_in_one_solid_the_mean_is_of_all_that_is_seen_also_behind_a_ridge_within(renderer):
+    """Between two balls that overlap a value rises and falls again, below 0: that is no second surface."""
+    rays = Rays(vector((0.01, 0.02, -2))[None], vector((0, 0, 1))[None])
+    pair = sphere(0.3, (0.0, 0.0, -0.2)) | sphere(0.3, (0.0, 0.0, 0.2))
+    rendering = renderer.with_blur(0.3).render(pair, rays)
+    seen = rendering.volume
+    assert rendering.hit.item()
+    assert rendering.distance.item() == pytest.approx(
+        ((seen.weight * seen.distance).sum() / seen.weight.sum()).item(), abs=1e-4
+    )
+
+
 def test_of_two_surfaces_within_the_band_the_first_counts():
     front, behind = (torch.tensor(0.2, dtype=torch.float64, requires_grad=True) for _ in range(2))
 

@@ -36,8 +36,8 @@ def script(path: Path) -> tuple[str, str, Any]:
 class Page:
     """What the page of a results folder shows."""
 
-    def __init__(self, results: Path) -> None:
-        self.results, self.data = results, results / "page" / "data"
+    def __init__(self, results: Path, beginning: int = 2) -> None:
+        self.results, self.data, self.beginning = results, results / "page" / "data", beginning
         self.shell = Shell(results / "index.html")
         lists = {name: self.read("list", name) for name in ("about", "papers", "runs")}
         self.about, self.papers, self.runs = lists["about"], lists["papers"], lists["runs"]
@@ -55,7 +55,17 @@ class Page:
 
     def run(self, folder: str) -> dict[str, Any]:
         """The details of a run."""
-        return self.read("run", self.runs["key"][self.folders.index(folder)])
+        place = self.folders.index(folder)
+        key, address = (self.runs[column][place] for column in ("key", "address"))
+        whole = self.read("run", key[: self.beginning])
+        texts, run = whole["texts"], whole["runs"][key]
+        return run | {
+            "settings": [row for part in run["settings"] for row in texts[part]],
+            "environment": [texts[row] for row in run["environment"]],
+            "metrics": [[texts[name], *values, texts[words]] for name, *values, words in run["metrics"]],
+            "files": {name: address + name for name in texts[run["files"]]},
+            "python": texts[run["python"]].replace("\0", folder),
+        }
 
     def paper(self, name: str) -> dict[str, Any]:
         """The details of a table or figure."""

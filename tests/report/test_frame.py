@@ -6,9 +6,10 @@ import pandas as pd
 import pytest
 
 import bench
-from bench.records.read import Plan, PlannedCell
+from bench.records import read as read_module
+from bench.records.read import Plan, PlannedCell, read_records
 from bench.report.__main__ import main as report
-from bench.report.data.frame import COLUMNS
+from bench.report.data.frame import COLUMNS, write_csv
 from tests.report.test_report import crashed, record, write_run
 
 
@@ -54,6 +55,18 @@ def test_the_files_have_the_columns_of_the_table(results, capsys):
     assert said.out.splitlines()[0] == str(results / "runs.csv")
     table = pd.read_csv(results / "runs.csv")
     assert list(table) == list(runs) and list(table.folder) == list(runs.folder)
+    assert (results / "runs.csv").read_text() == runs.to_csv(index=False)
+
+
+def test_each_record_is_read_once_and_equal_settings_are_one_object(results, monkeypatch):
+    for name in ("four", "five"):
+        write_run(results, record(name), name)
+    read, before = [], read_module.read_run
+    monkeypatch.setattr(read_module, "read_run", lambda *of: (read.append(of[0].name), before(*of))[1])
+    report([f"results_dir={results}"])
+    assert sorted(read) == ["five", "four", "one", "two"]
+    known = {run["folder"]: run for run in read_module.read_records(results)[0]}
+    assert known["four"]["config"]["task"] is known["five"]["config"]["task"]
 
 
 @pytest.mark.parametrize("odd", [{"threads": "auto"}, {"threads": 1.5}, {"threads": 10**400}, {"dirty": "yes"}])
@@ -63,6 +76,8 @@ def test_a_record_from_elsewhere_with_an_odd_value_leaves_the_table_whole(result
     runs = bench.load(results)
     (name, value), *_ = odd.items()
     assert len(runs) == 4 and str(runs[name].dtype) == "string" and runs[name][0] == str(value)
+    write_csv(read_records(results)[0], results / "odd.csv")
+    assert (results / "odd.csv").read_text() == runs.to_csv(index=False)
 
 
 @pytest.mark.parametrize("odd", [{"a": 1}, 3])

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from bench.records.names import differences
-from bench.records.read import RESULTS, Plan, PlannedCell, not_run
+from bench.records.read import RESULTS, Plan, PlannedCell, not_run, read_records
 from bench.records.record import NOT_RUN, RunStatus
 from bench.report.data.records import definition
 from bench.report.site.columns import names
@@ -218,7 +218,7 @@ def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
         made.write(tmp_path, number)
     write_index(tmp_path, meshes=2)
     page = Page(tmp_path)
-    shown = ["x" in page.read("mesh", key) for key in page.runs["key"]]
+    shown = [(page.data / "mesh" / f"{key}.js").is_file() for key in page.runs["key"]]
     assert page.folders[-1] == "completion-0000" and shown == [True, True, False]
     monkeypatch.setattr("bench.report.site.meshes.read_ply", lambda path: pytest.fail("was made already"))
     write_index(tmp_path, meshes=2)
@@ -228,6 +228,18 @@ def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
     (tmp_path / "runs" / page.folders[0] / "mesh.ply").write_bytes(b"")
     write_index(tmp_path)
     assert "Not a ply file" in Page(tmp_path).read("mesh", page.runs["key"][0])["none"]
+
+
+def test_runs_share_scripts_from_which_each_has_its_own_details(tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "BEGINNING", 1)
+    for number in range(20):
+        made.write(tmp_path, number, folder=f'run "{number}"' if number % 2 else f"run-{number}")
+    write_index(tmp_path)
+    page = Page(tmp_path, beginning=1)
+    assert len(list((page.data / "run").iterdir())) <= 16
+    for found in read_records(tmp_path)[0]:
+        whole = detail(found, Folder(tmp_path, found["folder"]), tmp_path)
+        assert page.run(found["folder"]) == json.loads(safe_json(whole))
 
 
 def test_what_is_gone_leaves_the_page(tmp_path):
@@ -247,20 +259,20 @@ def test_what_another_put_in_the_place_of_a_script_is_replaced(tmp_path):
     for number in range(2):
         made.write(results, number)
     write_index(results)
-    linked, edited = Page(results).runs["key"]
-    for kind in ("run", "mesh"):
+    names = {kind: [path.name for path in (results / "page" / "data" / kind).iterdir()] for kind in ("run", "mesh")}
+    for kind, (linked, edited) in names.items():
         folder = results / "page" / "data" / kind
-        (folder / f"{linked}.js").rename(outside.with_name(kind))
-        (folder / f"{linked}.js").symlink_to(outside.with_name(kind))
-        (folder / f"{edited}.js").write_text("evil();")
+        (folder / linked).rename(outside.with_name(kind))
+        (folder / linked).symlink_to(outside.with_name(kind))
+        (folder / edited).write_text("evil();")
     (results / "page" / "data" / "run" / f"{'0' * 16}.js").write_text("evil();")
     (results / "page" / html.START).write_text("evil();")
     write_index(results)
     assert not any("evil();" in path.read_text(encoding="utf-8") for path in (results / "page").rglob("*.js"))
-    for kind in ("run", "mesh"):
+    for kind in names:
         outside.with_name(kind).write_text("evil();")
-        for key in (linked, edited):
-            script = results / "page" / "data" / kind / f"{key}.js"
+        for name in names[kind]:
+            script = results / "page" / "data" / kind / name
             assert not script.is_symlink() and "evil" not in script.read_text()
 
 

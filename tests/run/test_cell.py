@@ -8,6 +8,7 @@ import torch
 from bench import config as config_module
 from bench.machine.environment import using_threads
 from bench.setup.inputs import ALL_THREADS, cell_of, threads_for
+from renderers.checks import BadInput
 from tests.tiny import cell_from, plain
 
 
@@ -48,6 +49,14 @@ def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_c
             reasons.append(str(error))
     assert reasons == ["steps must be at least 1, not 0: the paper uses 50 to 100"] * 2
     assert (built["renderer"], built["task"], built["dataset"], built["prior"]) == (2, 1, 1, 1)
+
+
+def test_a_shape_has_a_code_of_the_prior_where_its_training_had_the_shape(compose_config):
+    cells = [cell_from(compose_config("split=train", "prior.shapes=2", f"index={index}")) for index in range(3)]
+    assert [cell.inputs.trained for cell in cells] == [0, 1, None]
+    with pytest.raises(BadInput, match="at the shape that it was fitted to"):
+        cells[2].inputs.check_fitted()
+    assert cell_from(compose_config("split=test", "prior.shapes=2", "index=0")).inputs.trained is None
 
 
 def test_a_narrow_network_takes_one_thread_and_a_wide_one_all():

@@ -10,8 +10,9 @@ from bench.prior import main as prior_main
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import compose, sweep
+from bench.run import plan as plan_module
 from bench.run import run as run_module
-from bench.run.plan import check_plan, kind, refusal, times
+from bench.run.plan import check_plan, kind, refusal, refusals, times
 from bench.train import main as train_main
 from tests import tiny
 from tests.run.driving import command
@@ -31,7 +32,7 @@ class Mine:
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusal", lambda config: "")
+    monkeypatch.setattr(run_module, "refusals", lambda configs: [""])
     return tmp_path / "r"
 
 
@@ -131,12 +132,38 @@ def run(total=10.0, *, status="ok", renderer="dist", task="completion", scale="s
     } | more  # fmt: skip
 
 
-def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_time():
-    unlike = [run(1.0, task="pose"), run(1.0, renderer="dvr"), run(1.0, scale="desk"), run(1.0, method="dist_mask")]
+@pytest.fixture
+def times_of(tmp_path, monkeypatch):
+    """The times of finished runs that are like one that is planned, and how many records were read for them."""
+
+    def of(runs: list[dict], **like) -> tuple[list[float], int]:
+        folders, read = {}, []
+        for number, one in enumerate(runs):
+            named = [one["task"], one["renderer"], "sofa", one["method"].replace("/", "_")]
+            folders["-".join([*filter(None, named), f"{number:012x}"])] = one
+        monkeypatch.setattr(plan_module, "run_folders", lambda _: [tmp_path / name for name in folders])
+        monkeypatch.setattr(plan_module, "read_run", lambda at, _: (read.append(at), (folders[at.name], ""))[1])
+        one = run(**like)
+        cells = [PlannedCell("c", [], one["task"], one["renderer"], "sofa", 0, one["config"], one["method"])]
+        return times(Plan("p", tmp_path, cells), set())[kind(one)], len(read)
+
+    return of
+
+
+def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_time(times_of):
+    other = [run(1.0, task="pose"), run(1.0, renderer="dvr"), run(1.0, renderer="dist_k_3")]
+    unlike = [run(1.0, scale="desk"), run(1.0, method="dist_mask")]
     broken = [run(1.0, status=status) for status in ("crashed", "killed", "oom", "refused", "not_run")]
     odd = [run(float("inf")), run(None), run(0.0), run(1.0, config={"scale": 3}), run(1.0, config={"scale": None})]
-    assert kind(run()) not in times([*unlike, *broken, *odd])
-    assert times([*unlike, run(2.0), run(3.0, status="timeout")])[kind(run())] == [2.0, 3.0]
+    assert times_of([*other, *unlike, *broken, *odd]) == ([], len([*unlike, *broken, *odd]))
+    assert times_of([*other, run(2.0), run(3.0, status="timeout")]) == ([2.0, 3.0], 2)
+    assert times_of([run(2.0), run(3.0, method="dist/mask")], method="dist/mask") == ([3.0], 1)
+
+
+def test_of_many_like_runs_a_part_is_read(times_of):
+    many = [run(1.0, scale="desk")] * 50 + [run(2.0)] * 200
+    assert times_of(many) == ([2.0] * plan_module.LIKE, 50 + plan_module.LIKE)
+    assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MOST)
 
 
 def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
@@ -185,6 +212,22 @@ def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plai
         (tmp_path / f"{module}.py").write_text(CODE.format(act=act))
         assert refusal(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
     assert capsys.readouterr().out == ""
+
+
+def test_a_class_that_ends_its_process_is_left_to_its_run(plain, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / f"ends_{tmp_path.name}.py").write_text("import os\n" + CODE.format(act="os._exit(3)"))
+    wrong, ends = plain("renderer.steps=0"), plain("renderer=custom", f"renderer._target_=ends_{tmp_path.name}.Mine")
+    assert refusals([wrong]) == [refusal(wrong)] != [""]
+    assert refusals([wrong, ends]) == ["", ""]
+
+
+def test_a_folder_of_the_users_may_say_that_an_experiment_is_a_sweep(results, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '0,1'}}}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    done = command("--config-dir", str(tmp_path), "+experiment=mine", "plan=true", *SMALL, f"results_dir={results}")
+    assert (done.code, done.out.splitlines()[-1][:9]) == (0, "2 planned"), done.err
 
 
 @pytest.fixture

@@ -90,3 +90,28 @@ def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is
     job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
     process._enter(job, *Pipe())
     assert done == [*process.preloaded(), "main"] and "open3d" in done
+
+
+def test_the_server_has_what_runs_need_and_no_more():
+    found = process.beside(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
+    assert found >= {"torch", "open3d", "matplotlib"} and not found & {"dash", "plotly", "hydra", "pandas"}
+
+
+@pytest.mark.parametrize(("arguments", "early"), [
+    ((), True),
+    (("-m", "seed=0,1"), True),
+    (("--help",), False),
+    (("list",), False),
+    (("--cfg", "job"), False),
+    (("isolation=off",), False),
+    (("-m", "hydra/launcher=workers"), False),  # it sets variables of the environment, which come first
+])  # fmt: skip
+def test_the_server_starts_before_the_command_line_is_read_where_that_asks_for_runs(monkeypatch, arguments, early):
+    done, ended = [], []
+    monkeypatch.setattr(process, "warm_up", lambda: done.append(True))
+    monkeypatch.setattr(process, "_early", False)
+    monkeypatch.setattr(process.forkserver._forkserver, "_forkserver_pid", 42)
+    monkeypatch.setattr(process.os, "kill", lambda *of: ended.append(of))
+    process.start_early(arguments)
+    process.leave_server()  # of a command that is refused
+    assert (done, ended) == (([True], [(42, signal.SIGKILL)]) if early else ([], []))

@@ -70,3 +70,13 @@ def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_were_run(tmp_path
         pass
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("[1/4] ok  ") and second.startswith("[2/4, 20.0 s left] ok  ")
+
+
+def test_cells_that_are_reused_take_no_time_that_is_left(tmp_path, capsys, monkeypatch):
+    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    monkeypatch.setattr(sweep, "time", SimpleNamespace(monotonic=count(0.0, 10.0).__next__))
+    ended(tmp_path, "a")
+    with sweep.followed(Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00"), {"c", "d"}):
+        pass
+    assert capsys.readouterr().out.startswith("[1/4, 10.0 s left] ok  ")

@@ -11,6 +11,7 @@ from bench.solve.optimise import DIVERGED, History, OptimiserSettings, Starts, S
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
 from tests.looped import each
+from tests.operations import Operations
 
 CPU = torch.device("cpu")
 POINTS = 7  # evaluations that a toy's loss makes
@@ -42,16 +43,16 @@ class Toy:
     def objective(self):
         return None
 
-    def frame(self):
-        return self.field(), None
+    def camera(self):
+        return None
 
-    def evaluate(self, inputs):
+    def evaluate(self, state):
         return Evaluation({"radius": self.radius.item()})
 
-    def checkpoint(self, inputs):
+    def checkpoint(self, state):
         return {}
 
-    def draw(self, inputs, folder, first, curve, title):
+    def draw(self, folder, states, curve, title):
         pass
 
     def loss(self, iteration):
@@ -126,6 +127,24 @@ def test_the_warm_up_is_neither_counted_nor_part_of_the_first_step():
     assert [line["gradient_evaluations"] for line in history.curve] == [POINTS * n for n in (1, 2, 3, 4)]
     assert history.seconds["warmup"] > 0
     assert gradients[0] == pytest.approx(-4.0)  # d/dr (3 - r)^2 at 1, not twice that
+
+
+def test_terms_and_parameters_are_read_in_one_wait():
+    class Many(Toy):
+        def __post_init__(self):
+            super().__post_init__()
+            self.parameters = [self.radius, *(torch.zeros(2, requires_grad=True) for _ in range(6))]
+
+        def loss(self, iteration):
+            terms = {f"term {number}": term.square().mean() for number, term in enumerate(self.parameters)}
+            return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    problem = Many()
+    with Operations() as counted:
+        history = go(problem, 3)
+    steps = 3 * len(problem.parameters)  # Adam's own counters of them, which are on the CPU wherever parameters are
+    assert counted.waits == {"_local_scalar_dense": steps}
+    assert history.curve[0]["total"] == history.curve[0]["term 0"] == 1.0
 
 
 def test_the_time_of_on_step_is_not_counted(clock):

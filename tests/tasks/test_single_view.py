@@ -1,6 +1,5 @@
 """Shape from one image from the command line: trained, inferred, judged, and the rows that need no network."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,20 +10,27 @@ import torch
 import trimesh
 from PIL import Image
 
+from bench.config import load
+from bench.evaluate.state import State
 from bench.records.read import read_records
 from bench.single_view import baselines, store
-from bench.single_view.baselines import best_shape, mean_shape, most_alike
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
 from bench.single_view.own_image import best_view, filled_share, read_picture
+from bench.solve.latent_code import CodePenalty
+from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import descend, failure_of
 from bench.tasks import single_view
 from bench.tasks.single_view import DEFINITIONS
 from bench.train import main
 from datasets.mesh import Mesh
 from datasets.scene import Split, Truth, see
 from renderers.checks import BadInput
+from renderers.silhouette import Own
 from tests.looped import each
+from tests.reconstruct.test_losses import PAINT, Ball, shot_of
 from tests.run.driving import Outcome, command, record_of
 from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
-from tests.tiny import silent
+from tests.tiny import ball_prior, camera_of, run_of, silent
 
 TINY = (
     "+method=single_view", "dataset=sphere", "scale=smoke", "isolation=off", "threads=1", "task.shapes=3",
@@ -102,9 +108,30 @@ def test_the_code_of_the_prior_is_found_by_the_mask(tmp_path):
     assert done.code == 0, done.err
     record = record_of(done.out)
     assert 0 < record["metrics"]["iou"] <= 1 and record["evaluations"]["value"] > 0
-    curve = (Path(done.out.splitlines()[-1]) / "curve.jsonl").read_text().splitlines()
-    losses = [json.loads(line)["total"] for line in curve]
-    assert len(losses) == 8 and losses[-1] < losses[0]
+    assert len((Path(done.out.splitlines()[-1]) / "curve.jsonl").read_text().splitlines()) == 8
+
+
+@each("factor, radius", [(0.8, 0.4), (1.25, 0.625)])
+def test_a_search_has_succeeded_where_its_silhouette_is_nearer_to_the_mask_though_its_loss_rose(
+    factor, radius, tmp_path
+):
+    prior, camera = ball_prior(0.5), camera_of(48)
+    run = run_of(tmp_path, load("renderer", "dist"), prior, camera)
+    search = MaskSearch(Own(), 10.0, CodePenalty(1.0, "sum"), OptimiserSettings(30, 0.02, "constant"))
+    shot = shot_of(Ball(torch.tensor(factor * 0.5), torch.zeros(3), PAINT), camera)
+    problem = search.problem(shot, run.inputs)
+    history = descend(problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference)
+    assert failure_of(history, problem.evaluate(State(problem.field(), run.inputs))) is None
+    first, last = history.objectives
+    assert first == pytest.approx(abs(covered(radius) - covered(0.5)), abs=0.02) and last < 0.3 * first
+    losses = [line["total"] for line in history.curve]
+    assert (losses[-1] > losses[0]) == (factor < 1)  # hits beside the mask weigh next to nothing
+
+
+def covered(radius: float) -> float:
+    """The share of an image of `camera_of` that a sphere about the origin covers."""
+    tangent = radius / (2.5**2 - radius**2) ** 0.5
+    return np.pi * (tangent / np.tan(np.radians(25))) ** 2 / 4
 
 
 @pytest.fixture(scope="module")

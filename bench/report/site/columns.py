@@ -1,11 +1,13 @@
 """The list of all runs as columns, which the page filters, sorts and searches."""
 
 from collections import Counter
+from collections.abc import Hashable
+from math import isfinite
 from typing import Any
 
 from bench.records.format import plural
 from bench.records.metrics import FIRST, MEASURED, SHOWN
-from bench.records.names import in_order, settings_of, told_apart
+from bench.records.names import Node, in_order, settings_of, told_apart
 from bench.records.record import NEUTRAL_KEYS, as_number, digest, plain, row_name, started
 from bench.report.data.records import (
     OURS,
@@ -57,7 +59,8 @@ def names(records: list[Record]) -> list[str]:
     row that those before it do not, so that what follows from another setting is not repeated; at most `MOST_TOLD`.
     """
     found = [_base_name(record) for record in records]
-    settings = [settings_of(record["config"], IN_COLUMNS) for record in records]
+    known: dict[Hashable, dict[str, str]] = {}
+    settings = [_settings(record["config"], known) for record in records]
     for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
         alike = list(grouped(places, lambda place: str(settings[place])).values())  # most runs of a list have the same
         different = [settings[same[0]] for same in alike]
@@ -67,6 +70,15 @@ def names(records: list[Record]) -> list[str]:
             for place in same:
                 found[place] = name
     return found
+
+
+def _settings(config: dict[str, Any], known: dict[Hashable, dict[str, str]]) -> dict[str, str]:
+    """The settings of a run that may be in its name, made once for runs that share all of them; `known` has these."""
+    kept = {key: value for key, value in config.items() if key not in IN_COLUMNS}
+    parts = tuple((key, value if isinstance(value, Node) else repr(value)) for key, value in kept.items())
+    if parts not in known:
+        known[parts] = settings_of(kept, ())
+    return known[parts]
 
 
 def _base_name(record: Record) -> str:
@@ -158,6 +170,8 @@ def _reason(record: Record) -> str:
 
 def rounded(value: Any) -> int | float | str | None:
     """A number with few digits; one that is not finite as a word, as the page's scripts have it."""
+    if type(value) is float and isfinite(value):
+        return float(f"{value:.{DIGITS}g}")
     known = as_number(value)
     return plain(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
 

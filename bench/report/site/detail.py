@@ -1,9 +1,12 @@
 """What a run's own page shows: what was asked, what happened, numbers, costs, settings, curve and pictures."""
 
+from collections.abc import Hashable, Iterable
+from functools import cache, lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from bench.records.names import flat
+from bench.records.names import Node, flat
 from bench.records.read import ERRORS, NO_TERMS, curve_lines
 from bench.records.record import as_number
 from bench.report.data.records import Record, definition
@@ -33,7 +36,7 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "log": [text(line) for line in record.get("log") or []],
         "metrics": _metrics(record),
         "costs": _costs(record),
-        "environment": [[text(key), text(value)] for key, value in record["environment"].items()],
+        "environment": [(text(key), text(value)) for key, value in record["environment"].items()],
         "settings": settings(record),
         "files": files,
         "pictures": [[name, folder.link(name), ALT.get(name, "")] for name in folder.pictures()],
@@ -43,12 +46,52 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
     }
 
 
-def settings(record: Record) -> list[list[str]]:
+def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
+    """Details of runs by their keys, as a script has them: what most of them share stands once, in `texts`.
+
+    Numbers of entries in `texts` stand for the settings of each top-level key, a row of the machine, the name and the
+    definition of a metric, the names of files, and the lines for Python, where a NUL stands for the folder's name.
+    """
+    numbers: dict[Hashable, int] = {}
+
+    def number(entry: Hashable) -> int:
+        return numbers.setdefault(entry, len(numbers))
+
+    runs = {}
+    for folder, whole in details:
+        parts = groupby(whole["settings"], key=lambda row: row[0].partition(".")[0])
+        runs[folder.key] = whole | {
+            "settings": [number(tuple(rows)) for _, rows in parts],
+            "environment": [number(row) for row in whole["environment"]],
+            "metrics": [[number(name), *values, number(words)] for name, *values, words in whole["metrics"]],
+            "files": number(tuple(whole["files"])),
+            "python": number(whole["python"].replace(f'"{folder.name}"', '"\0"')),
+        }
+    return {"texts": list(numbers), "runs": runs}
+
+
+def settings(record: Record) -> list[tuple[str, str]]:
     """All settings of the run by dotted keys, what decides it first."""
-    known = flat({key: value for key, value in record["config"].items() if key != "results_dir"})
-    place = {key: number for number, key in enumerate(("task", "renderer", "dataset", *TOP))}
-    keys = sorted(known, key=lambda key: (place.get(key.split(".")[0], len(place)), key))
-    return [[key, text(known[key])] for key in keys]
+    rows: list[tuple[str, str]] = []
+    for key, value in sorted(record["config"].items(), key=lambda item: _place(item[0])):
+        if key != "results_dir":
+            rows += _shared_rows(key, value) if isinstance(value, Node) else _rows(key, value)
+    return rows
+
+
+def _rows(key: str, value: Any) -> list[tuple[str, str]]:
+    known = flat({key: value}) if isinstance(value, dict) else {key: value}
+    return [(key, text(known[key])) for key in sorted(known)]
+
+
+_shared_rows = lru_cache(maxsize=10_000)(_rows)
+
+
+@cache
+def _place(key: str) -> tuple[int, str]:
+    """The place of a key among others."""
+    first = ("task", "renderer", "dataset", *TOP)
+    return first.index(key) if key in first else len(first), f"{key}."  # as the first of its settings
 
 
 def text(value: Any) -> str:
@@ -81,16 +124,15 @@ def _kept(lines: list[dict[str, Any]]) -> list[int]:
 
 
 def _metrics(record: Record) -> list[list[Any]]:
-    names = dict.fromkeys([*record["metrics"], *record["metrics_start"]])
-    return [
-        [
-            name,
-            _value(record["metrics_start"].get(name)),
-            _value(record["metrics"].get(name)),
-            text(definition(record["definitions"], name)),
-        ]
-        for name in names
-    ]
+    names = tuple(dict.fromkeys([*record["metrics"], *record["metrics_start"]]))
+    told = _definitions(tuple((key, text(words)) for key, words in record["definitions"].items()), names)
+    before, after = record["metrics_start"], record["metrics"]
+    return [[name, _value(before.get(name)), _value(after.get(name)), told[name]] for name in names]
+
+
+@lru_cache(maxsize=1000)  # most runs of a task have the same
+def _definitions(known: tuple[tuple[str, str], ...], names: tuple[str, ...]) -> dict[str, str]:
+    return {name: definition(dict(known), name) for name in names}
 
 
 def _value(value: Any) -> int | float | str | None:

@@ -1,5 +1,7 @@
 """The files of a run that the page links to: those that are there, and lie within the results folder."""
 
+import os
+from functools import cached_property
 from pathlib import Path
 
 from bench.records.record import PICTURES, leads_out
@@ -31,13 +33,21 @@ class Folder:
         """The name of the run's files among those of the page."""
         return key_of(self.name)
 
+    @cached_property
+    def _linked(self) -> dict[str, bool]:
+        """Its files, and whether each is a link."""
+        try:
+            with os.scandir(self.path) as found:
+                return {one.name: one.is_symlink() for one in found if one.is_file()}
+        except OSError:
+            return {}
+
     def has(self, name: str) -> bool:
         """Whether it has this file, and not a link to something outside of the results folder."""
-        path = self.path / name
-        if not path.is_file():
+        if name not in self._linked:
             return False
-        linked = self.linked or path.is_symlink()  # others are not resolved, which takes time
-        return not linked or not leads_out(path, self.results_dir)
+        linked = self.linked or self._linked[name]  # others are not resolved, which takes time
+        return not linked or not leads_out(self.path / name, self.results_dir)
 
     def thumb(self) -> str:
         """The picture that stands for the run; empty without one."""
@@ -45,10 +55,7 @@ class Folder:
 
     def pictures(self) -> list[str]:
         """The names of its pictures, the one that stands for the run first."""
-        try:
-            found = sorted(p.name for p in self.path.iterdir() if p.suffix in SUFFIXES and self.has(p.name))
-        except OSError:
-            return []
+        found = sorted(name for name in self._linked if Path(name).suffix in SUFFIXES and self.has(name))
         return sorted(found, key=lambda name: PICTURES.index(name) if name in PICTURES else len(PICTURES))
 
     def link(self, name: str) -> str:
@@ -57,4 +64,5 @@ class Folder:
 
     def links(self) -> dict[str, str]:
         """The addresses of the files that every run may have, by their names."""
-        return {name: self.link(name) for name in FILES if self.has(name)}
+        folder = self.link("")
+        return {name: folder + name for name in FILES if self.has(name)}

@@ -8,10 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
+
 from bench.records.read import check_results, read_records
 from bench.records.record import file_lock, plain, write_bytes, write_text
+from bench.report.data.records import grouped
 from bench.report.site.columns import columns
-from bench.report.site.detail import detail
+from bench.report.site.detail import bundle, detail
 from bench.report.site.files import Folder
 from bench.report.write.paper import papers
 
@@ -26,7 +29,7 @@ SCRIPTS = (  # in the order in which they need each other
 )
 START = "app.js"  # after the data
 LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
-MOST_MESHES = 500  # of the newest runs; `bench.report meshes=all` makes all
+MOST_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
 # Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src 'self' file: data:; "
@@ -35,7 +38,10 @@ POLICY = (
 
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
-KEY = re.compile(r"[0-9a-f]{16}\.js")  # of the files with details
+KEY = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
+BEGINNING = (
+    2  # letters of the keys of runs whose details are in one file: small files take more of a disk than they have
+)
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
@@ -49,20 +55,37 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
         ValueError: if `results_dir` is not a folder, or one that the page is written to is a link out of it.
     """
     check_results(results_dir)
-    with file_lock(results_dir, FOLDER):  # of two sweeps that end, the last one's page has the runs of both
-        records, problems = read_records(results_dir)
-        data, page = results_dir / FOLDER / "data", results_dir / "index.html"
-        folders = [Folder(results_dir, record["folder"]) for record in records]
-        entries, wholes = papers(results_dir)
-        _copy_assets(results_dir / FOLDER)
-        runs = zip(folders, records, strict=True)
-        _write_all(data, "run", ((folder.key, detail(record, folder, results_dir)) for folder, record in runs))
-        _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
-        _write_all(data, "paper", wholes.items())
-        lists = {"about": {"problems": problems}, "papers": entries, "runs": columns(records, folders)}
-        for name, content in lists.items():
-            write_script(data, "list", name, content)
-        write_text(page, shell())
+    with page_lock(results_dir):
+        return write_page(*read_records(results_dir), results_dir, meshes)
+
+
+def page_lock(results_dir: Path) -> FileLock:
+    """Held while records are read and their page is written: of two that write, the last one's has the runs of both."""
+    return file_lock(results_dir, FOLDER)
+
+
+def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: Path, meshes: int | None) -> Path:
+    """Writes the page of records that were read within `page_lock`, as `write_index` does; gives it."""
+    data, page = results_dir / FOLDER / "data", results_dir / "index.html"
+    folders = [Folder(results_dir, record["folder"]) for record in records]
+    entries, wholes = papers(results_dir)
+    _copy_assets(results_dir / FOLDER)
+    bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:BEGINNING])
+    details = (
+        (name, bundle((folder, detail(record, folder, results_dir)) for folder, record in runs))
+        for name, runs in bundles.items()
+    )
+    _write_all(data, "run", details)
+    _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
+    _write_all(data, "paper", wholes.items())
+    lists = {
+        "about": {"problems": problems, "meshes": meshes},
+        "papers": entries,
+        "runs": columns(records, folders),
+    }
+    for name, content in lists.items():
+        write_script(data, "list", name, content)
+    write_text(page, shell())
     return page
 
 
@@ -76,12 +99,16 @@ def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> No
 
 def _write_meshes(folders: list[Folder], data: Path, most: int | None) -> None:
     """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
-    left_out = {"none": f"Made for the newest {most} runs: `python -m bench.report meshes=all` makes all."}
+    kept = []
     for number, folder in enumerate(folders):
         source = folder.path / "mesh.ply"
-        if not _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key):
-            write_script(data, "mesh", folder.key, _mesh(source) if most is None or number < most else left_out)
-    remove_others(data / "mesh", [folder.key for folder in folders])
+        made = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
+        if not made and (most is None or number < most):
+            write_script(data, "mesh", folder.key, _mesh(source))
+            made = True
+        if made:
+            kept.append(folder.key)
+    remove_others(data / "mesh", kept)
 
 
 def _mesh(source: Path) -> dict[str, Any]:

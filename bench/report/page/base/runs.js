@@ -54,6 +54,22 @@
       }
     }
 
+    /* The details of a run: what it shares with others stands once in their script, and has numbers here. */
+    function told({texts, runs}, place) {
+      const run = runs[data.key[place]];
+      return {
+        ...run,
+        settings: run.settings.flatMap((part) => texts[part]),
+        environment: run.environment.map((row) => texts[row]),
+        metrics: run.metrics.map(([name, before, after, words]) => [texts[name], before, after, texts[words]]),
+        files: Object.fromEntries(texts[run.files].map((name) => [name, data.address[place] + name])),
+        python: texts[run.python].replaceAll("\0", data.folder[place]),
+      };
+    }
+
+    const {meshes} = bench.store.have("list", "about");
+    const unmade = `Made for the newest ${meshes} runs: python -m bench.report meshes=all makes all.`;
+
     return {
       ...{count: data.count, tasks: data.tasks, metrics, text, words, name},
       codes: (column) => texts[column].codes,
@@ -63,8 +79,8 @@
       reason: (place) => data.reason[place],
       reused: (place) => reused.has(place),
       place: (wanted) => places.get(wanted),
-      detail: (place) => bench.store.load("run", data.key[place]),
-      mesh: (place) => bench.store.load("mesh", data.key[place]),
+      detail: (place) => bench.store.load("run", data.key[place].slice(0, 2)).then((whole) => told(whole, place)),
+      mesh: (place) => bench.store.load("mesh", data.key[place]).catch((error) => (meshes === null ? Promise.reject(error) : {none: unmade})),
       picture: (place) => text(place, "thumb") && data.address[place] + text(place, "thumb"),
       link: (place) => bench.address.to(["run", name(place)]),
       title: (place) => `${text(place, "name")}, ${text(place, "scene")}`,

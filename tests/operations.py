@@ -1,0 +1,44 @@
+"""PyTorch's operations, counted on a CPU as a GPU would feel them: each is a launch, and some make the host wait."""
+
+from collections import Counter
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+# By the beginning of their names: what only looks at numbers in another way, or only makes room.
+FREE = (
+    *("alias", "as_strided", "chunk", "detach", "diagonal", "empty", "expand", "lift_fresh", "narrow", "new_empty"),
+    *("permute", "reshape", "resize", "select", "slice", "split", "squeeze", "t", "transpose", "unbind", "unfold"),
+    *("unsqueeze", "view", "_reshape_alias", "_unsafe_view"),
+)
+# Whose result, or its size, the host must know before it goes on.
+WAITS = ("nonzero", "_local_scalar_dense", "masked_select", "unique", "is_nonzero", "equal", "repeat_interleave")
+
+
+class Operations(TorchDispatchMode):
+    """Within it operations are counted, those of backward passes too.
+
+    `launches` counts all that compute, `waits` by name those that make the host wait, and `made` how many results of
+    each size in numbers were made, other than in place.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.launches, self.waits, self.made = 0, Counter[str](), Counter[int]()
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = str(function).removeprefix("aten.").split(".")[0]
+        result = function(*args, **(kwargs or {}))
+        if name in FREE:
+            return result
+        self.launches += 1
+        masks = name in ("index", "index_put", "index_put_") and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        if name in WAITS or masks:
+            self.waits[name] += 1
+        if isinstance(result, Tensor) and not function._schema.is_mutable:
+            self.made[result.numel()] += 1
+        return result
