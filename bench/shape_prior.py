@@ -219,7 +219,7 @@ def _sample_points(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "coun
     """Half of the points close to the surface, a third farther from it, the rest anywhere in a sphere."""
     generator = np.random.default_rng(seed)
     near, around = count // 2, count // 3
-    surface, _ = sample_surface(mesh, near + around, seed)
+    surface = sample_surface(mesh, near + around, seed).points
     sigma = np.repeat([NEAR, AROUND], [near, around])[:, None]
     around_surface = surface + sigma * generator.standard_normal(surface.shape)
     free = generator.standard_normal((count - near - around, 3))

@@ -184,7 +184,7 @@ def smoothed(mesh: Mesh) -> Mesh | None:
     if not (found.watertight and found.volume > 0):
         return None
     for near, far in ((mesh, found), (found, mesh)):
-        points, _ = sample_surface(near, 5000, seed=0)
+        points = sample_surface(near, 5000, seed=0).points
         if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
             return None
     return with_note(found, "replaced by its Poisson reconstruction, since its parts do not close into a solid")

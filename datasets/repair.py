@@ -149,7 +149,7 @@ def _merge(mesh: Mesh) -> Mesh | None:
 
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
     """True where at most `OUTSIDE_SHARE` of the mesh's surface lies outside the solid."""
-    points, _ = sample_surface(mesh, 5000, seed=0)
+    points = sample_surface(mesh, 5000, seed=0).points
     outside = Truth(solid).signed_distance(points) > OUTSIDE_BY * mesh.diagonal
     return bool(outside.mean() <= OUTSIDE_SHARE)
 

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 from zlib import crc32
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from datasets.mesh import Mesh
@@ -61,11 +63,17 @@ class Hits:
     face: Int[np.ndarray, " n"]
 
 
-class Surface(NamedTuple):
+@dataclass(frozen=True)
+class Surface:
     """Points sampled on a surface, each with its normal, of which only the direction counts."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The points, ready to be asked for the nearest ones."""
+        return cKDTree(self.points)
 
     def some(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
         """The samples that are kept."""
@@ -187,6 +195,11 @@ class Scene:
     mesh: Mesh
     view: View
     measured: Float[Tensor, "height width"] | None = None
+
+    @cached_property
+    def cast_on(self) -> Truth:
+        """The true shape, for ray casting and signed distances."""
+        return Truth(self.mesh)
 
     def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
         """The view whose depths may be given to a task, and the pixels that have one.

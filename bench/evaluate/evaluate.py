@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bench.evaluate.state import State, coloured_image, colours_at
@@ -197,13 +196,7 @@ def chamfer_only(state: State) -> dict[str, float]:
 def _surface_scores(state: State) -> dict[str, float]:
     inputs, mesh = state.inputs, state.mesh
     found = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
-    truth = true_surface(inputs, inputs.seed)
-    return surface_metrics(found, truth, threshold=inputs.evaluation.fscore_threshold)
-
-
-def true_surface(inputs: RunInputs, seed: int) -> Surface:
-    """Samples of the true surface, as many as metrics use."""
-    return sample_surface(inputs.scene.mesh, inputs.evaluation.points, seed)
+    return surface_metrics(found, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
 
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
@@ -240,7 +233,7 @@ def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[Vi
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:
     """From each source point to the nearest target point: distance, and absolute cosine of the normals."""
-    distance, index = cKDTree(target.points).query(source.points)
+    distance, index = target.tree.query(source.points)
     return distance, np.abs((_unit(source.normals) * _unit(target.normals)[index]).sum(axis=1))
 
 

@@ -33,7 +33,9 @@ class State:
 
     field: Field
     inputs: RunInputs
-    known: dict[tuple[int, int, bytes, bytes], View] = field(default_factory=dict, repr=False, compare=False)
+    known: dict[tuple[int, int, bytes, bytes], View] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def inside(self) -> Shape:

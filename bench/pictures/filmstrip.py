@@ -13,9 +13,9 @@ from torch import Tensor
 
 from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, normals_image, window
-from bench.pictures.style import SCREEN, bare, silhouette_image
+from bench.pictures.style import SCREEN, bare, save, silhouette_image
 from bench.setup.inputs import RunInputs
-from datasets.scene import Truth, View, see
+from datasets.scene import View, see
 from renderers.camera import Camera
 
 MOST = 9  # columns of a strip
@@ -95,14 +95,14 @@ class Filmstrip:
             return
         truth = self._truth()
         strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
-        strip.savefig(folder / "strip.png", dpi=110, bbox_inches="tight")
+        save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
     def _truth(self) -> Shown:
         size = self.inputs.evaluation.picture
         if self.true is None:
-            return Shown(see(Truth(self.inputs.scene.mesh), at_size(self.inputs.scene.view.camera, size)))
+            return Shown(see(self.inputs.scene.cast_on, at_size(self.inputs.scene.view.camera, size)))
         return self.true.enlarged(at_size(self.true.view.camera, size))
 
     def _shown(self, chosen: str | None) -> dict[int | str, Shown]:

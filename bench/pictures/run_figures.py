@@ -19,7 +19,7 @@ from torch import Tensor
 from bench.evaluate.state import State, unseen
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
-from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, silhouette_image
+from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, save, silhouette_image
 from bench.records.read import ERRORS, NO_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -75,7 +75,7 @@ def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: lis
     """
     inputs = states[0].inputs
     front, back = _cameras(inputs, inputs.evaluation.picture)
-    truth = Truth(inputs.scene.mesh)
+    truth = inputs.scene.cast_on
     pairs = (
         *(
             ViewPair(name, state.pictured(front), state.pictured(back))
@@ -83,7 +83,7 @@ def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: lis
         ),
         ViewPair("truth", see(truth, front), see(truth, back)),
     )
-    _summary(pairs, given, title).savefig(folder / "summary.png", dpi=110, bbox_inches="tight")
+    save(_summary(pairs, given, title), folder / "summary.png")
     draw_curve(folder / "curve.png", curve)
 
 
@@ -102,7 +102,7 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     axes[0].set_ylabel("weighted loss")
     if axes[0].lines:
         axes[0].legend(frameon=False)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    save(figure, path)
 
 
 @rc_context(SCREEN)
@@ -117,7 +117,7 @@ def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
     _show_silhouette(both[1])(axes[2], both[0], both)
     axes[2].set_title("silhouette error")
     figure.suptitle(title)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    save(figure, path)
 
 
 @rc_context(SCREEN)
@@ -146,7 +146,7 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
     patches = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in named.items()]
     kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
     figure.suptitle(title)
-    figure.savefig(folder / "failure.png", dpi=110, bbox_inches="tight")
+    save(figure, folder / "failure.png")
 
 
 @rc_context(SCREEN)
@@ -155,7 +155,7 @@ def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
     figure.suptitle(title)
-    figure.savefig(folder / "ladder.png", dpi=110)
+    save(figure, folder / "ladder.png")
 
 
 def save_images(folder: Path, found: View, true: View) -> None:

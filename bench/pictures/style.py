@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from numbers import Real
+from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -42,6 +43,7 @@ RC = {
 }
 # For the pictures in run folders, which are seen on a screen: larger type, no grid.
 SCREEN = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
+SCREEN_DPI = 110  # pixels per inch
 # Pixels of a rendered silhouette compared with the true one: in the true one only, in the rendered one only, in both,
 # in none; and pixels that show a wrong surface.
 MISSED, SPURIOUS, BOTH, PAPER, WRONG = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff", "#f2a600"
@@ -79,6 +81,11 @@ def look(preset: str) -> Look:
 def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:
     """Makes a function draw with `RC`; matplotlib's settings are restored after it."""
     return rc_context(RC)(function)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a picture of a run for a screen, quickly: drawn once, with little compression."""
+    figure.savefig(path, dpi=SCREEN_DPI, pil_kwargs={"compress_level": 1})
 
 
 def log_axis(axes: Axes, letter: str, values: Any) -> None:

@@ -94,10 +94,9 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     if subject.truth is None:
         return {}
     threshold, count = inputs.evaluation.fscore_threshold, inputs.evaluation.points
-    true = sample_surface(subject.truth, count, inputs.seed)
+    true, visible = subject.true_surface(count, inputs.seed)
     found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
     whole = surface_metrics(found, true, threshold=threshold)
-    visible = subject.seen(subject.truth, true)
     part = judged = None
     if mesh is not None and found is not None:
         there = subject.seen(mesh, found)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, draw_curve, normals_image, picture_normals
-from bench.pictures.style import SCREEN, bare
+from bench.pictures.style import SCREEN, bare, save
 from bench.reconstruct.judge import judge_mesh, judged_pixels
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter
@@ -87,14 +87,14 @@ def draw_picture(
             bare(axis)
             axis.set_title(name, fontsize=8)
         figure.suptitle(title)
-        figure.savefig(folder / "summary.png", dpi=110, bbox_inches="tight")
+        save(figure, folder / "summary.png")
 
 
 def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:
     with rc_context(SCREEN):
         figures = {"summary": _summary(seen, inputs, subject, title), "input": _input(subject)}
         for name, figure in figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+            save(figure, folder / f"{name}.png")
     shot = subject.held_out[len(subject.held_out) // 2]
     arrays = {"photograph": shot.colours} | _seen_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
     if len(subject.given) == 1:

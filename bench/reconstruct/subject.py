@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from datasets.photographs import Photography
-from datasets.scene import Surface, Truth, see
+from datasets.scene import Surface, Truth, sample_surface, see
 from datasets.shot import Shot
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
@@ -69,6 +69,18 @@ class Subject:
     held_out: tuple[Shot, ...]
     truth: Mesh | None
     found: str
+    known: dict[tuple[int, int], tuple[Surface, Bool[np.ndarray, " n"]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def true_surface(self, count: int, seed: int) -> tuple[Surface, Bool[np.ndarray, " n"]]:
+        """Samples of the true surface, and which of them a given photograph sees; drawn once."""
+        if self.truth is None:
+            raise ValueError("the true surface of these photographs is not known")
+        if (count, seed) not in self.known:
+            sampled = sample_surface(self.truth, count, seed)
+            self.known[count, seed] = sampled, self.seen(self.truth, sampled)
+        return self.known[count, seed]
 
     def seen(self, mesh: Mesh, sampled: Surface) -> Bool[np.ndarray, " n"]:
         """Which points of a mesh's surface at least one given photograph sees; see `visible`."""

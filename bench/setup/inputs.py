@@ -21,7 +21,7 @@ from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.shape_prior import Prior, PriorSettings, prior_for
 from datasets.own_photographs import Photographed
-from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, make_scene, scene_name
+from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.rendering import Renderer, final_notes
@@ -59,6 +59,11 @@ class RunInputs:
     def scene(self) -> Scene:
         """The scene, made at its first use: not every task needs one."""
         return self.make_scene()
+
+    @cached_property
+    def true_surface(self) -> Surface:
+        """The samples of the true surface that all metrics of the run use."""
+        return sample_surface(self.scene.mesh, self.evaluation.points, self.seed)
 
     @property
     def last_notes(self) -> list[str]:

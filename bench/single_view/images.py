@@ -161,5 +161,5 @@ class Imaging:
 def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:
     """Points in the cube, then points near the surface."""
     draw = np.random.default_rng([seed, 3])
-    near = sample_surface(mesh, POINTS // 2, seed)[0] + NEAR * draw.standard_normal((POINTS // 2, 3))
+    near = sample_surface(mesh, POINTS // 2, seed).points + NEAR * draw.standard_normal((POINTS // 2, 3))
     return np.concatenate([draw.uniform(-CUBE, CUBE, (POINTS - len(near), 3)), near])

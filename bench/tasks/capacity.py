@@ -19,7 +19,6 @@ from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.solve import COSTS, check_field_gradient, note_result
-from datasets.scene import Truth
 from renderers.checks import check_choice, check_positive, check_share
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
@@ -86,7 +85,7 @@ class Capacity:
         check_field_gradient(inputs.renderer)
         record.definitions = DEFINITIONS | COSTS | NEEDS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
-        views = Views(Truth(inputs.scene.mesh), inputs.views, models.views, self, inputs.renderer, inputs.device)
+        views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
         observations = views.observations(inputs.seed)
         with curve_file(run.folder) as write_line:
 

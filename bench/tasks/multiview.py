@@ -13,7 +13,7 @@ from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, solve_task
 from datasets.photographs import Photography
-from datasets.scene import Scene, Truth
+from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import rendered
 from renderers.camera import Rays
@@ -109,7 +109,7 @@ class Multiview:
         check_field_gradient(renderer)
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
-        photographs = self.images.take(Truth(scene.mesh), scene.view.camera.zoomed(self.focal), seed=scene_seed)
+        photographs = self.images.take(scene.cast_on, scene.view.camera.zoomed(self.focal), seed=scene_seed)
         given = GivenPhotographs(self, renderer, photographs, device)
         if len(prior.codes) < 2:
             raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")

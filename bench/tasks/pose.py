@@ -17,7 +17,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
 from bench.solve.solve import Unsupported, solve
-from datasets.scene import Scene, Truth, View, see
+from datasets.scene import Scene, View, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -92,7 +92,7 @@ class PoseTask(ABC):
             scene: the known mesh and the given view.
             own: what the renderer under test sees from the found camera, where there is one.
         """
-        seen, true = see(Truth(scene.mesh), found), scene.view
+        seen, true = see(scene.cast_on, found), scene.view
         images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN))
         metrics = self.metrics(found, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
@@ -166,7 +166,7 @@ def known_shape(settings: Pose, inputs: RunInputs) -> Field:
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
-    values = Truth(inputs.scene.mesh).distance_grid(settings.grid, REACH)
+    values = inputs.scene.cast_on.distance_grid(settings.grid, REACH)
     return Grid(torch.from_numpy(values).to(inputs.device), REACH)
 
 

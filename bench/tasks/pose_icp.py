@@ -12,7 +12,7 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.solve import note_result
 from bench.tasks.pose import SEEN_DEFINITIONS, PoseTask
-from datasets.scene import View, sample_surface
+from datasets.scene import Surface, View, sample_surface
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 
@@ -59,12 +59,12 @@ class PoseICP(PoseTask):
         record.definitions = SEEN_DEFINITIONS | COSTS
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
         record.metrics_start = self.evaluate(cameras[0], inputs.scene).metrics
-        points, normals = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
+        sampled = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
         tried = []
         with run.on_clock():
             for camera in cameras:
                 run.progress("registering points", len(tried), len(cameras))
-                tried.append(self._register(camera, view, points, normals))
+                tried.append(self._register(camera, view, sampled))
         run.progress("registering points", len(tried), len(cameras))
         found, distance = min(tried, key=lambda result: result[1])
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
@@ -73,9 +73,7 @@ class PoseICP(PoseTask):
         failure = (RunStatus.NOT_REACHED, "no point of the depth image came within task.reach of the mesh")
         note_result(run, replace(after, failure=None if np.isfinite(distance) else failure))
 
-    def _register(
-        self, camera: Camera, view: View, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-    ) -> tuple[Camera, float]:
+    def _register(self, camera: Camera, view: View, sampled: Surface) -> tuple[Camera, float]:
         """The camera found from one start, and the mean distance of its points from the known ones."""
         import open3d
 
@@ -86,8 +84,8 @@ class PoseICP(PoseTask):
         }[self.method]()
         seen, known = open3d.geometry.PointCloud(), open3d.geometry.PointCloud()
         seen.points = open3d.utility.Vector3dVector(world_points(view, camera).double().numpy())
-        known.points = open3d.utility.Vector3dVector(points)
-        known.normals = open3d.utility.Vector3dVector(normals)
+        known.points = open3d.utility.Vector3dVector(sampled.points)
+        known.normals = open3d.utility.Vector3dVector(sampled.normals)
         motion = np.eye(4)
         criteria = registration.ICPConvergenceCriteria(max_iteration=self.iterations)
         for reach in self.reach:

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import torch
 
-from bench.evaluate.evaluate import surface_metrics, true_surface
+from bench.evaluate.evaluate import surface_metrics
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior, near_surface_first, sample_distances
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import solve_task
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene, sample_surface, see
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, autograd_gradients
 from renderers.rendering import Renderer
@@ -56,8 +56,8 @@ class PriorFit:
         inputs, record = run.inputs, run.record
         state = solve_task(self, run)
         record.definitions |= DEFINITIONS
-        samples = true_surface(inputs, inputs.seed + 1), true_surface(inputs, inputs.seed)
-        floor = surface_metrics(*samples, threshold=inputs.evaluation.fscore_threshold)
+        again = sample_surface(inputs.scene.mesh, inputs.evaluation.points, inputs.seed + 1)
+        floor = surface_metrics(again, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
         points, distances = sample_distances(inputs.scene.mesh, self.distances, inputs.seed + 1)
         close = distances.abs() < NEAR
         points, distances = points[close].to(inputs.device), distances[close].to(inputs.device)
@@ -73,7 +73,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        found, true = state.pictured(camera), see(Truth(inputs.scene.mesh), camera)
+        found, true = state.pictured(camera), see(inputs.scene.cast_on, camera)
         save_images(run.folder, found, true)
 
     def problem(

@@ -199,7 +199,7 @@ def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
     assert 0 < mesh.volume < 0.01
     assert mesh.repairs[-1].startswith("wrapped: ") and "cut away" in mesh.repairs[-1]
     assert mesh.repairs[:-1] == tuple(warnings_of(mesh)) != ()  # wrapped on both sides: its area doubles
-    points, _ = sample_surface(thin, 500, seed=0)
+    points = sample_surface(thin, 500, seed=0).points
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 0.005
 
 

@@ -156,6 +156,6 @@ def test_a_scan_with_a_tangle_keeps_its_surface(inverted=True):
     mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]) if inverted else tangled, smoothed)
     assert mesh.watertight
     assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
-    points, _ = sample_surface(mesh, 2000, seed=0)
+    points = sample_surface(mesh, 2000, seed=0).points
     assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.01
     assert mesh.volume == pytest.approx(ball.volume, rel=1e-3)

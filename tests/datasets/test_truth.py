@@ -58,7 +58,8 @@ def test_an_open_mesh_has_no_truth(box):
 
 def test_samples_lie_on_the_surface_evenly_by_area_with_outward_normals():
     mesh = from_trimesh(trimesh.creation.box((1, 2, 4)))
-    points, normals = sample_surface(mesh, 20000, seed=0)
+    sampled = sample_surface(mesh, 20000, seed=0)
+    points, normals = sampled.points, sampled.normals
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 1e-6
     assert Truth(mesh).signed_distance(points + 0.01 * normals).min() > 0.009
     shares = np.abs(normals).mean(axis=0)
@@ -68,9 +69,9 @@ def test_samples_lie_on_the_surface_evenly_by_area_with_outward_normals():
 
 
 def test_samples_follow_the_seed(box):
-    assert np.array_equal(sample_surface(box, 10, seed=1)[0], sample_surface(box, 10, seed=1)[0])
-    assert not np.array_equal(sample_surface(box, 10, seed=1)[0], sample_surface(box, 10, seed=2)[0])
-    assert sample_surface(box, 0, seed=1)[0].shape == (0, 3)
+    assert np.array_equal(sample_surface(box, 10, seed=1).points, sample_surface(box, 10, seed=1).points)
+    assert not np.array_equal(sample_surface(box, 10, seed=1).points, sample_surface(box, 10, seed=2).points)
+    assert sample_surface(box, 0, seed=1).points.shape == (0, 3)
     with pytest.raises(ValueError, match="count: must be 0 or more, found -1"):
         sample_surface(box, -1, seed=0)
 

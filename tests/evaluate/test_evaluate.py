@@ -8,9 +8,10 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.evaluate.evaluate import DEFINITIONS, evaluate, render_view
+from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, evaluate, render_view
 from bench.evaluate.state import State
 from bench.setup.inputs import RunInputs
+from datasets.scene import sample_surface
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
 from tests.tiny import ball_prior, camera_of, run_of, scene_of
@@ -75,6 +76,14 @@ def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inpu
     view = state.pictured(inputs.scene.view.camera)
     assert meter.counts.value - asked == view.mask.sum() == inputs.scene.view.mask.sum()
     assert state.pictured(replace(inputs.scene.view.camera)) is view
+
+
+def test_the_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
+    fresh, draws = replace(inputs), []
+    monkeypatch.setattr("bench.setup.inputs.sample_surface", lambda *args: draws.append(args) or sample_surface(*args))
+    scores = [chamfer_only(State(sphere(radius), fresh))["chamfer_l2"] for radius in (0.5, 0.55, RADIUS)]
+    assert len(draws) == 1 and scores == sorted(scores, reverse=True)
+    assert scores[2] == evaluate(State(sphere(RADIUS), inputs)).metrics["chamfer_l2"]
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])

@@ -160,7 +160,7 @@ def plane(tilt: float, *, count: int = 2000, side: float = 1.0) -> Surface:
 def test_roughness_is_the_mean_angle_of_neighbours():
     assert roughness(plane(0)) == 0
     assert roughness(plane(5)) == pytest.approx(5, rel=0.05)  # half of the pairs are 10 degrees apart
-    flipped = plane(0)._replace(normals=plane(0).normals * np.where(np.arange(2000) % 3, 1, -1)[:, None])
+    flipped = replace(plane(0), normals=plane(0).normals * np.where(np.arange(2000) % 3, 1, -1)[:, None])
     assert roughness(flipped) == 0
     assert roughness(plane(5, count=20, side=100.0)) is None  # no neighbours
     assert roughness(plane(5, count=1)) is None
@@ -170,7 +170,7 @@ def test_roughness_is_over_the_seen_and_the_unseen_part_and_less_that_of_the_tru
     bumpy, smooth = plane(8), plane(2)
     seen = bumpy.points[:, 0] < 0.5
     normals = np.where(seen[:, None], smooth.normals, bumpy.normals)
-    scores = roughness_scores((bumpy._replace(normals=normals), seen), (smooth, seen))
+    scores = roughness_scores((replace(bumpy, normals=normals), seen), (smooth, seen))
     assert scores["seen_roughness"] == pytest.approx(0, abs=1e-9)
     assert scores["unseen_roughness"] == pytest.approx(6, rel=0.05)
     whole = np.ones_like(seen)  # without a side that is unseen
