@@ -11,11 +11,14 @@ from PIL import Image
 
 from bench.photos import main
 from datasets.captures.formats import OPENGL, find_layout
-from datasets.captures.hull import hull_mesh, hull_views
+from datasets.captures.hull import carve, hull_mesh, hull_views
 from datasets.captures.take import take
 from datasets.own_photographs import read_capture
+from datasets.shot import Shot
 from datasets.views import look_at
 from renderers.camera import Camera
+from tests.looped import each
+from tests.tiny import camera_of
 
 CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
 SIZE = 40, 48  # height and width
@@ -332,6 +335,19 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     np.savez(tmp_path / "cameras_sphere.npz", **known)
     capture = read_capture(tmp_path, longest=48)
     assert "24 x 20 and 48 x 40 pixels" in capture.summary
+
+
+@each("share", [0.005, 0.3, 0.7])
+def test_the_hull_is_half_less_the_least_mask_between_pixels(share):
+    """Four photographs from one place show one half; a point lies between the last column of it and the next."""
+    camera = camera_of(16)
+    mask = torch.arange(16).expand(16, 16) < 8
+    shots = [Shot(str(place), camera, torch.zeros(16, 16, 3), mask) for place in range(4)]
+    focal, middle = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
+    across = (8.5 - share - middle) / focal  # of a point at depth 1
+    seen = torch.tensor([across, 0.0, 1.0])
+    point = camera.camera_to_world[:3, :3] @ seen + camera.camera_to_world[:3, 3]
+    assert carve(shots, point[None]).item() == pytest.approx(0.5 - share, abs=1e-5)
 
 
 def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):

@@ -84,6 +84,23 @@ def test_a_pixel_near_grazing_does_not_cost_the_others():
     assert found.valid[0]
 
 
+@each("height, valid", [(3e-6, False), (1e-4, True)])
+def test_a_ray_along_a_plane_that_steps_may_lift_into_its_way_is_left_out(height, valid):
+    pixels = torch.tensor([15])
+    origin, along = (
+        part[0] for part in (camera().rays().flat()[pixels].origins, camera().rays().flat()[pixels].directions)
+    )
+    beside = torch.nn.functional.normalize(torch.linalg.cross(along, torch.tensor([1.0, 0, 0]).double()), dim=0)
+    front = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    decoder = union_decoder((beside, (beside @ origin).item() - height), (front, 0.0))
+    decoder.hidden[0].weight[2, 0] = 0.0  # the code moves both planes, by 1e-6 in a step
+    code, directions = torch.zeros(1).double(), torch.ones(1, 1).double()
+    distance = (-origin[2] / along[2])[None]
+    found = differences(decoder, code, directions, camera=camera(), pixels=pixels, distance=distance)
+    assert found.code[0, 0, 0].item() == pytest.approx(-1 / along[2].item(), rel=1e-6)
+    assert found.valid.tolist() == [valid]
+
+
 def passing_decoder(at: float, height: float) -> Decoder:
     """The lesser of 20 z and 0.1 |z - at| + height, in float64: a wall at 0, and something beside the way to it."""
     decoder = Decoder(layers=2, width=4, code_length=0, skip=0, narrow=False).double().requires_grad_(False)

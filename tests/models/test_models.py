@@ -11,6 +11,7 @@ import torch
 from bench.config import load
 from bench.models import candidates as formulas
 from bench.models.candidates import PAPERS, REACH, by_size, candidate
+from bench.models.field import rendered
 from bench.models.fit import SCREENING, Fitter, _slope_error, scattered
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
@@ -441,6 +442,17 @@ def test_a_refit_with_nothing_changed_is_the_fit():
     first, second = fits[1].evidence, refit(fits[1], fitter, DIST, fewest_rays=1.0)
     assert fits[1].previous is fits[0].model
     assert (second.mean, second.evaluations, second.flops) == (first.mean, first.evaluations, first.flops)
+
+
+def test_the_clock_of_a_fit_goes_on_where_its_trial_ended():
+    def line(candidate: str, phase: str, seconds: float) -> dict[str, object]:
+        return {"candidate": candidate, "phase": phase, "part": "growth", "seconds": seconds, "total": seconds}
+
+    trial = [line("box", "warm", 9.0), line("box", "fit", 1.0), line("box", "fit", 2.5)]
+    rest = [line("sphere", "fit", 7.0), line("box", "fit", 0.5), line("box", "fit", 2.0)]  # its own clock
+    curve = rendered([*trial, *rest], "box")
+    assert [one["seconds"] for one in curve] == [1.0, 2.5, 3.0, 4.5]
+    assert [one["iteration"] for one in curve] == [0, 1, 2, 3] and [one["total"] for one in curve] == [1, 2.5, 0.5, 2]
 
 
 def test_a_candidate_begins_from_the_best_that_did_not_fail():

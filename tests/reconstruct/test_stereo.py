@@ -57,6 +57,18 @@ def test_points_lie_on_the_sphere_where_photographs_see_it(sphere):
         assert np.median(facing) < 0.97  # not its middle alone
 
 
+def test_what_one_of_two_photographs_does_not_show_is_not_matched(sphere):
+    """The sphere is larger than either photograph, and what lies beyond a border was matched with black."""
+    cameras = [camera_of(PIXELS, field_of_view=20.0, angles=(turn, 20.0)) for turn in (100.0, 115.0)]
+    shots = SETTINGS.take_from(sphere, cameras, seed=0)
+    for cloud in stereo_clouds(shots, ALL):
+        places = torch.from_numpy(cloud.points).float()
+        assert len(places) > 1000
+        for camera in cameras:
+            pixels, depth = camera.project(places)
+            assert (depth > 0).all() and pixels.min() > -1e-3 and pixels.max() < PIXELS + 1e-3
+
+
 @each(
     "matching, pairs",
     [

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.records.folder import Identity
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus, digest, to_json, write_text
 
@@ -98,6 +99,23 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
     assert problems == []
     assert str([read["metrics"], read["metrics_start"]]) == str([odd, odd])  # where nan is equal to nan
     assert math.isnan(read["gemm_fraction"]) and read["flops"] is None
+
+
+@pytest.mark.parametrize("key", ["path", "image_path", "mask_path"])
+def test_a_run_is_another_one_where_a_file_that_it_reads_has_changed(tmp_path, key):
+    file, other = tmp_path / "file", tmp_path / "other"
+    file.write_text("before")
+    other.write_text("before")
+    names = {"task": "single_view", "renderer": "dist", "dataset": "sofa"}
+
+    def code() -> str:
+        return Identity(names, {"task": {key: str(file), "not_read": str(other)}}).code
+
+    before = code()
+    other.write_text("after")
+    assert code() == before
+    file.write_text("after")
+    assert code() != before
 
 
 def test_a_digest_knows_data_and_not_the_order_of_its_keys():

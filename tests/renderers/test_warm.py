@@ -67,6 +67,15 @@ def test_a_shape_that_moves_is_found_with_fewer_values(warm):
     assert sum(values for _, values in renderings) < 0.7 * cold
 
 
+def test_rays_go_on_along_a_bound_without_a_search(warm):
+    """A fifth of the distance takes five times the steps; a ray that ran out of them would be sampled densely."""
+    balls = [ball(0.5 + 0.002 * i) for i in range(6)]
+    fields = [Shape(lambda p, one=one: 0.2 * one(p), Kind.BOUND) for one in balls]
+    renderings = in_turn(warm, fields)
+    assert max(differing(found, field) for (found, _), field in zip(renderings, fields, strict=True)) <= 1
+    assert max(values for _, values in renderings[1:]) < 0.6 * renderings[0][1]
+
+
 def test_a_field_that_becomes_steep_loses_nothing(warm):
     rod = capsule((-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), 0.03) | box((0.3, 0.01, 0.3))
     fields = [Shape(lambda p, k=k: k * rod(p)) for k in torch.linspace(1, 4, 48).tolist()]

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from omegaconf import OmegaConf
 
 from bench.records.read import RESULTS, Plan, PlannedCell
 from bench.records.record import Record, RunStatus
@@ -70,6 +71,16 @@ def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_were_run(tmp_path
         pass
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("[1/4] ok  ") and second.startswith("[2/4, 20.0 s left] ok  ")
+
+
+@pytest.mark.parametrize(
+    "launcher, workers",
+    [({}, 1), ({"n_jobs": 3}, 3), ({"n_jobs": -1}, 7), ({"n_jobs": None}, 1), ({"array_parallelism": 256}, 256)],
+)
+def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers, monkeypatch):
+    """Joblib takes all processors for -1; submitit has a limit of its own."""
+    monkeypatch.setattr("os.cpu_count", lambda: 7)
+    assert sweep.workers_of(OmegaConf.create({"hydra": {"launcher": launcher}})) == workers
 
 
 def test_cells_that_are_reused_take_no_time_that_is_left(tmp_path, capsys, monkeypatch):
