@@ -132,7 +132,8 @@ class MemoryPeak:
     """Measures the largest rise of memory since the measurement began.
 
     On a GPU, it is memory allocated by PyTorch; else the process's resident set, whose high-water mark Linux lets a
-    process reset. `growth` is None where neither is available.
+    process reset, without pages of files: a process that was forked has those of its libraries when it first uses
+    them. `growth` is None where neither is available.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -142,17 +143,18 @@ class MemoryPeak:
         if device.type == "cuda":
             self.start: int | None = torch.cuda.memory_allocated(device)
         else:
-            self.start = _resident("VmRSS") if able else None
+            self.start = _resident().get("RssAnon") if able else None
 
     def growth(self) -> int | None:
         """The largest rise above the start so far, in bytes."""
         if self.start is None:
             return None
         if self.device.type == "cuda":
-            peak: int | None = torch.cuda.max_memory_allocated(self.device)
+            peak: int = torch.cuda.max_memory_allocated(self.device)
         else:
-            peak = _resident("VmHWM")
-        return None if peak is None else max(peak - self.start, self.earlier)
+            now = _resident()
+            peak = max(now["VmHWM"] - now["RssFile"] - now["RssShmem"], now["RssAnon"])
+        return max(peak - self.start, self.earlier)
 
     @contextmanager
     def pause(self) -> Iterator[None]:
@@ -219,11 +221,10 @@ def doubts(record: Record) -> list[str]:
     return lines
 
 
-def _resident(field: str) -> int | None:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(field + ":"):
-            return int(line.split()[1]) * 1024
-    return None
+def _resident() -> dict[str, int]:
+    """The bytes of this process's resident set: now, by kind, and at most since the last reset (`VmHWM`)."""
+    lines = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
+    return {words[0].rstrip(":"): int(words[1]) * 1024 for words in lines if words[0].startswith(("Rss", "VmHWM"))}
 
 
 def _own_version() -> str:

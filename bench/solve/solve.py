@@ -38,7 +38,7 @@ COSTS = {
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
     "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
-    "peak_memory_bytes": "highest rise, during the loop, of the process's resident memory (CPU) or PyTorch's (GPU)",
+    "peak_memory_bytes": "highest rise, in the loop, of the process's memory without files (CPU) or PyTorch's (GPU)",
     "flops": "evaluations times the field's operations per evaluation, coarse ones included",
     "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
     "coarse values, in bfloat16, over the loop's seconds",

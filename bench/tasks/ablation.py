@@ -49,7 +49,7 @@ DEFINITIONS = {
     "seconds.total": "the whole run, with making or loading shape, network and reference",
     "forward_gemm, step_gemm": "seconds that the floating-point operations take at the machine's peak rate of a matrix "
     "product, in float32 or, of coarse values, in bfloat16, over the median time",
-    "peak_memory_bytes": "largest growth of the process's resident memory (CPU) or of PyTorch's (GPU) in a step",
+    "peak_memory_bytes": "largest growth of the process's memory without files (CPU) or of PyTorch's (GPU) in a step",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
     "rays, hits": "pixels of the image; pixels that the reference hits",
     "wrong": "pixels that both hit, at depths that differ by more than task.wrong",

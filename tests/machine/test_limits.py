@@ -2,6 +2,7 @@
 
 import ctypes
 import itertools
+import mmap
 
 import pytest
 import torch
@@ -123,6 +124,19 @@ def test_a_rise_shows_in_memory_that_the_process_still_holds():
         pytest.skip("the memory of a process cannot be measured here")
     assert 0.9 * 64 * MIB < growth < 1.3 * 64 * MIB
     assert len(blocks) + last.numel() > 0
+
+
+def test_pages_of_files_do_not_count(tmp_path):
+    """A process that was forked has the pages of its libraries when it first uses them."""
+    (tmp_path / "library").write_bytes(bytes(64 * MIB))
+    memory = MemoryPeak(CPU)
+    if memory.growth() is None:
+        pytest.skip("the memory of a process cannot be measured here")
+    with (tmp_path / "library").open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as library:
+        assert not any(library[::4096])
+        block = torch.ones(32 * MIB // 4)
+        assert 30 * MIB < memory.growth() < 48 * MIB
+    assert block.numel()
 
 
 def test_memory_within_a_pause_does_not_count():
