@@ -49,7 +49,9 @@ class Rays:
         return self.origins[..., None, :] + distances[..., None] * self.directions[..., None, :]
 
     def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, " n"]) -> "Rays":
-        return _checked(self.origins[index], self.directions[index])
+        if index.dtype == torch.bool:
+            return _checked(self.origins[index], self.directions[index])
+        return _checked(self.origins.index_select(0, index), self.directions.index_select(0, index))
 
     def to(self, device: torch.device) -> "Rays":
         """The same rays on a device."""
