@@ -74,7 +74,7 @@ def test_the_field_is_asked_near_the_surface_alone(shape, name, share, more, gra
     assert meter.counts.coarse <= more * plain.counts.value
 
 
-@each("name", MARCHES)
+@each("name", [*MARCHES])
 def test_a_thin_plate_is_lost_no_more_often_than_without_coarse_values(name):
     """A plate of four times the error of the values, seen at a slant, in front of a wall."""
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.0, 0.7], [0.0, 0.0, 0.0], [-0.7, 0.0, 0.0]]))
@@ -89,7 +89,7 @@ def test_a_thin_plate_is_lost_no_more_often_than_without_coarse_values(name):
     assert all(lost(Offering(scene, off)) <= lost(scene) + 1 for off in ERRORS.values())
 
 
-@each("name", MARCHES)
+@each("name", [*MARCHES])
 @each("x, status", [(0.0, Status.STARTED_INSIDE), (0.602, Status.MISS)])
 def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status, name):
     """Beside the surface, where coarse values say that it is inside, it looks away."""
@@ -135,7 +135,7 @@ def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
 
 
 @each("behind", [2.0, 0.06])
-@each("name", MARCHES)
+@each("name", [*MARCHES])
 def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind, name):
     """The edge of a small ball, before a wall, so near that coarse rays lie closer than coarse values are exact."""
     y, x = torch.meshgrid(0.047 + 1e-4 * torch.arange(64), 1e-4 * torch.arange(64), indexing="ij")
@@ -218,7 +218,7 @@ def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
     assert wide.at(code).coarse is None
 
 
-@each("name", MARCHES)
+@each("name", [*MARCHES])
 def test_the_gradient_of_a_network_is_that_of_its_field(wide, name):
     """A network near a ball's distance: with coarse values and without, hits and their gradient towards the code."""
     from bench.shape_prior import initialise_to_sphere

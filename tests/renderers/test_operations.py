@@ -73,7 +73,7 @@ def step(name: str, warm: int) -> Count:
     return count
 
 
-@each("name", MOST)
+@each("name", [*MOST])
 @each("warm", [0, 3])
 def test_a_step_takes_no_more_operations_and_waits_than_it_did(name, warm):
     operations, waits = MOST[name]
