@@ -7,6 +7,7 @@ the graph instead.
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +15,8 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
-from renderers.field import Values
+from renderers.field import Values, marcher_of
+from renderers.kernels.decoder import RAYS
 from renderers.rendering import Status
 
 PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
@@ -266,9 +268,7 @@ class Moving:
 Note = Callable[[Tensor, Tensor, Tensor], None]  # of rays: their places in the front, distances and values there
 
 
-def march(
-    values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note = lambda *_: None
-) -> None:
+def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note | None = None) -> None:
     """Moves the front of flat rays [n, 3] by at most `steps` steps, in place.
 
     Args:
@@ -277,13 +277,17 @@ def march(
     if steps < 1:
         return
     moved, every = front.active, not stepping.active_only
+    if note is None and _marched_by_compiled_code(values, rays, front, stepping, steps):
+        front.finish(moved, stepping)
+        return
     index = (front.meets if every else moved).nonzero().squeeze(-1)
     moving, going, fresh = Moving.of(front, rays, stepping, index), moved[index], front.fresh[index]
     for step in range(steps):
         if moving.index.numel() == 0:
             break
         value = values(moving.origins + moving.distance[:, None] * moving.directions)
-        note(moving.index, moving.distance, value)
+        if note is not None:
+            note(moving.index, moving.distance, value)
         after = moving.after(value, stepping, None if step else fresh)
         goes_on = after.goes_on(stepping)
         if every:
@@ -296,6 +300,25 @@ def march(
         moving = after
     front.keep(moving)
     front.finish(moved, stepping)
+
+
+def _marched_by_compiled_code(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int) -> bool:
+    """The loop of `march`, ray by ray, where the field has compiled code for it; False where it is left to PyTorch."""
+    marcher = marcher_of(values)
+    plain = stepping.active_only and not stepping.step_back and front.sample_value.shape[1] == 1
+    if marcher is None or not plain or rays.origins.dtype != torch.float32:
+        return False
+    for name in CHANGING:
+        setattr(front, name, getattr(front, name).contiguous())
+    columns = (front.distance, front.value, front.sample_distance, front.sample_value)
+    columns = (*columns, front.entry - stepping.epsilon, front.leave.contiguous(), front.active, front.fresh)
+    ends = rays.origins.detach().contiguous(), rays.directions.detach().contiguous()
+    bounds = [inf if bound is None else bound for bound in (stepping.extra_step_cap, stepping.step_clamp)]
+    numbers = (stepping.epsilon, stepping.alpha, *bounds, stepping.least_step, stepping.slope)
+    for start in range(0, len(front.distance), RAYS):
+        part = slice(start, start + RAYS)
+        marcher((ends[0][part], ends[1][part]), [column[part] for column in columns], numbers, steps)
+    return True
 
 
 def march_coarse_to_fine(

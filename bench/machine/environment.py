@@ -17,6 +17,7 @@ import torch
 
 from bench.records.record import Record
 from renderers.fields.mlp import multiplies_faster
+from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
 GEMM_SIZE = 1024  # of the square matrices whose product is timed
@@ -55,6 +56,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
+        "kernels": kernels().said,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),

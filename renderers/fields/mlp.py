@@ -17,8 +17,9 @@ from torch.nn.functional import linear
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from renderers.checks import check_at_least
-from renderers.field import Coarse, Flops, Kind, Values, points_in_sphere
+from renderers.field import Coarse, Flops, Kind, Marcher, Values, points_in_sphere
 from renderers.fields.affine import segment_bounds
+from renderers.kernels.decoder import CompiledDecoder, compiled
 
 CACHED = 2**20  # bytes of a layer's features per pass and thread of a CPU: caches hold those of two layers
 AT_ONCE = 2**27  # of the same on a GPU, where each pass is a row of launches
@@ -131,19 +132,38 @@ class BoundDecoder:
         if self.hidden[0][1].dim() > 1:
             return self._forward(points)
         flat = points.reshape(-1, 3)
-        if torch.is_grad_enabled() and self._frozen:
-            biases = tuple(bias for _, bias in self.hidden)
-            if any(tensor.requires_grad for tensor in (flat, *biases)):
-                values = _FrozenDecoder.apply(self, flat, *biases)
-                assert isinstance(values, Tensor)
-                return values.view(points.shape[:-1])
-        chunks = [self._forward(chunk) for chunk in passes(flat, self._width)]
+        wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (flat, *self._tensors))
+        if wanted and self._frozen:
+            values = _FrozenDecoder.apply(self, flat, *(bias for _, bias in self.hidden))
+            assert isinstance(values, Tensor)
+            return values.view(points.shape[:-1])
+        forward = self._forward if wanted else self._quickest(flat)
+        chunks = [forward(chunk) for chunk in passes(flat, self._width)]
         values = torch.cat(chunks) if len(chunks) != 1 else chunks[0]
         return values.view(points.shape[:-1])
 
     @cached_property
     def _width(self) -> int:
         return max(len(weight) for weight, _ in self.hidden)
+
+    @cached_property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return tuple(tensor for layer in (*self.hidden, self.last) for tensor in layer)
+
+    @property
+    def marcher(self) -> Marcher | None:
+        """A march through the field by compiled code, for one code and weights that stay; None where there is none."""
+        return None if self._compiled is None or torch.get_num_threads() > 1 else self._compiled.march
+
+    @cached_property
+    def _compiled(self) -> CompiledDecoder | None:
+        one = self._frozen and self.hidden[0][1].dim() == 1
+        return compiled(self.hidden, self.last, self.skip) if one else None
+
+    def _quickest(self, points: Tensor) -> Values:
+        """The values without a graph: by compiled code where there is some, which is that of one thread."""
+        suits = points.dtype == torch.float32 and points.device.type == "cpu" and torch.get_num_threads() == 1
+        return self._forward if not suits or self._compiled is None else self._compiled.values
 
     def _forward(self, points: Tensor, gates: tuple[Tensor, ...] = ()) -> Tensor:
         """The values; fills `gates`, where given, with True where a ReLU is open."""

@@ -1,0 +1,149 @@
+// Values of a ReLU network at points, without a graph: the layers of a tile of points stay in the first caches.
+// Its plain twin is `BoundDecoder._forward` in renderers/fields/mlp.py.
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16, VECTORS = 4;  // 24 of 32 registers hold sums
+#else
+constexpr int LANES = 8, VECTORS = 2;  // 12 of 16
+#endif
+constexpr int BLOCK = LANES * VECTORS;  // neurons whose weights lie together: [outputs / BLOCK][inputs][BLOCK]
+constexpr int ROWS = 6;                 // points whose sums are in registers
+constexpr int TILE = 8 * ROWS;          // points between two layers
+
+typedef float Vector __attribute__((vector_size(4 * LANES), aligned(4)));
+
+struct Decoder {
+  int layers, skip;              // hidden layers, and the one whose input also has the point; 0 for none
+  const int *inputs, *outputs;   // of each hidden layer; its outputs are a multiple of BLOCK
+  const float *const *weights, *const *biases;
+  const float *last;             // as long as the last hidden layer's outputs
+  float last_bias;
+};
+
+struct Rows {  // features of points, one row each
+  float *start;
+  int stride;
+  float *at(int row) const { return start + (size_t)row * stride; }
+};
+
+// One block of neurons of R points, from inputs to the ReLU of their sums.
+template <int R>
+static inline void block(Rows from, int inputs, const float *weight, const float *bias, Rows to) {
+  Vector sum[R][VECTORS];
+  for (int j = 0; j < VECTORS; j++)
+    for (int r = 0; r < R; r++) sum[r][j] = *(const Vector *)(bias + LANES * j);
+  for (int k = 0; k < inputs; k++, weight += BLOCK) {
+    Vector column[VECTORS];
+    for (int j = 0; j < VECTORS; j++) column[j] = *(const Vector *)(weight + LANES * j);
+#pragma GCC unroll 6
+    for (int r = 0; r < R; r++)
+      for (int j = 0; j < VECTORS; j++) sum[r][j] += from.at(r)[k] * column[j];
+  }
+  for (int r = 0; r < R; r++)
+    for (int j = 0; j < VECTORS; j++)  // not a number stays so, as in PyTorch
+      *(Vector *)(to.at(r) + LANES * j) = sum[r][j] < 0 ? Vector{} : sum[r][j];
+}
+
+static void some(int rows, Rows from, int inputs, const float *weight, const float *bias, Rows to) {
+  switch (rows) {
+    case 6: return block<6>(from, inputs, weight, bias, to);
+    case 5: return block<5>(from, inputs, weight, bias, to);
+    case 4: return block<4>(from, inputs, weight, bias, to);
+    case 3: return block<3>(from, inputs, weight, bias, to);
+    case 2: return block<2>(from, inputs, weight, bias, to);
+    case 1: return block<1>(from, inputs, weight, bias, to);
+  }
+}
+
+static void layer(const Decoder *net, int index, Rows from, int points, Rows to) {
+  int inputs = net->inputs[index];
+  const float *weight = net->weights[index];
+  for (int o = 0; o < net->outputs[index]; o += BLOCK, weight += (size_t)BLOCK * inputs)
+    for (int r = 0; r < points; r += ROWS)
+      some(points - r < ROWS ? points - r : ROWS, {from.at(r), from.stride}, inputs, weight, net->biases[index] + o,
+           {to.at(r) + o, to.stride});
+}
+
+static float sum_last(const Decoder *net, const float *features) {
+  Vector sums = {};
+  for (int k = 0; k < net->outputs[net->layers - 1]; k += LANES)
+    sums += *(const Vector *)(features + k) * *(const Vector *)(net->last + k);
+  float sum = net->last_bias;
+  for (int j = 0; j < LANES; j++) sum += sums[j];
+  return sum;
+}
+
+extern "C" int decoder_block() { return BLOCK; }
+
+extern "C" void decoder_values(const Decoder *net, float *points, int64_t count, float *values) {
+  int stride = 0;
+  for (int l = 0; l < net->layers; l++) stride = net->outputs[l] > stride ? net->outputs[l] : stride;
+  stride += LANES;  // the point stands behind the features
+  std::unique_ptr<float[]> room(new float[2 * (size_t)TILE * stride]);
+  for (int64_t first = 0; first < count; first += TILE) {
+    int some = count - first < TILE ? (int)(count - first) : TILE;
+    Rows given = {points + 3 * first, 3}, from = {room.get(), stride}, to = {from.at(TILE), stride};
+    layer(net, 0, given, some, from);
+    for (int l = 1; l < net->layers; l++) {
+      if (l == net->skip)
+        for (int r = 0; r < some; r++) memcpy(from.at(r) + net->inputs[l] - 3, given.at(r), 3 * sizeof(float));
+      layer(net, l, from, some, to);
+      Rows swapped = from;
+      from = to, to = swapped;
+    }
+    for (int r = 0; r < some; r++) values[first + r] = sum_last(net, from.at(r));
+  }
+}
+
+struct Stepping {
+  float epsilon, alpha, extra_step_cap, step_clamp, least_step, slope;  // see `march.Stepping`; infinite for no bound
+};
+
+struct Front {  // of rays; see `march.Front` and `march.Moving`
+  float *distance, *value, *sample_distance, *sample_value;
+  const float *earliest, *leave;
+  const bool *active, *fresh;
+};
+
+static float within(float number, float bound) { return std::fmin(std::fmax(number, -bound), bound); }
+
+// Moves a ray by the value at its end, and says whether it goes on; the plain twin is `march.Moving.after`.
+static bool advance(const Front *front, int64_t ray, const Stepping *by, float found, bool first) {
+  float value = std::isfinite(found) ? found : NAN, known = std::isfinite(found) ? found : 0, size = std::fabs(value);
+  float reach = within(known / by->slope, by->step_clamp), at = front->distance[ray];
+  float step = reach + within((by->alpha - 1) * reach, by->extra_step_cap);
+  if (by->least_step > 0 && known > 0 && front->value[ray] >= 0) step = std::fmax(step, by->least_step);
+  bool converged = size < by->epsilon, inside = first && front->fresh[ray] && value < 0 && !converged;
+  float moved = inside ? -INFINITY : at + (converged ? known : step);
+  if (size < std::fabs(front->sample_value[ray])) front->sample_value[ray] = value, front->sample_distance[ray] = at;
+  front->distance[ray] = moved, front->value[ray] = value;
+  return moved <= front->leave[ray] && moved >= front->earliest[ray] && size >= by->epsilon;
+}
+
+// Marches each active ray on its own; one that stops leaves its place in the tile to the next. Returns the values asked.
+extern "C" int64_t decoder_march(const Decoder *net, const float *origins, const float *directions, const Front *front,
+                                 const Stepping *by, int64_t count, int steps) {
+  int64_t next = 0, asked = 0, ray[TILE];
+  int done[TILE], rows = 0;
+  float points[3 * TILE], values[TILE];
+  for (;;) {
+    for (; rows < TILE && next < count; next++)
+      if (front->active[next]) ray[rows] = next, done[rows++] = 0;
+    if (!rows) return asked;
+    for (int i = 0; i < 3 * rows; i++) {
+      int64_t r = ray[i / 3], place = 3 * r + i % 3;
+      points[i] = origins[place] + front->distance[r] * directions[place];
+    }
+    decoder_values(net, points, rows, values);
+    asked += rows;
+    int kept = 0;
+    for (int i = 0; i < rows; i++)
+      if (advance(front, ray[i], by, values[i], !done[i]) && done[i] + 1 < steps)
+        ray[kept] = ray[i], done[kept++] = done[i] + 1;
+    rows = kept;
+  }
+}

@@ -1,0 +1,171 @@
+"""Compiled values against their plain twin; and that runs without a compiler do the same more slowly."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.config import load
+from bench.machine.environment import using_threads
+from bench.shape_prior import initialise_to_sphere
+from datasets.views import ViewSampler
+from renderers.camera import Rays
+from renderers.field import Counts, Meter, marcher_of
+from renderers.fields import mlp
+from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.kernels import library
+from renderers.kernels.library import kernels
+from renderers.march import Front, Stepping, march
+from renderers.rendering import Status
+from tests.looped import each
+
+NETWORKS = {
+    "no skip": {"layers": 3, "width": 64, "skip": 0, "narrow": False},
+    "skip": {"layers": 4, "width": 128, "skip": 2, "narrow": False},
+    "odd widths": {"layers": 3, "width": 50, "skip": 1, "narrow": True},
+    "skip last": {"layers": 3, "width": 65, "skip": 2, "narrow": False},
+    "one layer": {"layers": 1, "width": 7, "skip": 0, "narrow": False},
+}
+with_compiler = pytest.mark.skipif(kernels().library is None, reason=f"nothing is compiled here: {kernels().said}")
+
+
+def make(name: str) -> Decoder:
+    torch.manual_seed(0)
+    return Decoder(code_length=4, **NETWORKS[name]).requires_grad_(False)
+
+
+def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
+    """What a new process would find."""
+    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: "", **environment}.items():
+        monkeypatch.setenv(name, value)
+    return kernels.__wrapped__()
+
+
+@with_compiler
+@each("name", NETWORKS)
+@each("count", [0, 1, 5, 6, 47, 48, 301])
+def test_values_are_those_of_torch(name, count):
+    field = make(name).at(torch.linspace(-1, 1, 4))
+    points = 2 * torch.rand(count, 3) - 1
+    with using_threads(1):
+        assert field._quickest(points) == field._compiled.values
+        torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
+        if count > 5:
+            points[2], points[4] = torch.nan, torch.inf
+            assert torch.equal(field(points).isnan(), field._forward(points).isnan()) and field(points).isnan().any()
+
+
+@with_compiler
+def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
+    monkeypatch.setattr(BoundDecoder, "_compiled", property(lambda self: pytest.fail("compiled code was asked")))
+    points, code = torch.rand(5, 3), torch.zeros(4)
+    with using_threads(1):
+        assert make("skip").at(code.clone().requires_grad_())(points).requires_grad
+        assert make("skip").at(code)(points.clone().requires_grad_()).requires_grad
+        assert make("skip").requires_grad_(True).at(code)(points).requires_grad
+        make("skip").double().at(code.double())(points.double())
+    with using_threads(2), torch.no_grad():
+        make("skip").at(code)(points)
+    monkeypatch.undo()
+    with using_threads(1), torch.no_grad():  # weights that may change meanwhile are not copied
+        assert make("skip").requires_grad_(True).at(code)._compiled is None
+
+
+def ball() -> BoundDecoder:
+    decoder = Decoder(layers=4, width=128, code_length=4, skip=2, narrow=False)
+    torch.manual_seed(0)
+    initialise_to_sphere(decoder, radius=0.5)
+    return decoder.requires_grad_(False).at(torch.full((4,), 0.1))
+
+
+def rendered(name: str, **settings) -> tuple[Tensor, Tensor, Counts]:
+    field = Meter(ball(), Counts())
+    rays = ViewSampler(1.2, 70.0, (0.0, 360.0), (15.0, 35.0), 48).camera(30.0, 25.0).rays()
+    with torch.no_grad():
+        rendering = load("renderer", name, **settings).render(field, rays)
+    return rendering.status, rendering.distance, field.counts
+
+
+@with_compiler
+@each(
+    "name, settings",
+    [
+        *((name, {}) for name in ("dist", "newton", "idr", "neus", "relaxed_boundary")),
+        ("dist", {"steps": 6, "coarse_to_fine": False}),
+        ("dist", {"alpha": 1.0, "step_clamp": 0.1, "least_step": 0.01, "sphere_radius": 1.3}),
+        ("dist", {"slope_samples": 100, "extra_step_cap": None}),
+        ("dist", {"n_gradient_samples": 3}),
+        ("dist", {"step_back": True}),
+        ("dist", {"active_only": False}),
+    ],
+)
+def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, settings, monkeypatch):
+    with using_threads(1):
+        status, distance, counts = rendered(name, **settings)
+        monkeypatch.setattr(mlp, "compiled", lambda *_: None)
+        status_of_torch, distance_of_torch, counts_of_torch = rendered(name, **settings)
+        monkeypatch.undo()
+    alike = status == status_of_torch
+    assert (~alike).sum() <= 2 and len(status.unique()) > 1
+    assert counts.value == pytest.approx(counts_of_torch.value, rel=2e-3)
+    assert (distance - distance_of_torch)[alike].abs().quantile(0.99) < 1e-4
+
+
+@with_compiler
+def test_a_march_of_compiled_code_keeps_what_each_ray_knows():
+    """Also where the field is no number, where rays begin inside, and of rays that are not to move."""
+    field, generator = ball(), torch.Generator().manual_seed(2)
+    directions = torch.nn.functional.normalize(torch.randn(5000, 3, generator=generator), dim=-1)
+    rays = Rays(0.9 * torch.rand(5000, 3, generator=generator), directions)
+    fronts = []
+    with using_threads(1):
+        for there in (True, False):
+            front = Front.on_sphere(rays, radius=1.0, samples=1)
+            front.active[::7], front.distance[3] = False, torch.nan
+            assert marcher_of(field) is not None and marcher_of(field.__call__) is None
+            march(field if there else field.__call__, rays, front, Stepping(1e-3, alpha=1.3), 4)
+            fronts.append(vars(front))
+    for name, of_compiled in fronts[0].items():
+        torch.testing.assert_close(of_compiled, fronts[1][name], rtol=1e-4, atol=1e-4, equal_nan=True)
+    assert set(fronts[0]["status"].tolist()) == {int(status) for status in Status}
+
+
+def test_torch_can_be_asked_for_and_nothing_else(monkeypatch, tmp_path):
+    asked = fresh(monkeypatch, tmp_path, **{library.VARIABLE: "torch"})
+    assert (asked.library, asked.said) == (None, f"torch: {library.VARIABLE}=torch")
+    with pytest.raises(ValueError, match=f"{library.VARIABLE} must be torch or compiled, not 'cuda'"):
+        fresh(monkeypatch, tmp_path, **{library.VARIABLE: "cuda"})
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(monkeypatch, tmp_path):
+    monkeypatch.setattr(library, "NEEDED", set())
+    assert fresh(monkeypatch, tmp_path, PATH="").said == "torch: no compiler (g++ or clang++)"
+    broken = tmp_path / "bin" / "g++"
+    broken.parent.mkdir()
+    broken.write_text("#!/bin/sh\necho it is broken >&2\nexit 1\n")
+    broken.chmod(0o755)
+    assert fresh(monkeypatch, tmp_path, PATH=str(broken.parent)).said == "torch: g++: it is broken"
+    file = tmp_path / "file"
+    file.touch()
+    assert fresh(monkeypatch, file, PATH=str(broken.parent)).said.startswith("torch: [Errno")
+    monkeypatch.setattr(library, "NEEDED", {"a-flag-of-none"})
+    assert fresh(monkeypatch, tmp_path).said == "torch: the processor lacks a-flag-of-none"
+
+
+@with_compiler
+def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
+    asked = "from renderers.kernels.library import kernels; print(kernels().said)"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-c", asked]
+    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
+    (built,) = (tmp_path / "implicit-bench" / "kernels").iterdir()
+    whole = built.read_bytes()
+    built.unlink()
+    built.write_bytes(whole[:100])
+    assert fresh(monkeypatch, tmp_path).said == "compiled" and built.stat().st_size > 1000
