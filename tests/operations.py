@@ -1,6 +1,8 @@
 """PyTorch's operations, counted on a CPU as a GPU would feel them: each is a launch, and some make the host wait."""
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -27,11 +29,19 @@ class Operations(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.launches, self.waits, self.made = 0, Counter[str](), Counter[int]()
+        self.paused = False
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Within it nothing is counted."""
+        self.paused = True
+        yield
+        self.paused = False
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = str(function).removeprefix("aten.").split(".")[0]
         result = function(*args, **(kwargs or {}))
-        if name in FREE:
+        if self.paused or name in FREE:
             return result
         self.launches += 1
         masks = name in ("index", "index_put", "index_put_") and any(
