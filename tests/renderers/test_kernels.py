@@ -17,6 +17,7 @@ from renderers.camera import Rays
 from renderers.field import Counts, Meter, marcher_of
 from renderers.fields import mlp
 from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.kernels import decoder as of_decoders
 from renderers.kernels import library
 from renderers.kernels.library import kernels
 from renderers.march import Front, Stepping, march
@@ -30,7 +31,22 @@ NETWORKS = {
     "skip last": {"layers": 3, "width": 65, "skip": 2, "narrow": False},
     "one layer": {"layers": 1, "width": 7, "skip": 0, "narrow": False},
 }
-with_compiler = pytest.mark.skipif(kernels().library is None, reason=f"nothing is compiled here: {kernels().said}")
+
+
+def asked_for() -> library.Kernels:
+    """What a process finds that asks for compiled code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(library.VARIABLE, library.COMPILED)
+        return kernels.__wrapped__()
+
+
+THERE = asked_for()
+with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.said}")
+
+
+@pytest.fixture(autouse=True)
+def compiled_code(monkeypatch):
+    monkeypatch.setattr(of_decoders, "kernels", lambda: THERE)
 
 
 def make(name: str) -> Decoder:
@@ -40,7 +56,7 @@ def make(name: str) -> Decoder:
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
     """What a new process would find."""
-    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: "", **environment}.items():
+    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: library.COMPILED, **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
 
@@ -134,9 +150,10 @@ def test_a_march_of_compiled_code_keeps_what_each_ray_knows():
     assert set(fronts[0]["status"].tolist()) == {int(status) for status in Status}
 
 
-def test_torch_can_be_asked_for_and_nothing_else(monkeypatch, tmp_path):
-    asked = fresh(monkeypatch, tmp_path, **{library.VARIABLE: "torch"})
-    assert (asked.library, asked.said) == (None, f"torch: {library.VARIABLE}=torch")
+def test_torch_is_the_default_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
+    for wanted in ("torch", ""):
+        found = fresh(monkeypatch, tmp_path, **{library.VARIABLE: wanted})
+        assert (found.library, found.said) == (None, "torch")
     with pytest.raises(ValueError, match=f"{library.VARIABLE} must be torch or compiled, not 'cuda'"):
         fresh(monkeypatch, tmp_path, **{library.VARIABLE: "cuda"})
     assert not list(tmp_path.iterdir())
@@ -160,7 +177,7 @@ def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(mo
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
     asked = "from renderers.kernels.library import kernels; print(kernels().said)"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.VARIABLE: library.COMPILED}
     command = [sys.executable, "-c", asked]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
