@@ -9,7 +9,7 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import PATIENT, Field, steepest, values_to_march_on
+from renderers.field import Field, steepest, values_to_march_on
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
@@ -42,9 +42,9 @@ class DIST:
         n_gradient_samples: K, how many samples of least magnitude carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that holds the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.
-        coarse: march on the field's coarse values away from the surface, where it offers any, by at most `PATIENT`
-            times as many steps; see `field.values_to_march_on`. What is lost or found is what would be on values nearer
-            to 0 by twice their error; without a gradient a miss's `closest` is such a value.
+        coarse: march on the field's coarse values away from the surface, where it offers any; see
+            `field.values_to_march_on`. What is lost or found is what would be on values nearer to 0 by twice their
+            error; without a gradient a miss's `closest` is such a value.
     """
 
     steps: int
@@ -105,8 +105,7 @@ class DIST:
     def _trace(self, field: Field, rays: Rays) -> Front:
         given = {setting.name: getattr(self, setting.name) for setting in fields(Stepping) if setting.name != "slope"}
         stepping = Stepping(**given, slope=self._slope(field, rays))
-        values = values_to_march_on(field, self.coarse)
-        steps = self.steps if values is field else PATIENT * self.steps
+        values, steps = values_to_march_on(field, self.steps, coarse=self.coarse)
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
                 values, rays, stepping, steps=steps, radius=self.sphere_radius, samples=self.n_gradient_samples

@@ -15,9 +15,7 @@ from torch import Tensor
 from renderers.camera import rigid
 
 PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
-PATIENT = (
-    2  # times the steps of a march on the field, of one on coarse values, whose steps are shorter near the surface
-)
+PATIENT = 2  # times as many steps are made on coarse values, since these are shorter near the surface
 STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
 
 
@@ -85,15 +83,16 @@ def coarse_of(field: Field) -> Coarse | None:
     return getattr(field, "coarse", None)
 
 
-def values_to_march_on(field: Field, coarse: bool) -> Values:
-    """The values that a march asks for: with `coarse`, of the coarse ones that the field offers what is certain.
+def values_to_march_on(field: Field, steps: int, *, coarse: bool) -> tuple[Values, int]:
+    """The values that a march of at most `steps` steps asks for, and how many steps it makes on them.
 
+    With `coarse` these are what is certain of the coarse values that the field offers, and `PATIENT` times the steps.
     They are nearer to 0 by their error, so that no step is longer than the field's own value would have it. Where no
     more than that error is left, or the coarse value is no number, the field itself is asked: a hit is one of its own.
     """
     offered = coarse_of(field) if coarse else None
     if offered is None:
-        return field
+        return field, steps
 
     def values(points: Tensor) -> Tensor:
         found = offered.values(points)
@@ -101,7 +100,7 @@ def values_to_march_on(field: Field, coarse: bool) -> Values:
         near = (~(certain > offered.error)).nonzero().squeeze(-1)
         return found.sign().mul_(certain).index_copy_(0, near, field(points.index_select(0, near)))
 
-    return values
+    return values, PATIENT * steps
 
 
 # From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.

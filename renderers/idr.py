@@ -6,7 +6,7 @@ import torch
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import PATIENT, Field, values_to_march_on
+from renderers.field import Field, values_to_march_on
 from renderers.gradients import implicit_front
 from renderers.march import Front, Stepping, march
 from renderers.rendering import Rendering
@@ -45,7 +45,6 @@ class IDR(SurfaceRenderer):
         flat = rays.flat()
         with torch.no_grad():
             front = Front.on_sphere(flat, radius=self.sphere_radius, samples=1)
-            values = values_to_march_on(field, self.coarse)
-            steps = self.steps if values is field else PATIENT * self.steps
+            values, steps = values_to_march_on(field, self.steps, coarse=self.coarse)
             march(values, flat, front, Stepping(self.epsilon), steps)
         return implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
