@@ -227,7 +227,7 @@ class _Samples:
             self._ask(~(above > KEPT * fall) & ~(below > KEPT * fall), stride)
             values, known = self.values[_every(stride)], self.known[_every(stride)]
             above, below = np.where(known, values, above), np.where(known, -values, below)
-        outside, inside = (_surely(bound, slope * self.spacing) for bound in (above, below))
+        outside, inside = (_between(bound, slope * self.spacing) > 0 for bound in (above, below))
         self._ask(~outside & ~inside, 1)
         np.copyto(self.values, np.where(inside, np.float32(-1), np.float32(1)), where=~self.known)
 
@@ -301,17 +301,6 @@ def _between(bound: Float[np.ndarray, "n n n"], fall: float) -> Float[np.ndarray
         for axis in np.flatnonzero(odd):
             around = np.maximum(*_neighbours(around, axis))
         finer[tuple(slice(start, None, 2) for start in odd)] = around - fall * sqrt(sum(odd))
-    return finer
-
-
-def _surely(bound: Float[np.ndarray, "n n n"], fall: float) -> Bool[np.ndarray, "m m m"]:
-    """Where the bounds of `_between` are above 0."""
-    finer = np.empty((2 * len(bound) - 1,) * 3, dtype=bool)
-    for odd in product((0, 1), repeat=3):
-        around = bound > fall * sqrt(sum(odd))
-        for axis in np.flatnonzero(odd):
-            around = np.logical_or(*_neighbours(around, axis))
-        finer[tuple(slice(start, None, 2) for start in odd)] = around
     return finer
 
 
