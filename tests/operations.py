@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-# By the beginning of their names: what only looks at numbers in another way, or only makes room.
+# What only looks at numbers in another way, or only makes room.
 FREE = (
     *("alias", "as_strided", "chunk", "detach", "diagonal", "empty", "expand", "lift_fresh", "narrow", "new_empty"),
     *("permute", "reshape", "resize", "select", "slice", "split", "squeeze", "t", "transpose", "unbind", "unfold"),

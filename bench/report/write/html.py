@@ -39,9 +39,8 @@ POLICY = (
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
 KEY = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
-BEGINNING = (
-    2  # letters of the keys of runs whose details are in one file: small files take more of a disk than they have
-)
+# Letters of a run's key: those with the same share a file of details, since a small file takes a whole block of a disk.
+BEGINNING = 2
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
