@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
 from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
@@ -88,25 +88,12 @@ def settings_of(config: dict[str, Any], without: Container[str] = SKIPPED) -> di
 def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
     """The values of nested settings by dotted keys; what lies deeper than `depth` levels is left out, as "…"."""
     values: dict[str, Any] = {}
-
-    def add(node: dict[str, Any], prefix: str, depth: int) -> None:
-        for key, value in node.items():
-            if not isinstance(value, dict):
-                values[f"{prefix}{key}"] = value
-            elif depth and type(value) is Node:
-                values.update(_flat(value, f"{prefix}{key}.", depth - 1))
-            elif depth:
-                add(value, f"{prefix}{key}.", depth - 1)
-            else:
-                values[f"{prefix}{key}"] = "…"
-
-    add(node, prefix, depth)
+    for key, value in node.items():
+        if isinstance(value, dict) and depth:
+            values |= flat(value, f"{prefix}{key}.", depth - 1)
+        else:
+            values[f"{prefix}{key}"] = "…" if isinstance(value, dict) else value
     return values
-
-
-@lru_cache(maxsize=10_000)
-def _flat(node: Node, prefix: str, depth: int) -> dict[str, Any]:
-    return flat(dict(node), prefix, depth)
 
 
 def _parts(
