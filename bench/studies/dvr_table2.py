@@ -53,6 +53,7 @@ ALIKE = {  # rows that are not shown there, since they look as another does
 }
 ARRAYS = ("photograph", "colours", "normals", "hit")
 
+TUNED = "tuned/"  # before the names of methods at tuned settings
 PRESET, AGAIN = "rgb_dist", 3  # the row that `rerendering` shows, where it has a run that ended ok, and its scenes
 SIDES = {  # prefixes in images.npz, see `bench.reconstruct.pictures`; turns are about the vertical axis
     "coarse": "size_0_",
@@ -113,7 +114,7 @@ def _conditions(runs: Runs) -> str:
 
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, one row of those that look alike."""
-    rows = [row for row in runs.rows() if row.preset.removeprefix("tuned/") not in ALIKE] or list(runs.rows())
+    rows = [row for row in runs.rows() if row.preset.removeprefix(TUNED) not in ALIKE] or list(runs.rows())
     every = grouped(runs.records, medians.scene_of)
     shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
     scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
@@ -137,7 +138,7 @@ def figures(runs: Runs) -> Result:
 def rerendering(runs: Runs) -> Result:
     """The shapes of one row in several sizes, from other sides, and under other lights."""
     ended = [row for row, of in runs.rows().items() if any(run["status"] == "ok" for run in of)] or list(runs.rows())
-    row = next((row for row in ended if row.preset == PRESET), ended[0])
+    row = next((row for row in ended if row.preset.removeprefix(TUNED) == PRESET), ended[0])
     of_scene = grouped([record for record in runs.records if row_of(record) == row], medians.scene_of)
     kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
     shown = replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept))
