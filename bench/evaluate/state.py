@@ -1,6 +1,6 @@
 """A field at one moment of a run: its mesh, what cameras see of it, and its colours. Never within a timed phase."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,9 +33,6 @@ class State:
 
     field: Field
     inputs: RunInputs
-    known: dict[tuple[int, int, bytes, bytes], View] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
 
     @property
     def inside(self) -> Shape:
@@ -63,24 +60,17 @@ class State:
 
     def pictured(self, camera: Camera) -> View:
         """What pictures show: the hits of the mesh, a Newton step nearer to the field's surface, with its normals."""
-        key = camera.height, camera.width, _bytes(camera.intrinsics), _bytes(camera.world_to_camera)
-        if key not in self.known:
-            self.known[key] = self._stepped(self.seen(camera))
-        return self.known[key]
-
-    def colours(self, camera: Camera) -> Float[Tensor, "height width 3"] | None:
-        """The colours of what pictures show; None of a field without colours."""
-        if not isinstance(self.field, Coloured):
-            return None
-        return coloured_image(self.field, self.pictured(camera), self.inputs.device)
-
-    def _stepped(self, view: View) -> View:
+        view = self.seen(camera)
         rays = view.camera.rays()[view.mask].to(self.inputs.device)
         distance = view.camera.distance(view.depth)
         moved, gradients = newton_step(self.inside, rays, distance[view.mask].to(rays.origins), self.spacing)
         distance[view.mask], normals = moved.cpu(), torch.zeros_like(view.normals)
         normals[view.mask] = torch.nn.functional.normalize(gradients, dim=-1).cpu()
         return replace(view, depth=view.camera.depth(distance), normals=normals)
+
+    def colours(self, view: View) -> Float[Tensor, "height width 3"] | None:
+        """The colours of what a view shows; None of a field without colours."""
+        return coloured_image(self.field, view, self.inputs.device) if isinstance(self.field, Coloured) else None
 
 
 def newton_step(
@@ -147,7 +137,3 @@ def colours_at(
         with torch.no_grad():
             found.append(field.colours(some, slopes, towards).cpu())
     return torch.cat(found)
-
-
-def _bytes(matrix: Tensor) -> bytes:
-    return matrix.detach().cpu().numpy().tobytes()

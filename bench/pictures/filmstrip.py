@@ -81,8 +81,8 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            camera = at_size(camera, self.inputs.evaluation.picture)
-            self.frames[name] = Shown(state.pictured(camera), state.colours(camera))
+            view = state.pictured(at_size(camera, self.inputs.evaluation.picture))
+            self.frames[name] = Shown(view, state.colours(view))
 
     @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:

@@ -45,7 +45,8 @@ def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: lis
         draw_curve(folder / "curve.png", curve)
 
     def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-        return state.pictured(camera), state.colours(camera)
+        view = state.pictured(camera)
+        return view, state.colours(view)
 
     _save(folder, seen, state.inputs, subject, title)
 
