@@ -70,10 +70,9 @@ def _left_out(name: str) -> Any:
     return function
 
 
-if "open3d" not in sys.modules:
-    stand_in = ModuleType(DRAWINGS)
-    vars(stand_in)["__getattr__"] = _left_out
-    sys.modules.setdefault(DRAWINGS, stand_in)
+stand_in = ModuleType(DRAWINGS)
+vars(stand_in)["__getattr__"] = _left_out
+sys.modules.setdefault(DRAWINGS, stand_in)  # unless Open3D is there already
 
 if foreign := _foreign():
     if sys.argv[:1] == ["-m"]:  # of `python -m bench`, while the command is looked for

@@ -14,7 +14,7 @@ from bench.config import Isolation
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import row_name
-from bench.run.process import beside, reason_of
+from bench.run.process import in_child, reason_of
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
@@ -52,7 +52,7 @@ def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """
     if not configs or any(config["isolation"] == Isolation.off for config in configs):
         return _refusals(configs)
-    return beside(_refusals, configs) or [""] * len(configs)  # a class that ends its process does so in its run too
+    return in_child(_refusals, configs) or [""] * len(configs)  # a class that ends its process does so in its run too
 
 
 def _refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -179,7 +179,7 @@ def leave_server() -> None:
             os.kill(number, signal.SIGKILL)
 
 
-def beside(work: Callable[[Any], Any], argument: Any) -> Any:
+def in_child(work: Callable[[Any], Any], argument: Any) -> Any:
     """What `work` gives for an argument, in a process that branches off from the server; None where that one dies."""
     context = fork_server()
     answers, answer = context.Pipe(duplex=False)
