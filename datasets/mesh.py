@@ -19,7 +19,7 @@ from renderers.field import Field, Kind
 BANDS = ("red", "green", "blue")
 LARGEST = 1e12  # so that squares and cubes of coordinates stay finite in float32
 STRIDES = (4, 2, 1)  # of the lattices of samples
-SLOPE = 2.0  # a field may be so many times as steep as a distance before a part of its surface can be lost
+SLOPE = 3.0  # a field may be so many times as steep as a distance before a part of its surface can be lost
 STEEPER = 1.2  # the same, times the largest slope between neighbouring samples, where that is more
 KEPT = 0.5  # of the slope times the stride: a sample is asked for finer ones where its value may be less
 CHUNK = 65536  # points per evaluation

@@ -105,7 +105,7 @@ class DIST:
     def _trace(self, field: Field, rays: Rays) -> Front:
         given = {setting.name: getattr(self, setting.name) for setting in fields(Stepping) if setting.name != "slope"}
         stepping = Stepping(**given, slope=self._slope(field, rays))
-        values, steps = values_to_march_on(field, self.steps, coarse=self.coarse)
+        values, steps = values_to_march_on(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
                 values, rays, stepping, steps=steps, radius=self.sphere_radius, samples=self.n_gradient_samples

@@ -83,21 +83,22 @@ def coarse_of(field: Field) -> Coarse | None:
     return getattr(field, "coarse", None)
 
 
-def values_to_march_on(field: Field, steps: int, *, coarse: bool) -> tuple[Values, int]:
+def values_to_march_on(field: Field, steps: int, *, epsilon: float, coarse: bool) -> tuple[Values, int]:
     """The values that a march of at most `steps` steps asks for, and how many steps it makes on them.
 
     With `coarse` these are what is certain of the coarse values that the field offers, and `PATIENT` times the steps.
     They are nearer to 0 by their error, so that no step is longer than the field's own value would have it. Where no
-    more than that error is left, or the coarse value is no number, the field itself is asked: a hit is one of its own.
+    more than that error or `epsilon`, below which a ray hits, is left, or the coarse value is not finite, the field
+    itself is asked: a hit is one of its own.
     """
     offered = coarse_of(field) if coarse else None
     if offered is None:
         return field, steps
 
     def values(points: Tensor) -> Tensor:
-        found = offered.values(points)
+        found = offered.values(points).to(points.dtype)
         certain = found.abs() - offered.error
-        near = (~(certain > offered.error)).nonzero().squeeze(-1)
+        near = (~((certain > max(offered.error, epsilon)) & certain.isfinite())).nonzero().squeeze(-1)
         return found.sign().mul_(certain).index_copy_(0, near, field(points.index_select(0, near)))
 
     return values, PATIENT * steps

@@ -45,6 +45,6 @@ class IDR(SurfaceRenderer):
         flat = rays.flat()
         with torch.no_grad():
             front = Front.on_sphere(flat, radius=self.sphere_radius, samples=1)
-            values, steps = values_to_march_on(field, self.steps, coarse=self.coarse)
+            values, steps = values_to_march_on(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
             march(values, flat, front, Stepping(self.epsilon), steps)
         return implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)

@@ -285,7 +285,9 @@ def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: i
     for step in range(steps):
         if moving.index.numel() == 0:
             break
-        value = values(moving.origins + moving.distance[:, None] * moving.directions)
+        # Rays that have ended are asked for as well with `every`: where they left the sphere, not beyond it.
+        at = moving.distance.clamp(moving.earliest, moving.leave) if every else moving.distance
+        value = values(moving.origins + at[:, None] * moving.directions)
         if note is not None:
             note(moving.index, moving.distance, value)
         after = moving.after(value, stepping, None if step else fresh)

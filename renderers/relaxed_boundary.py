@@ -16,6 +16,7 @@ from renderers.silhouette import SurfaceRenderer
 
 # Of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value.
 CANDIDATE = 1.5
+FARTHEST = 1e3  # a value that is larger, or infinite, counts as this one
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class RelaxedBoundary(SurfaceRenderer):
             dips = (values[1] < values[0]) & (values[1] < values[2]) & (values[1] > 0)
             near = (dips & (values[1] < CANDIDATE * self.band) & least[asked].isinf()).nonzero().squeeze(-1)
             if near.numel():
-                place, near = _lowest(places[:, near], values[:, near]), asked[near]
+                place = _lowest(places[:, near], values[:, near].clamp_max(FARTHEST))
+                near = asked[near]
                 there = field(rays[near].at(place))
                 within = (there > self.epsilon) & (there < self.band + self.epsilon)
                 passed[near[within]], least[near[within]] = place[within], there[within]

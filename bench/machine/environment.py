@@ -24,7 +24,7 @@ GEMM_SIZE = 1024  # of the square matrices whose product is timed
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
 CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
-DENORMAL = 1e-39  # a number too small for float32's full precision
+DENORMAL = 713_623  # the bits of 1e-39, a number too small for float32's full precision: as a number it may become 0
 PER_THREAD = 2**15  # numbers of an operation that PyTorch leaves to one thread
 IMPOSSIBLE = 1.2  # times the machine's matrix product rate: above it, the clock did not wait for the device
 
@@ -101,8 +101,8 @@ def flushing_denormals() -> Iterator[None]:
 
 def _denormals_flushed() -> bool:
     """Whether all threads of PyTorch's operations take numbers too small for full precision as 0."""
-    small = torch.full((PER_THREAD * torch.get_num_threads(),), DENORMAL, device="cpu")
-    return not bool((small * 0.5).view(torch.int32).any())  # as integers: a comparison would take them as 0 itself
+    bits = torch.full((PER_THREAD * torch.get_num_threads(),), DENORMAL, dtype=torch.int32, device="cpu")
+    return not bool((bits.view(torch.float32) * 0.5).view(torch.int32).any())  # compared as bits, for the same reason
 
 
 def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32, repeats: int = 5) -> float:

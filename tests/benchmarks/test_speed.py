@@ -4,6 +4,7 @@ Rates are compared within one process: the same weights, camera and threads, and
 """
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 import pytest
 import torch
@@ -67,7 +68,7 @@ def test_rendering_reaches_most_of_the_rate_of_a_matrix_product(benchmark, decod
     peak = max(before, gemm_peak(CPU))
     flops = counts.flops(decoder.at(torch.zeros(decoder.code_length)))
     share = flops / benchmark.stats.stats.median / peak
-    benchmark.extra_info |= {"share_of_gemm": share, "gemm_gflops": peak / 1e9, **vars(counts)}
+    benchmark.extra_info |= {"share_of_gemm": share, "gemm_gflops": peak / 1e9, **asdict(counts)}
     print(f"\n{share:.2f} of {peak / 1e9:.0f} GFLOP/s; {counts}")
     assert share >= SHARE
 

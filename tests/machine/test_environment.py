@@ -68,8 +68,9 @@ def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
 
 def products() -> set[float]:
     """Of a denormal number and one, in each thread of an operation."""
-    small = torch.full((environment.PER_THREAD * torch.get_num_threads(),), environment.DENORMAL)
-    return set((small * 1.0).view(torch.int32).tolist())
+    count = environment.PER_THREAD * torch.get_num_threads()
+    bits = torch.full((count,), environment.DENORMAL, dtype=torch.int32)
+    return set((bits.view(torch.float32) * 1.0).view(torch.int32).tolist())
 
 
 @pytest.mark.skipif(not torch.set_flush_denormal(False), reason="this processor does not round denormals to 0")

@@ -29,6 +29,7 @@ ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
     "too small": lambda points: torch.full_like(points[..., 0], -ERROR),
     "rippled": lambda points: ERROR * (200.0 * points.sum(-1)).sin(),
     "not a number": lambda points: torch.where(points[..., 0] > 0, torch.nan, 0.0),
+    "infinite": lambda points: torch.where(points[..., 0] > 0, torch.inf, 0.0),
 }
 
 
@@ -46,6 +47,27 @@ class Offering(Wrapper):
     def coarse(self) -> Coarse:
         """The coarse values."""
         return Coarse(lambda points: self.inner(points) + self.off(points), ERROR)
+
+
+@each("name", ["dist", "idr"])
+def test_a_hit_is_of_the_field_also_where_its_threshold_is_larger_than_the_error(name):
+    renderer = replace(MARCHES[name], epsilon=2 * ERROR)
+    with torch.no_grad():
+        found = renderer.render(Offering(SHAPES["ring"], ERRORS["too small"]), camera().rays())
+    assert found.residual[found.hit].abs().max() < 2 * ERROR
+
+
+@each("name", MARCHES)
+def test_coarse_values_may_be_of_another_type(name):
+    class Single(Offering):
+        @property
+        def coarse(self) -> Coarse:
+            return Coarse(lambda points: self.inner(points.float()), ERROR)
+
+    rays = camera().rays()
+    doubled = Rays(rays.origins.double(), rays.directions.double())
+    with torch.no_grad():
+        assert MARCHES[name].render(Single(SHAPES["ring"], ERRORS["too large"]), doubled).hit.any()
 
 
 @each("off", ERRORS.values())

@@ -101,6 +101,15 @@ def test_finished_rays_are_asked_only_where_every_ray_is():
     assert active.status.tolist() == [Status.HIT, Status.HIT, Status.MISS, Status.MISS]
 
 
+def test_rays_that_have_ended_are_asked_within_the_sphere():
+    def strict(points):
+        assert points.norm(dim=-1).max() < 1.01
+        return WALL(points)
+
+    within = beam((0, 0, -0.5), (0.6, 0, -2), (0, 0, 0.9))
+    trace(Shape(strict, WALL.kind), within, replace(PLAIN, active_only=False), steps=20)
+
+
 @each(
     "steps, queries",
     [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)],

@@ -87,6 +87,12 @@ def test_a_machine_whose_name_is_no_text_is_written_as_text(results, odd):
     assert bench.load(results).cpu[0] == str(odd)
 
 
+def test_a_column_of_odd_types_is_written_as_pandas_writes_it(tmp_path):
+    records = [record(name, config={"label": label}) for name, label in (("one", "a\rb\nc"), ("two", 1))]
+    write_csv(records, tmp_path / "runs.csv")
+    assert pd.read_csv(tmp_path / "runs.csv")["config.label"].tolist() == ["a\rb\nc", "1"]
+
+
 def test_no_folder_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="there is no such folder"):
         bench.load(tmp_path / "nowhere")

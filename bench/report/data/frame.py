@@ -93,8 +93,9 @@ def _texts(name: str, values: list[Any]) -> tuple[Callable[[list[Any]], list[str
         return _words, values
     if kind == NUMBER and kinds <= {int, float} and not any(map(_huge, values)):
         return _numbers, values
-    written = pd.DataFrame({name: _series(values, kind)}).to_csv(index=False, header=False, lineterminator="\n")
-    return list, [line[0] if line else "" for line in csv.reader(io.StringIO(written))]
+    form = {"index": False, "header": False, "lineterminator": "\n", "quoting": csv.QUOTE_ALL}
+    written = pd.DataFrame({name: _series(values, kind)}).to_csv(**form)
+    return list, [line[0] if line else "" for line in csv.reader(io.StringIO(written, newline=""))]
 
 
 def _words(values: list[Any]) -> list[str]:
