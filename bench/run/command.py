@@ -45,6 +45,7 @@ USAGE = 2  # exit status of a wrong command line
 FAILED = 1
 EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+KERNELS = "IMPLICIT_BENCH_KERNELS"  # see renderers/kernels/library.py, whose import takes that of torch
 
 
 def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
@@ -162,6 +163,8 @@ def _identified(config: DictConfig) -> Identity:
     """The run that a configuration describes; raises ValueError for what needs no torch to be found invalid."""
     register_resolvers()  # again, since a launcher's worker has not read the command line
     hydra = HydraConfig.get()
+    if (asked := os.environ.get(KERNELS)) not in (None, "", "torch", "compiled"):
+        raise ValueError(f"{KERNELS} must be torch or compiled, not {asked!r}: unset it for torch")
     if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
         config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
     return identify(config, hydra.runtime, hydra.overrides.task)

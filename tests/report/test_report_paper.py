@@ -155,7 +155,7 @@ def test_only_what_may_be_compared_is_merged(tmp_path_factory, changed, merged):
     assert ("Not shown: 1 run" in told(table1.make(made))) is not merged
 
 
-@each("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}])
+@each("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}, {"kernels": "compiled"}])
 def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path_factory, other):
     results = tmp_path_factory.mktemp("results")
     write_run(results, "table1", DYNAMIC, metrics=costs())

@@ -105,6 +105,13 @@ def test_the_command_says_so_in_a_line_and_leaves_nothing(bench, tmp_path, no_pr
     assert not list((tmp_path / "r" / "runs").glob("*"))
 
 
+def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, monkeypatch):
+    monkeypatch.setenv("IMPLICIT_BENCH_KERNELS", "quick")
+    status, _, err = bench(*TINY, f"results_dir={tmp_path / 'results'}")
+    assert status == 2 and not (tmp_path / "results").exists()
+    assert_one_line(err, "IMPLICIT_BENCH_KERNELS must be torch or compiled, not 'quick'")
+
+
 def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no_prior):
     (tmp_path / "my conf").mkdir()
     table = tmp_path / "my conf" / "methods.yaml"

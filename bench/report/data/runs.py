@@ -16,6 +16,7 @@ from bench.report.data.frame import to_frame
 from bench.report.data.records import SCALE, Record, Row, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
+COMPILED = "compiled"  # kernels, as a record of the environment has it; others say torch, and why
 
 
 @dataclass(frozen=True)
@@ -132,9 +133,13 @@ class Runs:
         return [(name, value) for name, value in found.items() if isinstance(value, str | int | float)]
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
-        """The names of the runs by the machine that their times depend on: processor, accelerator, threads."""
-        known = [record for record in self.named() if record["environment"]]
-        machines = grouped(known, lambda record: tuple(record["environment"].get(key) for key in MACHINE))
+        """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels."""
+
+        def machine_of(record: Record) -> tuple[Any, ...]:
+            said = record["environment"]
+            return (*(said.get(key) for key in MACHINE), said.get("kernels") == COMPILED)
+
+        machines = grouped([record for record in self.named() if record["environment"]], machine_of)
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:

@@ -133,7 +133,7 @@ def _compared(runs: Runs) -> str:
     if len(machines) < 2:
         return ""
     each = [f"{_machine(*machine) or 'unnamed machine'} ({_listed(rows)})" for machine, rows in machines.items()]
-    return f"Times of rows from different machines or numbers of threads do not compare: {'; '.join(each)}."
+    return f"Times of rows from different machines, numbers of threads or kernels do not compare: {'; '.join(each)}."
 
 
 def _loaded(runs: Runs) -> str:
@@ -145,9 +145,10 @@ def _loaded(runs: Runs) -> str:
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
 
 
-def _machine(cpu: Any, device: Any, threads: Any) -> str:
+def _machine(cpu: Any, device: Any, threads: Any, compiled: bool) -> str:
     parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
-    return "; ".join([" + ".join(parts), *([plural(threads, "thread")] if threads else [])])
+    more = [plural(threads, "thread")] if threads else []
+    return "; ".join([" + ".join(parts), *more, *(["compiled kernels"] if compiled else [])])
 
 
 def _failure(record: Record) -> str:
