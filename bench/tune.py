@@ -28,6 +28,7 @@ from bench.report.tuning import (
     TUNING,
     Tuning,
     left_out,
+    metric_of,
     pooled,
     tunings,
     unfinished,
@@ -35,7 +36,6 @@ from bench.report.tuning import (
 from bench.tables import read_yaml
 
 SELECTIONS = {selection.experiment: selection for selection in (TUNING, ONE_LOSS, PHOTOGRAPHS)}
-ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that a draw is chosen by, where it is not the usual one
 SHARED = "_one_loss"  # the row with the setting that all methods share
 HEAD = "# Settings of methods, chosen on validation shapes. Written by `python -m bench.tune`; do not edit.\n"
 WIDTH = 118  # of its lines
@@ -63,8 +63,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
         raise ValueError(
             f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
         )
-    metric = ERRORS.get(name, CHAMFER)
-    found = tunings(experiment, metric)
+    found = tunings(experiment)
     if not found:
         raise ValueError("no draw has a run on every shape for every method: sweep over them all")
     if len(found[0].draws) < 2:
@@ -75,7 +74,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     for method in found:
         if not is_plain_name(method.method):
             raise ValueError(f"runs name the method {method.method!r}, which is no name of a row: leave these runs out")
-    new = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment, metric) for m in found]
+    new = [_shared(found, experiment)] if name == ONE_LOSS.experiment else [_own(m, experiment) for m in found]
     rows = (read_yaml(path) if path.is_file() else {}) | {row: said | settings for row, said, settings in new}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, HEAD + yaml.safe_dump(rows, sort_keys=False, width=WIDTH))
@@ -83,12 +82,12 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     return left_out(experiment, found) + [f"{path}: {row}: {text}" for row, text in told.items()]
 
 
-def _own(method: Tuning, experiment: Runs, metric: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _own(method: Tuning, experiment: Runs) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """The name of a method's row, what it says, and its settings by dotted key."""
     records = [record for record in experiment.records if record["method"].removeprefix(SPACE) == method.method]
     over = f"on {method.validation.shape[1]} validation runs"
     space = records[0]["method"] if records[0]["method"].startswith(SPACE) else experiment.selection.experiment
-    chosen = _chosen(method, records, space=space, over=over, metric=metric)
+    chosen = _chosen(method, records, space=space, over=over, metric=metric_of(experiment))
     said = {"chosen": chosen, "base": f"/method/{method.method}", "label": f"{method.label}, tuned"}
     return method.method, said, method.settings[method.best]
 

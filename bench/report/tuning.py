@@ -29,7 +29,8 @@ TUNING = Selection("tuning", ("split",))
 ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone, as the next
 PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")
 CHAMFER = "chamfer_l2"
-SPACE = "space/"  # before the names of methods whose settings are drawn
+ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that draws are chosen by, where it is not the usual one
+SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings are drawn; of those written for them
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
 OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
@@ -102,7 +103,12 @@ def unfinished(runs: Runs) -> int:
     return sum(record["status"] in UNFINISHED for record in runs.records)
 
 
-def tunings(runs: Runs, metric: str = CHAMFER) -> list[Tuning]:
+def metric_of(runs: Runs) -> str:
+    """The error that the draws of an experiment are chosen by."""
+    return ERRORS.get(runs.selection.experiment, CHAMFER)
+
+
+def tunings(runs: Runs) -> list[Tuning]:
     """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
 
     Validation shapes are enough: without test shapes `test` has no columns.
@@ -110,7 +116,7 @@ def tunings(runs: Runs, metric: str = CHAMFER) -> list[Tuning]:
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
     keys = sorted({run_key(record) for record in ended})
-    cells = pd.DataFrame([_cell(record, keys, metric) for record in ended])
+    cells = pd.DataFrame([_cell(record, keys, metric_of(runs)) for record in ended])
     if cells.empty:
         return []
     cells = cells[cells.groupby(["split", "draw", "run"]).method.transform("nunique") == len(by_method)]

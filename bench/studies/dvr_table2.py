@@ -6,6 +6,7 @@ import numpy as np
 
 from bench.report.data.records import SCALE, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
+from bench.report.tuning import TUNED
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -53,7 +54,6 @@ ALIKE = {  # rows that are not shown there, since they look as another does
 }
 ARRAYS = ("photograph", "colours", "normals", "hit")
 
-TUNED = "tuned/"  # before the names of methods at tuned settings
 PRESET, AGAIN = "rgb_dist", 3  # the row that `rerendering` shows, where it has a run that ended ok, and its scenes
 SIDES = {  # prefixes in images.npz, see `bench.reconstruct.pictures`; turns are about the vertical axis
     "coarse": "size_0_",

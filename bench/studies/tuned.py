@@ -1,10 +1,10 @@
 """Each method at its defaults, tuned, and at its paper's setting, side by side."""
 
 from bench.report.study import Result, Runs, Selection, compare, table
+from bench.report.tuning import TUNED
 
 PLACE = 38
 READS = (Selection("tuned", ("task.points",)),)
-FOLDER = "tuned/"  # of the presets that `python -m bench.tune` writes
 PAPERS = ("_paper", "_official")  # ends of the names of presets with a paper's setting
 NOTES = (
     compare.ERROR,
@@ -18,7 +18,7 @@ RUNS = (table.FAMILY, table.configured("points", "task", "points"), *table.COMPL
 
 def default_of(preset: str) -> str:
     """The preset of which another is the tuned or the paper's setting."""
-    name = preset.removeprefix(FOLDER)
+    name = preset.removeprefix(TUNED)
     return next((name.removesuffix(end) for end in PAPERS if name.endswith(end)), name)
 
 
@@ -26,7 +26,7 @@ def make(runs: Runs) -> Result:
     """A line per family and row: medians, and the ratio to the method's defaults."""
     found = compare.Compared(runs, default_of)
     lines = [line for line in found.lines if line["family"] in found.families]
-    tuned = [line for line in lines if line["preset"].startswith(FOLDER)]
+    tuned = [line for line in lines if line["preset"].startswith(TUNED)]
     ratios = [(f"{line['row']} on {line['family']}", line["ratio"]) for line in tuned]
     return found.result(
         "Methods at their defaults, tuned, and at their papers' settings.",
@@ -36,7 +36,7 @@ def make(runs: Runs) -> Result:
         remarks=NOTES,
         lines=lines,
         run_columns=RUNS,
-        filled=lambda preset: preset.startswith(FOLDER),
+        filled=lambda preset: preset.startswith(TUNED),
     )
 
 
