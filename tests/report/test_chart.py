@@ -28,6 +28,13 @@ def test_a_row_has_its_preset_s_look_in_the_figure_and_on_the_page():
     assert line.get_label() == "DIST" and list(line.get_ydata()) == [0, 5]
 
 
+def test_positions_with_names_are_evenly_apart_also_where_the_first_has_no_value():
+    drawn = [series("b", "dist", [2.0], [1]), series("c", "idr", [3.0], [8])]
+    assert not panel_data("", "x", "", drawn, rows=list("abcdefghi"))["y"]["log"]
+    crossed = [series(each["name"], "dist", each["y"], each["x"]) for each in drawn]
+    assert not panel_data("", "", "y", crossed, ticks=list("abcdefghi"))["x"]["log"]
+
+
 def test_an_axis_is_logarithmic_where_its_values_are_positive_and_spread():
     panel = panel_data("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
     assert panel["x"] == {"title": "x", "log": True} and panel["y"] == {"title": "y", "log": False}

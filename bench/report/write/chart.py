@@ -48,14 +48,16 @@ def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
 def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
     """A panel of a chart; an axis is logarithmic where its values are positive and span a factor above 3.
 
+    Positions that have names are not: where the first one has no value, the others are positive.
+
     Args:
         x, y: what its axes carry, with the unit.
         more: what the page reads as well; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
     """
     axes = {}
-    for letter, name in (("x", x), ("y", y)):
+    for letter, name, names in (("x", x, "ticks"), ("y", y, "rows")):
         values = [v for each in series for v in each[letter] if math.isfinite(v)]
-        log = bool(values) and min(values) > 0 and max(values) / min(values) > 3
+        log = names not in more and bool(values) and min(values) > 0 and max(values) / min(values) > 3
         axes[letter] = {"title": name, "log": log}
     return {"title": title, **axes, "series": series, **more}
 
