@@ -11,6 +11,7 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.field import Field, Meter, carries_gradient
 from renderers.rendering import Guided, Observed, Renderer, Rendering
+from renderers.waits import Late
 
 PARTS = ("distance", "status", "points", "residual", "closest")
 TOWARDS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
@@ -38,7 +39,7 @@ def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
     if (lacked := _lacked(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
         raise _no_gradient(renderer, lacked, "the distances of its hits carry")
     if isinstance(field, Meter):
-        field.counts.hits += int(rendering.hit.sum())
+        Late.add(field.counts, "hits", rendering.hit.sum())
     return rendering
 
 

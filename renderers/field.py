@@ -9,10 +9,11 @@ from math import log
 from typing import Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
+from renderers.waits import Late, active_among
 
 PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
 PATIENT = 2  # times as many steps are made on coarse values, since these are shorter near the surface
@@ -98,7 +99,9 @@ def values_to_march_on(field: Field, steps: int, *, epsilon: float, coarse: bool
     def values(points: Tensor) -> Tensor:
         found = offered.values(points).to(points.dtype)
         certain = found.abs() - offered.error
-        near = (~((certain > max(offered.error, epsilon)) & certain.isfinite())).nonzero().squeeze(-1)
+        near = ~((certain > max(offered.error, epsilon)) & certain.isfinite())
+        active = active_among(len(near))
+        near = (near if active is None else near & active).nonzero().squeeze(-1)
         return found.sign().mul_(certain).index_copy_(0, near, field(points.index_select(0, near)))
 
     return values, PATIENT * steps
@@ -126,23 +129,6 @@ def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
     return bounds
 
 
-class _Late:
-    """A number of `Counts`, 0 at first, that a device may still be counting: who reads it waits, who adds does not."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.place = f"_{name}"
-
-    def __get__(self, counts: "Counts | None", owner: type) -> int:
-        if counts is None:
-            return 0  # the default of the dataclass
-        number = int(vars(counts)[self.place])
-        vars(counts)[self.place] = number
-        return number
-
-    def __set__(self, counts: "Counts", number: int) -> None:
-        vars(counts)[self.place] = number
-
-
 # Moves rays in place by compiled code, see `CompiledDecoder.march`, and gives how many values that took.
 Marcher = Callable[[tuple[Tensor, Tensor], Sequence[Tensor], Sequence[float], int], int]
 
@@ -156,18 +142,23 @@ def marcher_of(values: Values) -> Marcher | None:
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
 
-    `coarse` are points whose value was computed by `Coarse`; they are not in `value`. `hits` are those of the
-    renderings of the metered field that `boundary.rendered` has checked.
+    `coarse` are points whose value was computed by `Coarse`; they are not in `value`. `masked` are in none of these:
+    points of rays that had ended, whose values, coarse or not, were thrown away; see `waits.values_where`. `hits` are
+    those of the renderings of the metered field that `boundary.rendered` has checked.
     """
 
-    value: int = 0
-    gradient: int = cast(int, _Late())
-    hits: int = field(default=0, repr=False, compare=False)
-    coarse: int = 0
+    value: int = cast(int, Late())
+    gradient: int = cast(int, Late())
+    hits: int = field(default=cast(int, Late()), repr=False, compare=False)
+    coarse: int = cast(int, Late())
+    masked: int = field(default=cast(int, Late()), repr=False, compare=False)
 
-    def add_gradient(self, number: Int[Tensor, ""]) -> None:
-        """Adds to `gradient` a number that a device may still be counting."""
-        vars(self)["_gradient"] = vars(self)["_gradient"] + number
+    def add(self, name: str, points: int) -> None:
+        """Adds to `value` or `coarse` those of so many points that are asked for, and the others to `masked`."""
+        active = active_among(points)
+        asked = points if active is None else active.count_nonzero()
+        Late.add(self, name, asked)
+        Late.add(self, "masked", points - asked)
 
     def flops(self, field: Field) -> int | None:
         """The floating-point operations of these evaluations, without coarse ones; None where the field has none."""
@@ -229,7 +220,7 @@ class Meter(Wrapper):
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)
-        self.counts.value += values.numel()
+        self._count_value(values.numel())
         if values.requires_grad:
             values.register_hook(self._count_backward)
         return values
@@ -260,13 +251,13 @@ class Meter(Wrapper):
         return march
 
     def _count_value(self, points: int) -> None:
-        self.counts.value += points
+        self.counts.add("value", points)
 
     def _count_coarse(self, points: int) -> None:
-        self.counts.coarse += points
+        self.counts.add("coarse", points)
 
     def _count_backward(self, gradient: Tensor) -> None:
-        self.counts.add_gradient(gradient.count_nonzero())
+        Late.add(self.counts, "gradient", gradient.count_nonzero())
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ the graph instead.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -18,6 +18,7 @@ from renderers.camera import Rays, sphere_span
 from renderers.field import Values, marcher_of
 from renderers.kernels.decoder import RAYS
 from renderers.rendering import Status
+from renderers.waits import steps_between, values_where
 
 PYRAMID = (4, 2)  # side of a coarse ray's block in pixels, at the first levels (DIST, Sec. 3.2)
 PYRAMID_STEPS = 3  # steps at each of these levels
@@ -141,15 +142,9 @@ class Front:
         child.sample_value = torch.where(keeps, least, child.sample_value)
         return child
 
-    def keep(self, moving: "Moving") -> None:
-        """Takes over where rays are that have moved."""
-        for name in CHANGING:
-            if (column := getattr(moving, name)) is not None:
-                getattr(self, name).index_copy_(0, moving.index, column)
-
     def finish(self, moved: Bool[Tensor, " n"], stepping: Stepping) -> None:
         """Says of the rays that have `moved` where and how they ended, or that they go on."""
-        unsettled = _unsettled(self.value, self.past, stepping)
+        unsettled = _unsettled(self.value.abs(), self.past.T, stepping)
         behind, left = self.distance < self.entry - stepping.epsilon, self.distance > self.leave
         converged = ~unsettled & ~self.value.isnan()
         status = torch.where(left, Status.MISS, Status.OUT_OF_STEPS)
@@ -161,111 +156,116 @@ class Front:
         self.value = self.value.nan_to_num(0.0)
 
 
-CHANGING = ("distance", "value", "sample_distance", "sample_value", "past")  # what a step changes
-
-
 @dataclass(frozen=True)
 class Moving:
-    """Those m rays of a front that go on; a step makes others of them.
+    """Where m rays are, as columns of one table, so that they are chosen in one operation; a step makes another one.
 
     Args:
-        index: their places in the front.
-        earliest: where they enter the sphere, less the threshold of a hit.
-        past: the step that the last value allowed, infinite after a step back; the step taken; and the running slope of
-            the values along the ray (see `Stepping.relaxation`). None where steps are never taken back.
+        table: its rows are: where the rays enter the sphere, less the threshold of a hit; where they leave it; where
+            they are, and the field there; the distances of the samples, and their values. Where steps may be taken
+            back: the step that the last value allowed, infinite after a step back; the step taken; and the running
+            slope of the values along the ray (see `Stepping.relaxation`).
+        samples: of each ray.
     """
 
-    index: Int[Tensor, " m"]
-    origins: Float[Tensor, "m 3"]
-    directions: Float[Tensor, "m 3"]
-    earliest: Float[Tensor, " m"]
-    leave: Float[Tensor, " m"]
-    distance: Float[Tensor, " m"]
-    value: Float[Tensor, " m"]
-    sample_distance: Float[Tensor, "m samples"]
-    sample_value: Float[Tensor, "m samples"]
-    past: Float[Tensor, "m 3"] | None
+    table: Float[Tensor, "rows m"]
+    samples: int
 
     @staticmethod
-    def of(front: Front, rays: Rays, stepping: Stepping, index: Int[Tensor, " m"]) -> "Moving":
-        """The rays of a front at these places."""
-        columns = (front.leave, front.distance, front.value, front.sample_distance, front.sample_value)
-        past = front.past if stepping.step_back else None
-        every = torch.arange(len(front.distance), device=index.device)
-        earliest = front.entry - stepping.epsilon
-        return Moving(every, rays.origins, rays.directions, earliest, *columns, past).some(index)
+    def of(front: Front, stepping: Stepping) -> "Moving":
+        """All rays of a front."""
+        ends = torch.stack([front.entry - stepping.epsilon, front.leave, front.distance, front.value])
+        tables = [ends, front.sample_distance.T, front.sample_value.T]
+        tables += [front.past.T] if stepping.step_back else []
+        return Moving(torch.cat(tables), front.sample_value.shape[1])
+
+    def write(self, front: Front) -> None:
+        """Has the front's rays, which are these, be here."""
+        _, _, distance, value, *rest = self.parts
+        front.distance, front.value = distance.squeeze(0), value.squeeze(0)
+        front.sample_distance, front.sample_value, past = (rows.T for rows in rest)
+        front.past = past if past.shape[1] else front.past
+
+    @property
+    def parts(self) -> tuple[Float[Tensor, "_ m"], ...]:
+        """Its rows: four single ones, the samples' distances, their values, and what is past."""
+        samples = self.samples
+        return self.table.split([1, 1, 1, 1, samples, samples, len(self.table) - 4 - 2 * samples])
 
     def some(self, index: Int[Tensor, " k"]) -> "Moving":
         """The same of some of them."""
-        columns: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        present = {name: column.index_select(0, index) for name, column in columns.items() if column is not None}
-        return Moving(**columns | present)
+        return Moving(self.table.index_select(1, index), self.samples)
 
     def where(self, chosen: Bool[Tensor, " m"], other: "Moving") -> "Moving":
         """These where they are chosen, else the others."""
-        changed = {}
-        for name in CHANGING:
-            if (mine := getattr(self, name)) is not None:
-                changed[name] = torch.where(chosen.view(-1, *[1] * (mine.dim() - 1)), mine, getattr(other, name))
-        return replace(self, **changed)
+        return Moving(torch.where(chosen, self.table, other.table), self.samples)
 
-    def after(self, value: Float[Tensor, " m"], stepping: Stepping, fresh: Bool[Tensor, " m"] | None) -> "Moving":
-        """The rays after a step by the field's values at their ends.
+    def after(
+        self, value: Float[Tensor, " m"], stepping: Stepping, fresh: Bool[Tensor, " m"] | None
+    ) -> tuple["Moving", Bool[Tensor, " m"]]:
+        """The rays after a step by the field's values at their ends, and which of them go on.
 
         Where a value is not finite it becomes NaN, and the ray stays.
 
         Args:
             fresh: see `Front`; a ray that turns out to begin inside is put infinitely far back. None for no ray.
         """
-        value = value.nan_to_num(torch.nan, torch.nan, torch.nan)
-        known, past = value.nan_to_num(0.0), self.past
+        value = value.nan_to_num(torch.nan, torch.nan, torch.nan)[None]
+        known, magnitude = value.nan_to_num(0.0), value.abs()
+        earliest, leave, distance, before, places, values, past = self.parts
         length = stepping.length(known)
-        if stepping.relaxation and past is not None:
+        if stepping.relaxation:
             length, past = _relaxed(stepping.reach(known), past, stepping.relaxation)
         if stepping.least_step:
-            onward = (known > 0) & (self.value >= 0)
+            onward = (known > 0) & (before >= 0)
             length = torch.where(onward, length.clamp_min(stepping.least_step), length)
-        magnitude = value.abs()
         converged = magnitude < stepping.epsilon
         step = torch.where(converged, known, length)  # the last query moves the ray without alpha (DIST, Eq. 1)
-        if past is not None:
-            step, past = self._taken_back(stepping.reach(known), step, past)
-        moved = self.distance + step
+        if stepping.step_back:
+            step, past = _taken_back(distance, leave, stepping.reach(known), step, past)
+        moved = distance + step
         if fresh is not None:
             moved = torch.where(fresh & (value < 0) & ~converged, -torch.inf, moved)
-        places, values = self._least(value, magnitude)
-        return replace(self, distance=moved, value=value, sample_distance=places, sample_value=values, past=past)
-
-    def goes_on(self, stepping: Stepping) -> Bool[Tensor, " m"]:
-        """Which rays go on after a step."""
-        within = (self.distance <= self.leave) & (self.distance >= self.earliest)
-        return within & _unsettled(self.value, self.past, stepping)
-
-    def _taken_back(
-        self, reach: Float[Tensor, " m"], step: Float[Tensor, " m"], past: Float[Tensor, "m 3"]
-    ) -> tuple[Float[Tensor, " m"], Float[Tensor, "m 3"]]:
-        """The steps, with a step back where the last two empty spheres do not meet; and what is then past."""
-        safe, gone, rise = past.unbind(dim=1)
-        over = (self.distance + step > self.leave) & (self.distance + reach <= self.leave)
-        step = torch.where(over, reach, step)
-        apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
-        back = torch.where(apart, safe - gone, step)
-        safe = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
-        return back, torch.stack([safe, back, rise], dim=1)
-
-    def _least(
-        self, value: Float[Tensor, " m"], magnitude: Float[Tensor, " m"]
-    ) -> tuple[Float[Tensor, "m samples"], Float[Tensor, "m samples"]]:
-        """The distances and values of the samples, with the one at the ends where it is among the least."""
-        new, at, values, distances = value[:, None], self.distance[:, None], self.sample_value, self.sample_distance
-        closer = magnitude[:, None] < values.abs()
-        if values.shape[1] > 1:  # those behind move on by one
-            new = torch.cat([new, torch.where(closer[:, :-1], values[:, :-1], new)], dim=1)
-            at = torch.cat([at, torch.where(closer[:, :-1], distances[:, :-1], at)], dim=1)
-        return torch.where(closer, at, distances), torch.where(closer, new, values)
+        least = _least(distance, value, magnitude, places, values)
+        after = Moving(torch.cat([earliest, leave, moved, value, *least, past]), self.samples)
+        goes_on = (moved.clamp(earliest, leave) == moved) & _unsettled(magnitude, past, stepping)
+        return after, goes_on.squeeze(0)
 
 
-Note = Callable[[Tensor, Tensor, Tensor], None]  # of rays: their places in the front, distances and values there
+def _taken_back(
+    distance: Float[Tensor, "1 m"],
+    leave: Float[Tensor, "1 m"],
+    reach: Float[Tensor, "1 m"],
+    step: Float[Tensor, "1 m"],
+    past: Float[Tensor, "3 m"],
+) -> tuple[Float[Tensor, "1 m"], Float[Tensor, "3 m"]]:
+    """The steps, with a step back where the last two empty spheres do not meet; and what is then past."""
+    safe, gone, rise = past.split(1)
+    over = (distance + step > leave) & (distance + reach <= leave)
+    step = torch.where(over, reach, step)
+    apart = (gone > safe) & (gone > (safe + reach.abs()) * TOUCHING)
+    back = torch.where(apart, safe - gone, step)
+    safe = torch.where(apart, torch.inf, reach.clamp_min(0))  # where it went back to is known to be safe
+    return back, torch.cat([safe, back, rise])
+
+
+def _least(
+    distance: Float[Tensor, "1 m"],
+    value: Float[Tensor, "1 m"],
+    magnitude: Float[Tensor, "1 m"],
+    distances: Float[Tensor, "samples m"],
+    values: Float[Tensor, "samples m"],
+) -> tuple[Float[Tensor, "samples m"], Float[Tensor, "samples m"]]:
+    """The distances and values of the samples, with a new one where it is among the least."""
+    closer = magnitude < values.abs()
+    if len(values) > 1:  # those behind move on by one
+        value = torch.cat([value, torch.where(closer[:-1], values[:-1], value)])
+        distance = torch.cat([distance, torch.where(closer[:-1], distances[:-1], distance)])
+    return torch.where(closer, distance, distances), torch.where(closer, value, values)
+
+
+# Of rays: their places in the front, and distances and values there, NaN of a ray that has ended.
+Note = Callable[[Tensor, Tensor, Tensor], None]
 
 
 def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int, note: Note | None = None) -> None:
@@ -280,27 +280,30 @@ def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: i
     if note is None and _marched_by_compiled_code(values, rays, front, stepping, steps):
         front.finish(moved, stepping)
         return
-    index = (front.meets if every else moved).nonzero().squeeze(-1)
-    moving, going, fresh = Moving.of(front, rays, stepping, index), moved[index], front.fresh[index]
+    table, index = Moving.of(front, stepping), (front.meets if every else moved).nonzero().squeeze(-1)
+    moving, going, fresh = table.some(index), moved[index], front.fresh[index]
+    origins, directions, between = rays.origins[index], rays.directions[index], steps_between(index.device)
     for step in range(steps):
-        if moving.index.numel() == 0:
+        if index.numel() == 0:
             break
-        # Rays that have ended are asked for as well with `every`: where they left the sphere, not beyond it.
-        at = moving.distance.clamp(moving.earliest, moving.leave) if every else moving.distance
-        value = values(moving.origins + at[:, None] * moving.directions)
+        some_ended = every or step % between  # these stay, and are asked for where they left the sphere, not beyond it
+        distance = moving.table[2]
+        at = distance.clamp(moving.table[0], moving.table[1]) if some_ended else distance
+        points = origins + at[:, None] * directions
+        value = values_where(going, values, points) if some_ended and not every else values(points)
+        after, goes_on = moving.after(value, stepping, None if step else fresh)
         if note is not None:
-            note(moving.index, moving.distance, value)
-        after = moving.after(value, stepping, None if step else fresh)
-        goes_on = after.goes_on(stepping)
-        if every:
-            moving, going = after.where(going, moving), going & goes_on
+            note(index, distance, torch.where(going, value, torch.nan) if some_ended else value)
+        moving, going = (after.where(going, moving), going & goes_on) if some_ended else (after, goes_on)
+        if every or (step + 1) % between:
             continue
-        onward = goes_on.nonzero().squeeze(-1)
-        if len(onward) < len(goes_on):
-            front.keep(after)
-            after = after.some(onward)
-        moving = after
-    front.keep(moving)
+        onward = going.nonzero().squeeze(-1)
+        if len(onward) < len(index):
+            table.table.index_copy_(1, index, moving.table)
+            index, origins, directions = (kept.index_select(0, onward) for kept in (index, origins, directions))
+            moving, going = moving.some(onward), going.index_select(0, onward)
+    table.table.index_copy_(1, index, moving.table)
+    table.write(front)
     front.finish(moved, stepping)
 
 
@@ -310,7 +313,7 @@ def _marched_by_compiled_code(values: Values, rays: Rays, front: Front, stepping
     plain = stepping.active_only and not stepping.step_back and front.sample_value.shape[1] == 1
     if marcher is None or not plain or rays.origins.dtype != torch.float32:
         return False
-    for name in CHANGING:
+    for name in ("distance", "value", "sample_distance", "sample_value"):
         setattr(front, name, getattr(front, name).contiguous())
     columns = (front.distance, front.value, front.sample_distance, front.sample_value)
     columns = (*columns, front.entry - stepping.epsilon, front.leave.contiguous(), front.active, front.fresh)
@@ -370,23 +373,24 @@ def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[
     return doubled[..., : fine[-2], : fine[-1]].reshape(-1)
 
 
-def _unsettled(value: Float[Tensor, " n"], past: Float[Tensor, "n 3"] | None, stepping: Stepping) -> Bool[Tensor, " n"]:
+def _unsettled(
+    magnitude: Float[Tensor, "*rays"], past: Float[Tensor, "3 n"], stepping: Stepping
+) -> Bool[Tensor, "*rays"]:
     """Which rays have a finite value and have not converged, or went back since."""
-    magnitude = value.abs()
     unsettled = magnitude >= stepping.epsilon
-    if stepping.step_back and past is not None:
-        unsettled |= (magnitude < stepping.epsilon) & past[:, 0].isinf()
+    if stepping.step_back:
+        unsettled |= (magnitude < stepping.epsilon) & past[0].isinf()
     return unsettled
 
 
 def _relaxed(
-    reach: Float[Tensor, " n"], past: Float[Tensor, "n 3"], weight: float
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    reach: Float[Tensor, "1 n"], past: Float[Tensor, "3 n"], weight: float
+) -> tuple[Float[Tensor, "1 n"], Float[Tensor, "3 n"]]:
     """Steps to where the empty sphere of a plane that falls as the values do would touch this one; with its slope."""
-    safe, gone, rise = past.unbind(dim=1)
+    safe, gone, rise = past.split(1)
     onward = (gone > 0) & safe.isfinite()  # after a step back nothing is known of the slope
     last = (reach - safe) / torch.where(onward, gone, 1.0)
     running = torch.lerp(rise, last.clamp(STEEPEST_FALL, -STEEPEST_FALL), weight)
     rise = torch.where(onward, running, STEEPEST_FALL)
     length = torch.where(reach > 0, 2 * reach / (1 - rise.clamp_max(FASTEST_RISE)), reach)
-    return length, torch.stack([safe, gone, rise], dim=1)
+    return length, torch.cat([safe, gone, rise])

@@ -16,6 +16,7 @@ from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Values
 from renderers.march import pyramid
+from renderers.waits import steps_between, values_where
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
 HOLDS = 2.0  # times the distance to the finer rays: with a smaller empty sphere, finer rays begin behind its boundary
@@ -220,22 +221,32 @@ def march(values: Values, rays: Rays, reached: Reached, stride: Stride, steps: i
     index = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
     origins, directions, columns = rays.origins[index], rays.directions[index], reached.table[index].T.contiguous()
     ended: list[tuple[Tensor, Tensor]] = []  # rays that have stopped, and their columns
-    for _ in range(steps):
+    going, between = torch.ones_like(index, dtype=torch.bool), steps_between(index.device)
+    for step in range(steps):
         if index.numel() == 0:
             break
         moving = Moving(*columns)
-        columns, goes_on = moving.after(values(origins + moving.distance[:, None] * directions), stride)
-        going = goes_on.nonzero().squeeze(-1)
-        if len(going) < len(index):
-            stopped = (~goes_on).nonzero().squeeze(-1)
+        if step % between:  # some may have stopped: they stay where they are
+            at = torch.minimum(moving.distance, moving.leave)
+            value = values_where(going, values, origins + at[:, None] * directions)
+            after, goes_on = moving.after(value, stride)
+            columns, going = torch.where(going, after, columns), going & goes_on
+        else:
+            columns, going = moving.after(values(origins + moving.distance[:, None] * directions), stride)
+        if (step + 1) % between:
+            continue
+        onward = going.nonzero().squeeze(-1)
+        if len(onward) < len(index):
+            stopped = (~going).nonzero().squeeze(-1)
             ended.append((index[stopped], columns.index_select(1, stopped)))
-            index, origins, directions = (kept.index_select(0, going) for kept in (index, origins, directions))
-            columns = columns.index_select(1, going)
-    reached.table.index_copy_(0, index, columns.T)
-    if ended:
-        index, stopped = torch.cat([some for some, _ in ended]), Reached(torch.cat([rows for _, rows in ended], 1).T)
-        stopped.note_stops(stride.epsilon)
-        reached.table.index_copy_(0, index, stopped.table)
+            index, origins, directions = (kept.index_select(0, onward) for kept in (index, origins, directions))
+            columns, going = columns.index_select(1, onward), going.index_select(0, onward)
+    on_the_way = torch.nn.functional.pad(going, (sum(len(some) for some, _ in ended), 0))
+    index, columns = (torch.cat(parts, -1) for parts in zip(*ended, (index, columns), strict=True))
+    stopped = Reached(columns.T)
+    stopped.note_stops(stride.epsilon)
+    stopped.stop = torch.where(on_the_way, Stop.ON_THE_WAY, stopped.stop)
+    reached.table.index_copy_(0, index, stopped.table)
 
 
 class Moving(NamedTuple):

@@ -28,6 +28,8 @@ COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
     "evaluations.coarse": "points whose value was computed more cheaply, in bfloat16, where it decides nothing; absent "
     "without any, and not among those of value",
+    "evaluations.masked": "not in these: points of rays that had ended, whose values were computed and thrown away, "
+    "since a march on a GPU looks every eight steps only which rays go on; absent without any",
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
     "evaluations.observed": "pixels whose depth was given",
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
@@ -288,8 +290,7 @@ def note_costs(
 def counted(counts: Counts, field: Field) -> dict[str, float]:
     """Evaluations of a field as they stand in a record; without hits no work is known to be needed."""
     numbers: dict[str, float] = {"value": counts.value, "gradient": counts.gradient}
-    if counts.coarse:
-        numbers["coarse"] = counts.coarse
+    numbers |= {name: number for name in ("coarse", "masked") if (number := getattr(counts, name))}
     if (over_bound := counts.over_bound(field)) is not None:
         numbers["work_over_bound"] = over_bound
     return numbers

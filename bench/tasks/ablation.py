@@ -33,7 +33,8 @@ SMALLER = 8  # factor by which the side of the image shrinks where a limit was r
 WARM_UP = 8  # pixels per side of the image that is rendered before the timing
 DEFINITIONS = {
     "size": "pixels per side of the image for which the other numbers were measured",
-    "queries": "points whose field value was computed in one rendering without gradient; counted at the field",
+    "queries": "points whose field value was computed in one rendering without gradient; counted at the field, without "
+    "those of rays that had ended, which a GPU computes and throws away",
     "coarse_queries, step_coarse_queries": "beside these, points whose value was computed more cheaply, in bfloat16, "
     "where it decides nothing; in a rendering, and in a step",
     "step_queries, step_gradients": "points whose value was computed in a step, and points through whose value a "
