@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
@@ -35,14 +35,23 @@ class Bracket:
         """Half way between both ends."""
         return (self.near + self.far) / 2
 
+    @property
+    def columns(self) -> tuple[Tensor, ...]:
+        """The tensors in the order of the constructor."""
+        return self.near, self.far, self.near_value, self.far_value
+
+    def some(self, index: Int[Tensor, " m"]) -> "Bracket":
+        """The same of some of the rays."""
+        return Bracket(*(column.index_select(0, index) for column in self.columns))
+
+    def replaced(self, index: Int[Tensor, " m"], by: Bool[Tensor, " m"], others: "Bracket") -> "Bracket":
+        """The same with the others, of m of the rays, for those of them that are to be replaced."""
+        pairs = zip(self.columns, others.columns, strict=True)
+        return Bracket(*(mine.index_put((index,), torch.where(by, other, mine[index])) for mine, other in pairs))
+
     def joined(self, other: "Bracket") -> "Bracket":
         """These brackets, and behind them the others."""
-        return Bracket(
-            torch.cat([self.near, other.near]),
-            torch.cat([self.far, other.far]),
-            torch.cat([self.near_value, other.near_value]),
-            torch.cat([self.far_value, other.far_value]),
-        )
+        return Bracket(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
 
 
 def first_crossing(
@@ -55,14 +64,12 @@ def first_crossing(
         value: of the field there, positive in free space.
 
     Returns:
-        which rays have such an interval, and the intervals of those rays.
+        which rays have such an interval, and the intervals, without meaning where there is none.
     """
     falls = (value[:, :-1] > 0) & (value[:, 1:] <= 0)
-    found = falls.any(dim=1)
-    some = found.nonzero().squeeze(-1)
-    before = falls[some].to(torch.int8).argmax(dim=1, keepdim=True)
-    pick = [table[some].gather(1, index).squeeze(1) for table in (distance, value) for index in (before, before + 1)]
-    return found, Bracket(pick[0], pick[1], pick[2], pick[3])
+    before = falls.to(torch.int8).argmax(dim=1, keepdim=True)
+    pick = [table.gather(1, index).squeeze(1) for table in (distance, value) for index in (before, before + 1)]
+    return falls.gather(1, before).squeeze(1), Bracket(*pick)
 
 
 def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: int) -> Bracket:

@@ -112,16 +112,16 @@ class DVR:
         distance = entry[:, None] + shares * (leave - entry)[:, None]
         value = self._in_order(field, rays, distance) if self.early_stop else field(rays.at_each(distance))
         inside = value[:, 0] < 0
-        outside = (~inside).nonzero().squeeze(-1)
-        found, bracket = first_crossing(distance[outside], value[outside])
-        hit = outside[found]
-        root, remaining = refine(field, rays[hit], bracket, method=self.refinement, steps=self.refinement_steps)
+        found, bracket = first_crossing(distance, value)
+        hit = (found & ~inside).nonzero().squeeze(-1)
+        bracket, steps = bracket.some(hit), self.refinement_steps
+        root, remaining = refine(field, rays[hit], bracket, method=self.refinement, steps=steps)
 
-        status = torch.full_like(entry, Status.MISS, dtype=torch.int8)
-        status[inside], status[hit] = Status.STARTED_INSIDE, Status.HIT
+        status = torch.where(inside, Status.STARTED_INSIDE, Status.MISS).to(torch.int8)
+        status[hit] = Status.HIT
         ended = torch.where(inside, entry, leave)
         magnitude = torch.where(value.isfinite(), value.abs(), torch.inf)
-        magnitude[inside, 1:] = torch.inf  # such a ray ended at its first sample
+        magnitude[:, 1:].masked_fill_(inside[:, None], torch.inf)  # such a ray ended at its first sample
         index = magnitude.argmin(dim=1, keepdim=True)
         least_distance, least = distance.gather(1, index).squeeze(1), value.gather(1, index).squeeze(1)
         least = torch.where(least.isfinite(), least, 1.0)  # a ray that met no finite value passes by

@@ -15,7 +15,7 @@ from torch import Tensor
 from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import Values
-from renderers.march import pyramid
+from renderers.march import Level, pyramid
 from renderers.waits import steps_between, values_where
 
 LEVEL_STEPS = 5  # at each coarse level, most: with more, rays next to a silhouette crawl twice
@@ -161,7 +161,7 @@ class Reached:
         self.value = value.nan_to_num(0.0, 0.0, 0.0)
 
     def split(
-        self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], rays: Rays, *, radius: float, error: float
+        self, parent: Int[Tensor, " m"], apart: Float[Tensor, " m"], child: "Reached", *, error: float
     ) -> "Reached":
         """The same of finer rays, each of which continues from its coarse `parent`: as far as that one's spheres reach.
 
@@ -169,9 +169,10 @@ class Reached:
 
         Args:
             apart: how far each of the finer rays is from its coarse one, at most.
+            child: the finer rays on the sphere, which are changed.
             error: most that the values of the coarse ray are off.
         """
-        child, known = Reached.on_sphere(rays, radius), self.some(parent)
+        known = self.some(parent)
         inherits = ~known.stopped(Stop.INSIDE) & ~known.stopped(Stop.NOT_FINITE) & known.least.isfinite()
         inherits &= child.stopped(Stop.ON_THE_WAY)
         spheres = known.stopped(Stop.CROSSED) | (known.stopped(Stop.ON_THE_WAY) & known.free_value.isfinite())
@@ -205,13 +206,13 @@ def approach(values: Values, rays: Rays, stride: Stride, *, steps: int, radius: 
         error: most that one of the values is off.
     """
     levels = pyramid(rays) if rays.image else []
-    reached = Reached.on_sphere(levels[0].coarse if levels else rays.flat(), radius)
-    for level in levels:
-        coarse, parent = level.coarse[level.parent], level.parent
-        apart = _apart(coarse, level.fine, reached.entry[parent], reached.leave[parent])
-        clear = HOLDS * (float(apart.max()) if apart.numel() else 0.0) + error
-        march(values, level.coarse, reached, replace(stride, epsilon=max(clear, stride.epsilon)), LEVEL_STEPS)
-        reached = reached.split(parent, apart, level.fine, radius=radius, error=error)
+    reached, *finer = (Reached.on_sphere(each, radius) for each in [*(level.coarse for level in levels), rays.flat()])
+    apart = [_apart(level, begun) for level, begun in zip(levels, [reached, *finer], strict=False)]
+    widest = torch.stack([torch.nn.functional.pad(each, (0, 1)).amax() for each in apart]).tolist() if levels else []
+    for level, child, each, most in zip(levels, finer, apart, widest, strict=True):
+        clear = max(HOLDS * most + error, stride.epsilon)
+        march(values, level.coarse, reached, replace(stride, epsilon=clear), LEVEL_STEPS)
+        reached = reached.split(level.parent, each, child, error=error)
     march(values, rays.flat(), reached, stride, steps)
     return reached
 
@@ -310,7 +311,12 @@ class Moving(NamedTuple):
         return torch.stack(columns), goes_on
 
 
-def _apart(first: Rays, second: Rays, begin: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """How far two sets of n rays are apart at the same distance between `begin` and `end`, at most."""
-    ends = (torch.linalg.vector_norm(first.at(distance) - second.at(distance), dim=-1) for distance in (begin, end))
-    return torch.maximum(*ends)
+def _apart(level: Level, begun: Reached) -> Float[Tensor, " n"]:
+    """How far each of the finer rays is from its coarse one within the sphere, at the same distance, at most.
+
+    Args:
+        begun: the coarse rays on the sphere.
+    """
+    coarse = level.coarse[level.parent]
+    ends = (distance[level.parent] for distance in (begun.entry, begun.leave))
+    return torch.maximum(*(torch.linalg.vector_norm(coarse.at(end) - level.fine.at(end), dim=-1) for end in ends))

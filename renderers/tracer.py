@@ -153,10 +153,9 @@ class Tracer:
         first = self._close(field, rays, reached)
         with torch.no_grad():
             crossed = reached.stopped(Stop.CROSSED)
-            unsolved = first.index[~first.settled]
-            between = unsolved[crossed[unsolved]]
-            on_the_way = reached.stopped(Stop.ON_THE_WAY).nonzero().squeeze(-1)
-            searched = torch.cat([unsolved[~crossed[unsolved]], on_the_way])
+            unsolved = torch.zeros_like(crossed).index_put((first.index,), ~first.settled)
+            between = (unsolved & crossed).nonzero().squeeze(-1)
+            searched = ((unsolved & ~crossed) | reached.stopped(Stop.ON_THE_WAY)).nonzero().squeeze(-1)
             found, bracket = self._search(field, rays, reached, searched)
             again = torch.cat([between, searched[found]])
             bracket = reached.some(between).bracket().joined(bracket)
@@ -202,23 +201,21 @@ class Tracer:
             distance = at + step - found.change / slope
             begun = solved.begun[asked] if steps_before else found.value
             solved = solved.updated(asked, distance, found.value, found.slope, begun, found.change, short | small)
-            asked = asked[enters & ~short]
-            if asked.numel() == 0:
+            if steps_before + 1 == self.newton_steps or (asked := asked[enters & ~short]).numel() == 0:
                 break
         return solved
 
     def _search(
         self, field: Field, rays: Rays, reached: Reached, index: Int[Tensor, " m"]
-    ) -> tuple[Bool[Tensor, " m"], Bracket]:
-        """The first change of sign among samples of m of the rays: which of them have one, and between which samples.
+    ) -> tuple[Int[Tensor, " k"], Bracket]:
+        """The first change of sign among samples of m of the rays: which k have one, and between which samples it is.
 
         Writes into `reached` the rays' samples of least magnitude, and that a ray begins inside.
         """
         known = reached.some(index)
         start = torch.where(known.free_value.isfinite(), known.free, known.entry)
         distance, value = self._samples(field, rays[index], start, known.leave)
-        ends = start.new_full((len(index), 4), torch.nan)
-        _keep_crossing(ends, torch.arange(len(index), device=index.device), distance, value)
+        found, bracket = first_crossing(distance, value)
         # What is thinner than the spacing may hide beside a small value in front of the change of sign.
         in_front = torch.where((value <= 0).cumsum(dim=1) > 0, torch.inf, value.nan_to_num(torch.inf))
         least, place = in_front.min(dim=1)
@@ -231,9 +228,10 @@ class Tracer:
         again = ((least < spacing / 2) & ~inside).nonzero().squeeze(-1)
         low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, known.leave)
         distance, value = self._samples(field, rays[index[again]], low[again], high[again])
-        _keep_crossing(ends, again, distance, value)
-        found = ends[:, 0].isfinite() & ~inside
-        return found, Bracket(*ends[found].unbind(dim=1))
+        closer, ends = first_crossing(distance, value)
+        bracket = bracket.replaced(again, closer, ends)
+        some = (found.index_put((again,), found[again] | closer) & ~inside).nonzero().squeeze(-1)
+        return some, bracket.some(some)
 
     def _samples(
         self, field: Field, rays: Rays, start: Float[Tensor, " m"], end: Float[Tensor, " m"]
@@ -253,15 +251,15 @@ class Tracer:
             steepness: by which its values are multiplied again.
         """
         inside, not_finite = reached.stopped(Stop.INSIDE), reached.stopped(Stop.NOT_FINITE)
-        status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
-        status[inside], status[not_finite] = Status.STARTED_INSIDE, Status.OUT_OF_STEPS
+        status = torch.where(not_finite, Status.OUT_OF_STEPS, Status.MISS)
+        status = torch.where(inside, Status.STARTED_INSIDE, status).to(torch.int8)
         distance = torch.where(inside, reached.entry, torch.where(not_finite, reached.distance, reached.leave))
         residual, closest = reached.value.clone(), reached.least.clone()
         index, settled = solved.index, solved.settled
         status[index] = torch.where(settled, Status.HIT, Status.OUT_OF_STEPS).to(status.dtype)
         residual[index] = solved.value.nan_to_num(0.0)
         distance = distance.index_put((index,), torch.where(settled, solved.distance, solved.distance.detach()))
-        closest = closest.index_put((index[settled],), solved.change[settled])
+        closest = closest.index_put((index,), torch.where(settled, solved.change, closest[index]))
         sampled = reached.least.isfinite()
         queried = sampled.nonzero().squeeze(-1)
         rendering = assemble(
@@ -313,12 +311,6 @@ class Solved:
         """The same with other answers for some of them: the columns behind the index."""
         pairs = zip(self.columns[1:], columns, strict=True)
         return Solved(self.index, *(old.index_put((some,), new) for old, new in pairs))
-
-
-def _keep_crossing(ends: Float[Tensor, "m 4"], index: Int[Tensor, " k"], distance: Tensor, value: Tensor) -> None:
-    """Writes the first change of sign among the samples of k rays, where they have one, as the ends of a Bracket."""
-    found, bracket = first_crossing(distance, value)
-    ends[index[found]] = torch.stack([bracket.near, bracket.far, bracket.near_value, bracket.far_value], dim=1)
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,11 @@ class Image:
 
     def note(self, solved: Solved) -> None:
         """Notes where the rays meet a surface now."""
-        solved = solved.some(solved.settled)
-        self.hit = torch.zeros_like(self.hit).index_fill(0, solved.index, True)
-        self.distance = self.distance.index_put((solved.index,), solved.distance.detach())
-        self.slope = self.slope.index_put((solved.index,), solved.slope)
+        index, settled = solved.index, solved.settled
+        self.hit = torch.zeros_like(self.hit).index_put((index,), settled)
+        distance = torch.where(settled, solved.distance.detach(), self.distance[index])
+        self.distance = self.distance.index_put((index,), distance)
+        self.slope = self.slope.index_put((index,), torch.where(settled, solved.slope, self.slope[index]))
         self.renderings += 1
 
     def free(self, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
@@ -193,8 +194,8 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
     steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
     solved = tracer.solve(asked, rays, reached, steady, image.distance[steady], furthest=CLEAR)
     with torch.no_grad():
-        change = (solved.slope / image.slope[steady])[solved.settled]
-        changed = len(change) == 0 or bool((change.median() - 1).abs() > STEEPER)
+        change = torch.where(solved.settled, solved.slope / image.slope[steady], torch.nan).nanmedian()
+        changed = not bool((change - 1).abs() <= STEEPER)  # not a number where no root is settled
         if (changed or image.renderings % MEASURED == 0) and not _as_steep(tracer, field, rays, image):
             return None
         looked = _look(asked, rays, reached)
@@ -211,8 +212,8 @@ def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: 
         moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
     found = tracer.resume(asked, rays[index], moving).among(index)
     with torch.no_grad():
-        differing = _differing(solved, found, certain & audited)
-        if memory.audit(int((certain & audited).sum()), differing):
+        judged = certain & audited
+        if memory.audit(*torch.stack([judged.sum(), (judged & _differing(solved, found, judged)).sum()]).tolist()):
             return None
         reached.put_back(index, moving)
         image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
@@ -227,17 +228,15 @@ def _look(field: Field, rays: Rays, reached: Reached) -> Float[Tensor, " m"]:
     return field(rays[index].at(entry + shares * (leave - entry))).nan_to_num(0.0)
 
 
-def _differing(kept: Solved, found: Solved, audited: Bool[Tensor, " n"]) -> int:
-    """How many of the audited rays meet a surface elsewhere than was certain of them."""
+def _differing(kept: Solved, found: Solved, like: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Which rays meet a surface elsewhere in one of the two."""
 
     def met(solved: Solved) -> Float[Tensor, " n"]:
-        nowhere = torch.full_like(audited, torch.inf, dtype=solved.distance.dtype)
-        solved = solved.some(solved.settled)
-        return nowhere.index_put((solved.index,), solved.distance.detach())[audited]
+        nowhere = torch.full_like(like, torch.inf, dtype=solved.distance.dtype)
+        return nowhere.index_put((solved.index,), solved.distance.detach().where(solved.settled, torch.inf))
 
     said, seen = met(kept), met(found)
-    alike = (said == seen) | ((said - seen).abs() <= APART)
-    return int((~alike).sum())
+    return ~((said == seen) | ((said - seen).abs() <= APART))
 
 
 def _largest(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:

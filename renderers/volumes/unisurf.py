@@ -90,7 +90,7 @@ class UNISURF(VolumeRenderer):
         coarse = Samples.of(field, rays, evenly(entry, leave, self.search_samples))
         found, bracket = first_crossing(coarse.distance, coarse.value)
         hit = found.nonzero().squeeze(-1)
-        root, _ = refine(field, rays[hit], bracket, method="secant", steps=self.search_steps)
+        root, _ = refine(field, rays[hit], bracket.some(hit), method="secant", steps=self.search_steps)
         near = torch.maximum(root - self.interval, entry[hit])
         far = torch.minimum(root + self.interval, leave[hit])
         distance = evenly(entry, leave, self.free_samples + self.samples)

@@ -49,11 +49,11 @@ def test_the_first_fall_from_free_to_occupied(values, first):
         assert (ends.near_value.item(), ends.far_value.item()) == (values[first], values[first + 1])
 
 
-def test_only_rays_with_a_crossing_have_a_bracket():
+def test_rays_with_a_crossing_have_a_bracket():
     values = torch.stack([vector((1, -1)), vector((1, 1)), vector((2, -3))])
     found, ends = first_crossing(vector((0, 1)).expand(3, 2), values)
     assert found.tolist() == [True, False, True]
-    assert ends.far_value.tolist() == [-1, -3]
+    assert ends.some(found.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
     none, empty = first_crossing(torch.zeros(0, 4), torch.zeros(0, 4))
     assert (none.shape, empty.near.shape) == ((0,), (0,))
 

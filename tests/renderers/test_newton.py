@@ -317,11 +317,11 @@ def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
     parent, apart, fine = torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0))
     for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-5), 0.4025), ((0.4, 0.2), 0.6025)]:
         reached = marched(*values)
-        finer = reached.split(parent, apart, fine, radius=1.0, error=0.002)
+        finer = reached.split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
         assert finer.distance.item() == pytest.approx(end - 0.03 - 0.002)
-    gone = marched(0.4, 0.62).split(parent, apart, fine, radius=1.0, error=0.002)
+    gone = marched(0.4, 0.62).split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
     assert gone.distance.item() < 1.0 and gone.stopped(Stop.ON_THE_WAY).item()
-    gone = marched(0.4, 0.7).split(parent, apart, fine, radius=1.0, error=0.002)
+    gone = marched(0.4, 0.7).split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
     assert gone.stopped(Stop.LEFT).item()
 
 
@@ -331,7 +331,7 @@ def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
     behind.distance = behind.entry + 0.5
     advance(behind, -0.1, NEWTON.tracer.stride())
     assert behind.stopped(Stop.ON_THE_WAY).item() and behind.least.item() < 0
-    finer = behind.split(parent, torch.tensor([0.03]).double(), fine, radius=1.0, error=0.0)
+    finer = behind.split(parent, torch.tensor([0.03]).double(), Reached.on_sphere(fine, 1.0), error=0.0)
     assert finer.least.isinf().item() and finer.stopped(Stop.ON_THE_WAY).item()
 
 
