@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderers.camera import Rays
@@ -17,6 +17,7 @@ from renderers.silhouette import SurfaceRenderer
 # Of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value.
 CANDIDATE = 1.5
 FARTHEST = 1e3  # a value that is larger, or infinite, counts as this one
+TOGETHER = 8  # steps whose samples are looked at in one go
 
 
 @dataclass(frozen=True)
@@ -77,24 +78,50 @@ class RelaxedBoundary(SurfaceRenderer):
     def _march(self, field: Field, rays: Rays) -> tuple[Front, Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The front; where each ray first passed a surface within the band, and the value there: infinite without."""
         front = Front.on_sphere(rays, radius=self.sphere_radius, samples=1)
-        passed, least = front.distance.clone(), torch.full_like(front.distance, torch.inf)
-        last = passed.new_full((2, 3, len(passed)), torch.nan)  # of each ray: places and values of three samples
+        seen = Seen(self, field, rays, front.distance)
+        march(field, rays, front, Stepping(self.epsilon), self.steps, note=seen.note)
+        seen.look()
+        return front, seen.passed, seen.least
 
-        def look(asked: Tensor, distance: Tensor, value: Tensor) -> None:
-            """Asks the field where rays have just passed a least value."""
-            new = torch.stack([distance, value])[:, None]
-            places, values = last[:, :, asked] = torch.cat([last[:, 1:, asked], new], dim=1)
-            dips = (values[1] < values[0]) & (values[1] < values[2]) & (values[1] > 0)
-            near = (dips & (values[1] < CANDIDATE * self.band) & least[asked].isinf()).nonzero().squeeze(-1)
-            if near.numel():
-                place = _lowest(places[:, near], values[:, near].clamp_max(FARTHEST))
-                near = asked[near]
-                there = field(rays[near].at(place))
-                within = (there > self.epsilon) & (there < self.band + self.epsilon)
-                passed[near[within]], least[near[within]] = place[within], there[within]
 
-        march(field, rays, front, Stepping(self.epsilon), self.steps, note=look)
-        return front, passed, least
+class Seen:
+    """What n rays pass by: `passed`, where that is, and `least`, the value there, infinite where there is nothing yet.
+
+    Samples are kept as they come, and looked at `TOGETHER`.
+    """
+
+    def __init__(self, renderer: RelaxedBoundary, field: Field, rays: Rays, begun: Float[Tensor, " n"]) -> None:
+        self.renderer, self.field, self.rays, self.kept = renderer, field, rays, 2
+        self.passed, self.least = begun.clone(), torch.full_like(begun, torch.inf)
+        self.samples = begun.new_full((2 + TOGETHER, 2, len(begun)), torch.nan)  # places and values; first the last two
+
+    def note(self, asked: Int[Tensor, " m"], distance: Float[Tensor, " m"], value: Float[Tensor, " m"]) -> None:
+        """Keeps a sample of some of the rays."""
+        self.samples[self.kept].index_copy_(1, asked, torch.stack([distance, value]))
+        self.kept += 1
+        if self.kept == len(self.samples):
+            self.look()
+
+    def look(self) -> None:
+        """Asks the field where rays have passed a least value since the last look; the first within the band counts."""
+        band, epsilon, values = self.renderer.band, self.renderer.epsilon, self.samples[:, 1]
+        before, here, after = values[:-2], values[1:-1], values[2:]
+        dips = (here < before) & (here < after) & (here > 0) & (here < CANDIDATE * band) & self.least.isinf()
+        step, ray = dips.nonzero(as_tuple=True)
+        if len(ray):
+            three = torch.stack([self.samples[step + later, :, ray] for later in range(3)])
+            place = _lowest(three[..., 0], three[..., 1].clamp_max(FARTHEST))
+            there = self.field(self.rays[ray].at(place))
+            order = torch.where((there > epsilon) & (there < band + epsilon), step, TOGETHER)
+            first = torch.full_like(self.least, TOGETHER, dtype=step.dtype).scatter_reduce(0, ray, order, "amin")
+            chosen = (order == first[ray]) & (order < TOGETHER)  # one of each ray
+            found = [torch.where(chosen, one, torch.inf) for one in (place, there)]
+            place, there = (torch.full_like(self.least, torch.inf).scatter_reduce(0, ray, f, "amin") for f in found)
+            self.passed = torch.where(there < torch.inf, place, self.passed)
+            self.least = torch.minimum(self.least, there)
+        self.samples[:2] = self.samples[-2:]
+        self.samples[2:] = torch.nan
+        self.kept = 2
 
 
 def _lowest(places: Float[Tensor, "3 n"], values: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:

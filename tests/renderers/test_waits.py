@@ -14,7 +14,11 @@ from tests.tiny import camera_of
 
 ERROR = 0.002
 MARCHED = ("dist", "dist_keinert", "dist_auto_relaxed", "idr", "relaxed_boundary", "newton")
-MORE = {"dist_keinert": {"n_gradient_samples": 3}, "idr": {"steps": 13}}
+MORE = {
+    "dist_keinert": {"n_gradient_samples": 3},
+    "idr": {"steps": 13},
+    "relaxed_boundary": {"sphere_radius": 0.7, "band": 0.05},
+}
 
 
 class Ring:
@@ -65,4 +69,4 @@ def test_when_ended_rays_are_left_out_changes_no_number(name, monkeypatch):
     assert counts == seldom and counts.hits == seldom.hits > 100
     assert counts.masked == 0 < seldom.masked
     assert shape.asked == seldom.value + seldom.coarse + seldom.masked
-    assert shape.furthest <= plain.furthest + 1e-6  # a field may have no values outside of the sphere
+    assert shape.furthest <= plain.furthest + 1e-4  # a field may have no values outside of the sphere
