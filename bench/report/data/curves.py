@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.stats import spearmanr
 
 from bench.records.read import curve_lines as lines
 from bench.records.record import as_number
@@ -78,4 +77,4 @@ def history_of(runs: Runs, record: Record) -> pd.DataFrame:
 def spearman(points: pd.DataFrame, first: str = "loss", second: str = "error") -> float | None:
     """The rank correlation of two columns; None for fewer than three points, or where a column does not vary."""
     varied = len(points) > 2 and all(points[column].nunique() > 1 for column in (first, second))
-    return float(spearmanr(points[first], points[second]).statistic) if varied else None
+    return float(np.corrcoef(points[[first, second]].rank().T)[0, 1]) if varied else None
