@@ -1,7 +1,9 @@
 """Reads a results folder: the records of its runs, and the plans of its sweeps, whose cells must have a run each."""
 
 import json
+import marshal
 import os
+import sys
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
@@ -124,7 +126,7 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
         ValueError: if `results_dir` is not a folder, or has a link in place of a folder or file of its own.
     """
     check_results(results_dir)
-    records, problems, known = list[dict[str, Any]](), list[str](), dict[Any, Any]()
+    records, problems, known = list[dict[str, Any]](), list[str](), dict[bytes, Any]()
     for folder in run_folders(results_dir):
         record, said = read_run(folder, results_dir)
         if record is not None:
@@ -139,34 +141,34 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
     return records, problems + unread
 
 
-def _sharing(record: dict[str, Any], known: dict[Any, Any]) -> dict[str, Any]:
+def _sharing(record: dict[str, Any], known: dict[bytes, Any]) -> dict[str, Any]:
     """The same record, whose nodes of settings and whose names are those of other records where they are equal.
 
     10,000 records then take 53 MiB in place of 437. Nothing may change a node.
 
     Args:
-        known: the nodes so far, by their text; it is extended.
+        known: the nodes so far, by their content; it is extended.
     """
 
     def shared(value: Any) -> Any:
         if isinstance(value, str):
-            return known.setdefault(value, value)
+            return sys.intern(value)
         if not isinstance(value, dict | list):
             return value
         try:
-            text = "node", json.dumps(value)
-        except RecursionError:
+            content = marshal.dumps(value, 2)  # the last version in which equal data have equal bytes
+        except ValueError:  # nested too deep
             return value
-        if text not in known:
-            known[text] = Node(value) if isinstance(value, dict) else value
-        return known[text]
+        if content not in known:
+            known[content] = Node(value) if isinstance(value, dict) else value
+        return known[content]
 
     for name, value in record.items():
         if isinstance(value, dict) and name != "definitions":
-            record[name] = {shared(key): shared(item) for key, item in value.items()}
+            record[name] = {sys.intern(key): shared(item) for key, item in value.items()}
         else:
             record[name] = shared(value)
-    return {shared(name): value for name, value in record.items()}
+    return {sys.intern(name): value for name, value in record.items()}
 
 
 def check_results(results_dir: Path) -> None:
