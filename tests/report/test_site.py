@@ -12,7 +12,7 @@ import trimesh
 
 from bench.records.names import differences
 from bench.records.read import RESULTS, Plan, PlannedCell, not_run, read_records
-from bench.records.record import NOT_RUN, RunStatus
+from bench.records.record import NOT_RUN, RunStatus, file_lock
 from bench.report.data.records import definition
 from bench.report.site.columns import names
 from bench.report.site.detail import curve, detail
@@ -284,6 +284,21 @@ def test_pages_that_are_written_at_the_same_time_have_all_runs(tmp_path):
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(end, range(4)))
     assert sorted(Page(tmp_path).folders) == [f"completion-{n:04}" for n in range(4)]
+
+
+def test_who_waits_for_another_page_is_told(tmp_path, monkeypatch):
+    write_run(tmp_path, record("one"), "one")
+    other, said = file_lock(tmp_path, html.FOLDER), []
+
+    def tell(text: str, **_: object) -> None:
+        said.append(text)
+        other.release()
+
+    other.acquire()
+    monkeypatch.setattr(html, "PATIENCE", 0.01)
+    monkeypatch.setattr(html, "print", tell, raising=False)
+    write_index(tmp_path)
+    assert said == [f"waiting for another process that writes the page of {tmp_path}"]
 
 
 def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):

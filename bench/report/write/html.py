@@ -3,12 +3,14 @@
 import json
 import os
 import re
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
+from filelock import Timeout
 
 from bench.records.read import check_results, read_records
 from bench.records.record import file_lock, plain, write_bytes, write_text
@@ -20,6 +22,7 @@ from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
 FOLDER = "page"  # of the results folder
+PATIENCE = 1.0  # seconds to wait in silence
 LIBRARY = "plotly.min.js"
 STYLES = ("style.css",)
 SCRIPTS = (  # in the order in which they need each other
@@ -58,9 +61,22 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
         return write_page(*read_records(results_dir), results_dir, meshes)
 
 
-def page_lock(results_dir: Path) -> FileLock:
-    """Held while records are read and their page is written: of two that write, the last one's has the runs of both."""
-    return file_lock(results_dir, FOLDER)
+@contextmanager
+def page_lock(results_dir: Path) -> Iterator[None]:
+    """Held while records are read and their page is written: of two that write, the last one's has the runs of both.
+
+    Who waits for it longer than `PATIENCE` is told.
+    """
+    lock = file_lock(results_dir, FOLDER)
+    try:
+        lock.acquire(timeout=PATIENCE)
+    except Timeout:
+        print(f"waiting for another process that writes the page of {results_dir}", file=sys.stderr, flush=True)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: Path, meshes: int | None) -> Path:
