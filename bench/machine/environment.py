@@ -110,11 +110,9 @@ def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32, repeats:
     matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device).to(dtype)
     best = float("inf")
     for _ in range(repeats + 1):  # one more, since the first one is a warm-up
-        synchronise(device)
-        start = time.perf_counter()
+        stopwatch = Stopwatch(device)
         matrix @ matrix
-        synchronise(device)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, stopwatch.seconds())
     return 2 * GEMM_SIZE**3 / best
 
 
@@ -124,10 +122,33 @@ def seconds_at_peak(environment: dict[str, Any], flops: int, coarse_flops: int) 
     return seconds + coarse_flops / environment["bfloat16_peak_flops"] if coarse_flops else seconds
 
 
-def synchronise(device: torch.device) -> None:
-    """Waits until the device has finished its work."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+class Stopwatch:
+    """Seconds that a device's work takes from here on: by a GPU's own events, else by the wall clock.
+
+    It waits until the device has finished what came before, and what is measured.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device if device.type == "cuda" else None
+        if self.device is not None:
+            torch.cuda.synchronize(self.device)
+        self.start = self._mark()
+
+    def seconds(self) -> float:
+        """The seconds so far."""
+        end = self._mark()
+        if self.device is None:
+            return end - self.start
+        torch.cuda.synchronize(self.device)
+        return self.start.elapsed_time(end) / 1000  # milliseconds
+
+    def _mark(self) -> Any:
+        """The time, or an event behind all that the GPU was given to do."""
+        if self.device is None:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
 
 
 class MemoryPeak:

@@ -3,7 +3,6 @@
 Several starts share one budget of iterations: successive halving keeps the better ones, and the last gets the rest.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import cos, inf, isfinite, isnan, pi
@@ -14,7 +13,7 @@ from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim.adam import adam
 
-from bench.machine.environment import MemoryPeak, synchronise
+from bench.machine.environment import MemoryPeak, Stopwatch
 from bench.records.record import RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
@@ -183,11 +182,9 @@ def _failed(history: History, largest: float, least_reference: float) -> bool:
 
 
 def _timed(device: torch.device, work: Callable[[], Any]) -> float:
-    synchronise(device)
-    start = time.perf_counter()
+    stopwatch = Stopwatch(device)
     work()
-    synchronise(device)
-    return time.perf_counter() - start
+    return stopwatch.seconds()
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """The rendering benchmark: a renderer's cost and error on one view of a fitted network (DIST, Table 1).
 
-With `beside`, several renderers are timed in turn in one process: what they cost over the run's own renderer.
+With `beside`, several renderers are timed in turn in one process: what they cost over the run's own renderer. With
+`device=cuda` all seconds are those of the GPU's own events, after a warm-up at full size; not yet run on a GPU. There
+are no CUDA graphs, since the shapes of a march change from one rendering to the next.
 """
 
 import time
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from bench.config import load
 from bench.evaluate.reference import Reference, reference_for
-from bench.machine.environment import gemm_peak, seconds_at_peak, synchronise, using_threads
+from bench.machine.environment import Stopwatch, gemm_peak, seconds_at_peak, using_threads
 from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
@@ -30,7 +32,7 @@ from renderers.rendering import Observed, Renderer, Rendering
 
 BASE = "base"  # the run's renderer, where others are timed beside it
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
-WARM_UP = 8  # pixels per side of the image that is rendered before the timing
+WARM_UP = 8  # pixels per side of the image that is rendered before the timing, on a CPU
 DEFINITIONS = {
     "size": "pixels per side of the image for which the other numbers were measured",
     "queries": "points whose field value was computed in one rendering without gradient; counted at the field, without "
@@ -39,7 +41,8 @@ DEFINITIONS = {
     "where it decides nothing; in a rendering, and in a step",
     "step_queries, step_gradients": "points whose value was computed in a step, and points through whose value a "
     "non-zero gradient was propagated back",
-    "forward_seconds": "rendering without gradient: median of the repeats; _low and _high: least and largest",
+    "forward_seconds": "rendering without gradient: median of the repeats; _low and _high: least and largest; by the "
+    "wall clock or, on a GPU, its own events",
     "step_seconds": "a step of an optimisation: rendering with gradient, losses, backward",
     "backward_seconds": "the backward pass of a step",
     "repeats": "how often a step was timed",
@@ -259,8 +262,12 @@ class Workbench:
         self.forward, self.step = Clocked(), Clocked()
         check_kind(self.renderer, self.decoder.at(self.code))
         check_field_gradient(self.renderer)
-        small = camera.resized(WARM_UP, WARM_UP)
-        self._step(self.decoder.at(self.code), small.rays().to(self.device), torch.ones(WARM_UP, WARM_UP).bool())
+        field = self.decoder.at(self.code)
+        if self.device.type == "cpu":
+            small = camera.resized(WARM_UP, WARM_UP)
+            self._step(field, small.rays(), torch.ones(WARM_UP, WARM_UP).bool())
+        else:  # which loads kernels and takes memory by the size of the work
+            self._step(limits.watch(field, self.device, "a step"), self.rays, self.mask)
 
     def renderings(self, repeats: int, of: str = "") -> None:
         """Times renderings without gradient; `of` names the renderer where a limit is reached."""
@@ -312,11 +319,9 @@ class Workbench:
         rendering = rendered(self.renderer, field, rays)
         silhouette = silhouette_loss(self.renderer, field, rays, rendering, Observed(mask.to(self.device)))
         loss = rendering.distance[rendering.hit].sum() + silhouette
-        synchronise(self.device)
-        start = time.perf_counter()
+        stopwatch = Stopwatch(self.device)
         torch.autograd.grad(loss, self.code, allow_unused=True)
-        synchronise(self.device)
-        return time.perf_counter() - start
+        return stopwatch.seconds()
 
     def _clock(self, clocked: Clocked, name: str, work: Callable[[Field], float], repeats: int) -> None:
         """Times the same work `repeats` times, or until all took a quarter of the values that one may take."""
@@ -324,11 +329,9 @@ class Workbench:
         for _ in range(repeats):
             clocked.counts = Counts()
             field = self.limits.watch(self.decoder.at(self.code), self.device, name)
-            synchronise(self.device)
-            start, ran = time.perf_counter(), time.process_time()
+            stopwatch, ran = Stopwatch(self.device), time.process_time()
             clocked.second.append(work(Meter(field, clocked.counts)))
-            synchronise(self.device)
-            clocked.seconds.append(time.perf_counter() - start)
+            clocked.seconds.append(stopwatch.seconds())
             clocked.cpu.append(time.process_time() - ran)
             spent, grew = spent + field.spent, field.memory.growth()
             clocked.memory = grew if clocked.memory is None else max(clocked.memory, grew or 0)

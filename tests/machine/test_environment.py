@@ -5,11 +5,13 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass, field
 
 import pytest
 import torch
 
 from bench.machine import environment
+from bench.machine.environment import Stopwatch
 from bench.records.record import Record
 from tests.looped import each
 
@@ -104,3 +106,42 @@ def test_within_it_forward_and_backward_threads_take_denormals_as_0():
 
 def test_the_description_can_be_read_without_torch():
     assert "torch" not in {type(value).__module__.partition(".")[0] for value in environment.describe(CPU).values()}
+
+
+@dataclass
+class Device:
+    """Stands in for a GPU whose work takes two seconds; notes what it is asked for, in order."""
+
+    asked: list[str] = field(default_factory=list)
+
+    def synchronize(self, device: torch.device) -> None:
+        self.asked.append(f"wait for {device}")
+
+    def current_stream(self, device: torch.device) -> str:
+        return f"stream of {device}"
+
+    def event(self, enable_timing: bool) -> "Device":
+        assert enable_timing
+        return self
+
+    def record(self, stream: str) -> None:
+        self.asked.append(f"event in {stream}")
+
+    def elapsed_time(self, end: "Device") -> float:
+        self.asked.append("read")
+        return 2000.0
+
+
+def test_a_stopwatch_reads_the_clock_on_a_cpu_and_events_of_a_gpu(monkeypatch):
+    stopwatch, before = Stopwatch(torch.device("cpu")), time.perf_counter()
+    time.sleep(0.02)
+    assert 0.02 <= time.perf_counter() - before <= stopwatch.seconds() < 60
+    device = Device()
+    monkeypatch.setattr(torch.cuda, "Event", device.event)
+    for name in ("synchronize", "current_stream"):
+        monkeypatch.setattr(torch.cuda, name, getattr(device, name))
+    stopwatch = Stopwatch(torch.device("cuda:0"))
+    device.asked.append("work")
+    assert stopwatch.seconds() == 2.0
+    wait, event = "wait for cuda:0", "event in stream of cuda:0"
+    assert device.asked == [wait, event, "work", event, wait, "read"]
