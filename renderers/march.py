@@ -374,9 +374,9 @@ def _parents(coarse: torch.Size, fine: torch.Size, device: torch.device) -> Int[
 
 
 def _unsettled(
-    magnitude: Float[Tensor, "*rays"], past: Float[Tensor, "3 n"], stepping: Stepping
+    magnitude: Float[Tensor, "*rays"], past: Float[Tensor, "rows n"], stepping: Stepping
 ) -> Bool[Tensor, "*rays"]:
-    """Which rays have a finite value and have not converged, or went back since."""
+    """Which rays have a finite value and have not converged, or went back since, which the rows of `past` say."""
     unsettled = magnitude >= stepping.epsilon
     if stepping.step_back:
         unsettled |= (magnitude < stepping.epsilon) & past[0].isinf()
