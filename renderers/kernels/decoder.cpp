@@ -48,15 +48,10 @@ static inline void block(Rows from, int inputs, const float *weight, const float
       *(Vector *)(to.at(r) + LANES * j) = sum[r][j] < 0 ? Vector{} : sum[r][j];
 }
 
+template <int R>
 static void some(int rows, Rows from, int inputs, const float *weight, const float *bias, Rows to) {
-  switch (rows) {
-    case 6: return block<6>(from, inputs, weight, bias, to);
-    case 5: return block<5>(from, inputs, weight, bias, to);
-    case 4: return block<4>(from, inputs, weight, bias, to);
-    case 3: return block<3>(from, inputs, weight, bias, to);
-    case 2: return block<2>(from, inputs, weight, bias, to);
-    case 1: return block<1>(from, inputs, weight, bias, to);
-  }
+  if (rows == R) return block<R>(from, inputs, weight, bias, to);
+  if constexpr (R > 1) some<R - 1>(rows, from, inputs, weight, bias, to);
 }
 
 static void layer(const Decoder *net, int index, Rows from, int points, Rows to) {
@@ -64,8 +59,8 @@ static void layer(const Decoder *net, int index, Rows from, int points, Rows to)
   const float *weight = net->weights[index];
   for (int o = 0; o < net->outputs[index]; o += BLOCK, weight += (size_t)BLOCK * inputs)
     for (int r = 0; r < points; r += ROWS)
-      some(points - r < ROWS ? points - r : ROWS, {from.at(r), from.stride}, inputs, weight, net->biases[index] + o,
-           {to.at(r) + o, to.stride});
+      some<ROWS>(points - r < ROWS ? points - r : ROWS, {from.at(r), from.stride}, inputs, weight,
+                 net->biases[index] + o, {to.at(r) + o, to.stride});
 }
 
 static float sum_last(const Decoder *net, const float *features) {
