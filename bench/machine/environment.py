@@ -56,7 +56,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
-        "kernels": kernels().said,
+        "kernels": kernels().said_of(device.type, torch.get_num_threads()),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),

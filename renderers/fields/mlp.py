@@ -153,7 +153,7 @@ class BoundDecoder:
     @property
     def marcher(self) -> Marcher | None:
         """A march through the field by compiled code, for one code and weights that stay; None where there is none."""
-        return None if self._compiled is None or torch.get_num_threads() > 1 else self._compiled.march
+        return None if torch.get_num_threads() > 1 or self._compiled is None else self._compiled.march
 
     @cached_property
     def _compiled(self) -> CompiledDecoder | None:

@@ -30,6 +30,11 @@ class Kernels:
     library: ctypes.CDLL | None
     said: str
 
+    def said_of(self, device: str, threads: int) -> str:
+        """The same of a run on that type of device with so many threads."""
+        suits = self.library is None or (device == "cpu" and threads == 1)
+        return self.said if suits else f"{TORCH}: compiled code is for one thread of a CPU"
+
 
 @cache
 def kernels() -> Kernels:

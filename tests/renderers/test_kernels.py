@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
+from bench.machine import environment
 from bench.machine.environment import using_threads
 from bench.shape_prior import initialise_to_sphere
 from datasets.views import ViewSampler
@@ -77,6 +78,7 @@ def test_values_are_those_of_torch(name, count):
 
 @with_compiler
 def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
+    monkeypatch.setattr(environment, "kernels", lambda: THERE)
     monkeypatch.setattr(BoundDecoder, "_compiled", property(lambda self: pytest.fail("compiled code was asked")))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
@@ -86,6 +88,8 @@ def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatc
         make("skip").double().at(code.double())(points.double())
     with using_threads(2), torch.no_grad():
         make("skip").at(code)(points)
+        assert marcher_of(make("skip").at(code)) is None
+        assert environment.describe(torch.device("cpu"))["kernels"] == "torch: compiled code is for one thread of a CPU"
     monkeypatch.undo()
     with using_threads(1), torch.no_grad():  # weights that may change meanwhile are not copied
         assert make("skip").requires_grad_(True).at(code)._compiled is None
