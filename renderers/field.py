@@ -16,6 +16,7 @@ from renderers.camera import rigid
 from renderers.waits import Late, active_among
 
 PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
+GRADIENT, COARSE = 2.0, 0.125  # what a gradient and a coarse value count in `Counts.cost`
 PATIENT = 2  # times as many steps are made on coarse values, since these are shorter near the surface
 STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
 
@@ -159,6 +160,11 @@ class Counts:
         asked = points if active is None else active.count_nonzero()
         Late.add(self, name, asked)
         Late.add(self, "masked", points - asked)
+
+    @property
+    def cost(self) -> float:
+        """These evaluations as so many values: a gradient counts as two of them, a coarse value as an eighth."""
+        return self.value + GRADIENT * self.gradient + COARSE * self.coarse
 
     def flops(self, field: Field) -> int | None:
         """The floating-point operations of these evaluations, without coarse ones; None where the field has none."""

@@ -30,7 +30,8 @@ from bench.records.record import (
 RESULTS = "results/local"  # the results folder unless another is given, as conf/config.yaml has it
 PLAN = "plan.json"
 WORDS = ('"inf"', '"-inf"', '"nan"')  # for numbers, in JSON
-NO_TERMS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "chamfer_l2")  # of a curve's loss
+COSTS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost")
+NO_TERMS = (*COSTS, "chamfer_l1", "chamfer_l2")  # of a curve's loss
 ERRORS = ("psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success")  # likewise, at checkpoints
 PAGE = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
 FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks", *PAGE)  # of a results folder, and in these

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import Evaluation, chamfer_only, evaluate
+from bench.evaluate.evaluate import CHAMFER, Evaluation, chamfer_only, evaluate
 from bench.evaluate.state import State
 from bench.pictures.run_figures import Given, draw_run
 from bench.shape_prior import Prior
@@ -76,7 +76,7 @@ class CodeProblem:
     judged: Callable[[Field], float] | None = None
     counts: Counts = field(default_factory=Counts)
 
-    tracked: ClassVar[tuple[str, ...]] = ("chamfer_l2",)
+    tracked: ClassVar[tuple[str, ...]] = CHAMFER
     shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ class CodeProblem:
         return evaluate(state)
 
     def checkpoint(self, state: State) -> dict[str, float]:
-        """The Chamfer distance of the current shape."""
+        """The Chamfer distances of the current shape."""
         return chamfer_only(state)
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:

@@ -38,16 +38,20 @@ class OptimiserSettings:
         learning_rate: of Adam, at the start.
         schedule: "constant", or "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises
             from zero over the first tenth, for a start that is nearly right.
+        budget: of the field, see `renderers.field.Counts.cost`; the step that reaches it is the last.
     """
 
     iterations: int
     learning_rate: float
     schedule: str
+    budget: float | None = None
 
     def __post_init__(self) -> None:
         check_at_least("task.optimiser.iterations", self.iterations, 1, "the paper uses 100")
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
+        if self.budget is not None:
+            check_positive("task.optimiser.budget", self.budget, "1e7 is a tenth of a minute of the shipped priors")
 
     def rate(self, iteration: int) -> float:
         """The learning rate of an iteration, counted from 0."""
@@ -119,11 +123,12 @@ def optimise(
             "seconds": history.seconds["forward"] + history.seconds["backward"],
             "value_evaluations": history.counts.value + history.counts.coarse,
             "gradient_evaluations": history.counts.gradient,
+            "cost": history.counts.cost,
             **dict(zip(terms, numbers, strict=True)),
         }
         history.curve.append(line)
         history.peak_memory_bytes = memory.growth()
-        over = _failed(history, largest, least_reference)
+        over = _failed(history, largest, least_reference) or line["cost"] >= (settings.budget or inf)
         with memory.pause():
             on_step(line)
         if over:

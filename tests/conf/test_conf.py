@@ -35,9 +35,12 @@ EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
 SINGLE = {"fitted"}  # of one run, and without a table or figure of its own
 # The table or figure of an experiment, where it has another name: one that joins several experiments.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
-SHARED_ROWS = {"speed_accuracy": "speed_completion"}  # an experiment that sweeps over rows that several share
+SHARED_ROWS = {
+    "speed_accuracy": "speed_completion",
+    "core": "core_complete",
+}  # an experiment that sweeps over rows that several share
 COMPARING = {"table1": 24, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
-COMPARING["crossing"] = 5
+COMPARING |= {"crossing": 5, "core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))

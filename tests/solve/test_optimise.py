@@ -1,6 +1,6 @@
 """The optimisation loop on problems small enough to know the answer."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
@@ -264,3 +264,19 @@ def test_rounds_must_leave_something_of_the_budget():
     with pytest.raises(ValueError, match=r"optimiser\.iterations must be more than 32, not 32: 4 starts share it"):
         StartSettings(4, 8).check(32)
     StartSettings(1, 8).check(1)
+
+
+def test_the_step_that_reaches_the_budget_is_the_last_one():
+    toy, history = Toy(), History()
+    settings = OptimiserSettings(10, 0.05, "constant", budget=2.5 * 3 * POINTS)  # a value and a gradient count as 3
+    optimise(toy, settings, CPU, history=history, on_step=lambda line: None)
+    assert [line["cost"] for line in history.curve] == [3 * POINTS * n for n in (1, 2, 3)]
+    assert history.status is RunStatus.OK
+    with pytest.raises(ValueError, match="budget"):
+        replace(settings, budget=0.0)
+
+
+def test_a_coarse_value_counts_as_an_eighth():
+    counts = Counts()
+    counts.value, counts.gradient, counts.coarse = 10, 3, 16
+    assert counts.cost == 18
