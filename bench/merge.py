@@ -14,6 +14,7 @@ from typing import Any
 from bench.records.folder import content_of, put_into, set_aside
 from bench.records.read import check_links, run_folders
 from bench.records.record import file_lock, leads_out, link_out, read_record, write_text
+from bench.report.suite.attempts import place, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
 UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above
@@ -28,7 +29,7 @@ def merge(sources: list[Path], into: Path) -> list[str]:
         ValueError: for a source that is not a results folder, or that is or contains `into`; where `into` is a file.
     """
     for source in sources:
-        if not (source / "runs").is_dir():
+        if not (source / "runs").is_dir() and not place(source).is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
         if not leads_out(into, source):
             raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")
@@ -38,6 +39,10 @@ def merge(sources: list[Path], into: Path) -> list[str]:
     (into / "runs").mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
     for source in sources:
+        kept, problems = read_attempts(source)
+        lines += [f"{source}: not copied: {problem}" for problem in problems]
+        if kept:
+            write_attempts(kept, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
             if link := link_out(folder, source):
                 lines.append(f"{folder}: not copied, since {link} is a link out of its results folder")

@@ -28,14 +28,17 @@ ROOMS = (
     "setup", "evaluate", "pictures", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
     "run", "report", "studies",
 )  # fmt: skip
-COMMANDS = ("bench.merge", "bench.photos", "bench.prior", "bench.train", "bench.tune", "bench.turntable")
+COMMANDS = (
+    "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune", "bench.turntable",
+)  # fmt: skip
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a method that is made of what others maintain
 WITHOUT_TORCH = ("bench.records", "bench.report", STUDIES, "bench.pictures.style", "bench.pictures.size_chart")
 COMMON = "datasets.extras"  # without torch, and of use to all but renderers
-REPORT_MAY = (COMMON, "bench.report", "bench.records", "bench.pictures.style", "bench.pictures.size_chart")
+OWN = ("bench.report", "bench.records", "bench.tables")
+REPORT_MAY = (COMMON, *OWN, "bench.pictures.style", "bench.pictures.size_chart")
 
 
 def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:

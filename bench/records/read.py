@@ -34,8 +34,16 @@ COSTS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "c
 NO_TERMS = (*COSTS, "chamfer_l1", "chamfer_l2")  # of a curve's loss
 ERRORS = ("psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success")  # likewise, at checkpoints
 PAGE = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
-FOLDERS = ("runs", "sweeps", "earlier", "paper", ".locks", *PAGE)  # of a results folder, and in these
-WRITTEN = ("*", "paper/*", "sweeps/*/*", "page/*", "page/data/*")  # where a results folder is written to
+FOLDERS = ("runs", "sweeps", "earlier", "paper", "suite", ".locks", *PAGE)  # of a results folder, and in these
+WRITTEN = (
+    "*",
+    "paper/*",
+    "suite/*",
+    "suite/*/*",
+    "sweeps/*/*",
+    "page/*",
+    "page/data/*",
+)  # where a results folder is written to
 
 
 @dataclass(frozen=True)

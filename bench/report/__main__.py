@@ -5,6 +5,7 @@ from pathlib import Path
 
 from bench.records.read import RESULTS, check_results, read_records
 from bench.report.data.frame import write_csv
+from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.paper import write_paper, write_readme
@@ -35,7 +36,8 @@ def _report(given: dict[str, str]) -> int:
     results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
     if ship := given.get("ship"):
         records, _ = read_records(results_dir)
-        print(*write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
+        rows = write_attempts([*attempts_of(records, results_dir), *read_attempts(results_dir)[0]], Path(ship))
+        print(*rows, *write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
         return 0
     check_results(results_dir)
     with page_lock(results_dir):

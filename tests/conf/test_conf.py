@@ -92,7 +92,7 @@ def build_part(config: DictConfig, part: str):
 
 
 def test_no_yaml_lies_where_it_is_not_looked_for():
-    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", *GROUPS}
+    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", "suite", *GROUPS}
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
     files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
     assert folders <= files | {*GROUPS.values(), "method/space"}

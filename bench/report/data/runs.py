@@ -143,8 +143,9 @@ class Runs:
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings of view and evaluation in which runs differ, and those of prior and field within one family."""
-        together = [(self.records, ("view", "evaluation"))]
+        """The settings of view and evaluation in which an experiment's runs differ, of prior and field in a family."""
+        experiments = grouped(self.records, lambda record: record["config"].get("experiment"))
+        together = [(records, ("view", "evaluation")) for records in experiments.values()]
         together += [(records, ("prior", "field")) for records in self.families().values()]
         found: dict[str, None] = {}
         for records, parts in together:

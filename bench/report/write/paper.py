@@ -75,7 +75,11 @@ def studies() -> tuple[Study, ...]:
 
 
 def write_paper(
-    records: list[dict[str, Any]], results_dir: Path, into: Path | None = None, problems: list[str] | None = None
+    records: list[dict[str, Any]],
+    results_dir: Path,
+    into: Path | None = None,
+    problems: list[str] | None = None,
+    only: str | None = None,
 ) -> list[Path]:
     """Writes the files of every page that has runs to the folder `paper`; gives the path of each page's CSV.
 
@@ -83,9 +87,10 @@ def write_paper(
         into: the folder that gets `paper`; by default the results folder. Where it is another, it is what is shipped:
             pages of runs of scale=smoke are left out.
         problems: gets a line for each study that cannot be made of these runs; without it, its error is raised.
+        only: the name of a page, where no other is written.
     """
     written = []
-    for study in studies():
+    for study in studies() if only is None else [study for study in studies() if only in study.pages]:
         experiments = [selection.experiment for selection in study.reads]
         try:
             if study.problem:

@@ -1,0 +1,244 @@
+"""The rows of the suite: an attempt of a renderer at a problem, with its curve of cost and error.
+
+Attempts are made of runs, and kept as CSV files, a file a renderer and a line an attempt, so that results outlive the
+run folders and are joined over days and machines.
+"""
+
+import csv
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from io import StringIO
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from bench.records.read import curve_lines
+from bench.records.record import as_number, decoded, is_plain_name, plain, write_text
+from bench.report.data.records import Record, base_renderer, grouped, loop_seconds, setting
+from bench.tables import CONF, read_yaml
+
+FOLDER = "suite"  # of a results folder, with a folder a version in it
+EXPERIMENT = "core_"  # in front of the name of a set
+NAMES = {"task.points": "{} points", "task.degrees": "{} degrees", "task.images.texture": "{}"}  # within a set
+
+
+@dataclass(frozen=True)
+class Suite:
+    """The content of `conf/suite.yaml`; its comments say what it means."""
+
+    name: str
+    version: int
+    sizes: dict[str, str]
+    targets: list[float]
+    errors: dict[str, str]
+    references: dict[str, dict[str, float]]
+
+    @property
+    def id(self) -> str:
+        """The name with the version."""
+        return f"{self.name}-{self.version}"
+
+
+@cache
+def suite() -> Suite:
+    """The suite of this version."""
+    return Suite(**read_yaml(CONF / "suite.yaml"))
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A run of a renderer at a problem of the suite.
+
+    Args:
+        set, problem, scene, seed: what was to be solved; a scene has a problem for each amount of what is given.
+        row, preset: the renderer's name in tables, and what decides its look.
+        start, final: the errors before and after; `final` is infinite where the run did not end ok.
+        cost, operations, seconds: of the loop; `cost` in field values, see `renderers.field.Counts.cost`.
+        waited: share of its time that the run waited for a processor.
+        settings, code: hashes of the configuration and of the code.
+        curve: at each checkpoint the cost, the seconds and the error.
+        overrides: the command line that makes it again.
+    """
+
+    set: str
+    problem: str
+    scene: str
+    seed: int
+    row: str
+    preset: str
+    status: str
+    reason: str
+    start: float
+    final: float
+    cost: float
+    operations: float | None
+    seconds: float | None
+    waited: float | None
+    cpu: str
+    device: str
+    threads: int | None
+    kernels: str
+    started: str
+    commit: str
+    code: str
+    settings: str
+    curve: list[list[float]]
+    overrides: list[str]
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What there is one attempt of."""
+        return self.set, self.problem, self.seed, self.row
+
+    @property
+    def ok(self) -> bool:
+        """Whether its errors count; those of a run that ended otherwise do not."""
+        return self.status == "ok"
+
+    @property
+    def machine(self) -> tuple[Any, ...]:
+        """What its seconds depend on."""
+        return self.cpu, self.device, self.threads, self.kernels
+
+    def reached(self, error: float) -> tuple[float, float] | None:
+        """The cost and the seconds from which on the error stays at or below this one; None where it does not."""
+        found = None
+        for cost, seconds, at in reversed(self.curve if self.ok else []):
+            if not at <= error:
+                break
+            found = cost, seconds
+        return found
+
+
+def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
+    """The attempts among the records of a results folder; a run that was planned and not made is none."""
+    found = [one for record in records if (one := _attempt(record, results_dir / "runs" / record["folder"]))]
+    return list(joined(found).values())
+
+
+def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
+    """One attempt of each key: of several the last one that ended ok, or else the last one."""
+    found: dict[tuple[Any, ...], Attempt] = {}
+    for attempt in (one for attempts in several for one in attempts):
+        other = found.setdefault(attempt.key, attempt)
+        if (attempt.ok, attempt.started) > (other.ok, other.started):
+            found[attempt.key] = attempt
+    return found
+
+
+def _attempt(record: Record, folder: Path) -> Attempt | None:
+    config, said = record["config"], record["environment"]
+    of_set = str(config.get("experiment") or "").removeprefix(EXPERIMENT)
+    if of_set not in suite().errors or config["experiment"] == of_set or record["status"] in ("not_run", "killed"):
+        return None
+    error, ok = suite().errors[of_set], record["status"] == "ok"
+    scene = f"{record['dataset']} {config.get('split')} {config.get('index')}"
+    given = [text.format(value) for key, text in NAMES.items() if (value := _swept(record, key)) is not None]
+    final, start = (as_number(record[part].get(error)) for part in ("metrics", "metrics_start"))
+    curve = _curve(folder, error, final if ok else None)
+    return Attempt(
+        **{"set": of_set, "problem": ", ".join([scene, *given]), "scene": scene, "seed": record["seed"]},
+        row=_row(record),
+        preset=record.get("method") or record["renderer"],
+        status=str(record["status"]),
+        reason=record["reason"],
+        start=inf if start is None else start,
+        final=inf if final is None or not ok else final,
+        cost=curve[-1][0] if curve else 0.0,
+        operations=record["flops"],
+        seconds=loop_seconds(record),
+        waited=said.get("waited_share"),
+        **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
+        threads=said.get("threads"),
+        **{"started": record["started"], "code": record.get("code", ""), "settings": record.get("config_hash", "")},
+        curve=curve,
+        overrides=[text for text in record.get("overrides", ()) if not text.startswith(("results_dir=", "hydra"))],
+    )
+
+
+def _row(record: Record) -> str:
+    """The name of its row, without the loss of the mask, which all rows of a set share."""
+    config = record["config"]
+    own = config.get("renderer") or {}
+    return str(config.get("label") or own.get("_label_") or base_renderer(record))
+
+
+def _swept(record: Record, key: str) -> Any:
+    """The value of a setting in which problems of a scene differ; None where the run's set does not sweep over it."""
+    swept = any(text.startswith(f"{key}=") for text in record.get("overrides", ()))
+    return setting(record["config"], *key.split(".")) if swept else None
+
+
+def _curve(folder: Path, error: str, final: float | None) -> list[list[float]]:
+    """The checkpoints, and the end; a line has the error before its step, and the costs after it."""
+    found, spent = list[list[float]](), [0.0, 0.0]
+    for line in curve_lines(folder) or []:
+        if (value := as_number(line.get(error))) is not None:
+            found.append([*spent, value])
+        spent = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
+    end = [[*spent, final]] if final is not None else []
+    return [[float(f"{number:.5g}") for number in point] for point in found + end]
+
+
+def place(results_dir: Path) -> Path:
+    """The folder of the attempts at this version of the suite."""
+    return results_dir / FOLDER / suite().id
+
+
+def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]:
+    """Joins attempts to those of a results folder; gives the files, one a row."""
+    folder = place(results_dir)
+    files = grouped(joined(attempts, read_attempts(results_dir)[0]).values(), lambda one: _file_name(one.row))
+    folder.mkdir(parents=True, exist_ok=True)
+    return [_write(folder / f"{name}.csv", own) for name, own in sorted(files.items())]
+
+
+def _write(path: Path, attempts: list[Attempt]) -> Path:
+    text = StringIO()
+    table = csv.DictWriter(text, [one.name for one in fields(Attempt)], lineterminator="\n")
+    table.writeheader()
+    for attempt in sorted(attempts, key=lambda one: one.key):
+        table.writerow({name: _cell(value) for name, value in asdict(attempt).items()})
+    write_text(path, text.getvalue())
+    return path
+
+
+def _cell(value: Any) -> Any:
+    return value if isinstance(value, str) else json.dumps(plain(value))
+
+
+def read_attempts(results_dir: Path) -> tuple[list[Attempt], list[str]]:
+    """The attempts that a results folder keeps, and a message for each file that cannot be read."""
+    found, problems = list[Attempt](), list[str]()
+    for path in sorted(place(results_dir).glob("[!.]*.csv")):
+        try:
+            with path.open(encoding="utf-8", newline="") as file:
+                found += [_read(line) for line in csv.DictReader(file)]
+        except (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error) as error:
+            problems.append(f"{path.name}: {error!r}")
+    return found, problems
+
+
+def _read(line: dict[str, str]) -> Attempt:
+    """The attempt of a line.
+
+    Raises:
+        ValueError, TypeError, KeyError: where it has another number of cells, or a cell has another type.
+    """
+    texts = {one.name: one.type is str for one in fields(Attempt)}
+    values: dict[str, Any] = {
+        name: line[name] if is_text else decoded(json.loads(line[name])) for name, is_text in texts.items()
+    }
+    numbers = [values["start"], values["final"], values["cost"], *(n for point in values["curve"] for n in point)]
+    if any(as_number(number) is None for number in numbers) or any(len(point) != 3 for point in values["curve"]):
+        raise ValueError(f"{values['problem']}: errors and costs must be numbers")
+    return Attempt(**values)
+
+
+def _file_name(row: str) -> str:
+    """A file's name for a row, whatever it is called."""
+    name = re.sub(r"[^a-z0-9]+", "_", row.lower()).strip("_")
+    return name if is_plain_name(name) else "row"

@@ -1,0 +1,161 @@
+"""The standing of the suite: which share of problems and targets each row reaches within the budget, at what cost.
+
+After data profiles (Moré and Wild 2009, "Benchmarking derivative-free optimization algorithms") and the targets of COCO
+(Hansen et al. 2021): an error e has the remainder r = log(e / reference) / log(start / reference), 1 at the start and 0
+at the reference, and a target is an r that is reached once the error stays at or below it to the end of the run.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, isfinite, nan
+from typing import Any
+
+import numpy as np
+
+from bench.report.data import statistics
+from bench.report.data.records import grouped
+from bench.report.data.statistics import Interval
+from bench.report.suite.attempts import Attempt, suite
+
+REFERENCE = "dist"  # the preset of the row by whose costs others are divided
+COST, SECONDS = 0, 1  # places in what a target was reached at
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Attempts of several rows at the same problems, one of each row at a problem and seed."""
+
+    attempts: list[Attempt]
+
+    @cached_property
+    def rows(self) -> list[str]:
+        """The rows, the one that reaches the most first; of those that lack a problem, last."""
+        return sorted(
+            grouped(self.attempts, lambda one: one.row), key=lambda row: (self.lacking(row), -self.share(row).value)
+        )
+
+    @cached_property
+    def sets(self) -> list[str]:
+        """The sets of problems, in the order of the suite."""
+        return [name for name in suite().errors if any(one.set == name for one in self.attempts)]
+
+    @cached_property
+    def references(self) -> dict[tuple[str, str], float]:
+        """The reference error of each set and problem: the suite's, or else the least final error of any row."""
+        found = {}
+        for (of_set, problem), own in grouped(self.attempts, lambda one: (one.set, one.problem)).items():
+            known = suite().references.get(of_set, {})
+            stated = known.get(own[0].scene, known.get("all"))
+            found[of_set, problem] = min(one.final for one in own) if stated is None else stated
+        return found
+
+    @cached_property
+    def judged(self) -> list[Attempt]:
+        """The attempts at problems whose start is worse than the reference, so that there is something to do."""
+        return [one for one in self.attempts if one.start > self.references[one.set, one.problem] > 0]
+
+    @cached_property
+    def left_out(self) -> list[str]:
+        """The problems that are not judged."""
+        return sorted(
+            {f"{one.set}: {one.problem}" for one in self.attempts}
+            - {f"{one.set}: {one.problem}" for one in self.judged}
+        )
+
+    @cached_property
+    def reached(self) -> dict[tuple[Any, ...], list[tuple[float, float]]]:
+        """Of each judged attempt by its key, the cost and the seconds of each target; infinite where not reached."""
+        found = {}
+        for one in self.judged:
+            reference = self.references[one.set, one.problem]
+            errors = [reference * (one.start / reference) ** target for target in suite().targets]
+            found[one.key] = [one.reached(error) or (inf, inf) for error in errors]
+        return found
+
+    @cached_property
+    def _by_row(self) -> dict[str, list[Attempt]]:
+        return grouped(self.judged, lambda one: one.row)
+
+    def of(self, row: str, of_set: str | None = None) -> list[Attempt]:
+        """The judged attempts of a row, in one set or in all."""
+        return [one for one in self._by_row.get(row, []) if of_set in (None, one.set)]
+
+    def preset(self, row: str) -> str:
+        """What decides a row's look."""
+        return next(one.preset for one in self.attempts if one.row == row)
+
+    def lacking(self, row: str) -> int:
+        """How many problems and seeds of other rows a row has no attempt at."""
+        return len({one.key[:3] for one in self.attempts} - {one.key[:3] for one in self.attempts if one.row == row})
+
+    def failures(self, row: str) -> Counter[str]:
+        """How many attempts of a row ended otherwise than ok, by their status."""
+        return Counter(one.status for one in self.attempts if one.row == row and not one.ok)
+
+    def share(self, row: str, of_set: str | None = None) -> Interval:
+        """The share of problems and targets that a row reaches, with its interval over scenes; nan without any."""
+        own = self._solved(row, of_set)
+        if not own:
+            return Interval(nan, nan, nan)
+        return statistics.share([sum(hits) for hits in own.values()], [len(hits) for hits in own.values()])
+
+    def _solved(self, row: str, of_set: str | None = None) -> dict[str, list[bool]]:
+        """Of each scene, which targets of its problems a row reaches."""
+        scenes = grouped(self.of(row, of_set), lambda one: one.scene)
+        return {s: [isfinite(at[COST]) for one in own for at in self.reached[one.key]] for s, own in scenes.items()}
+
+    def profile(self, row: str, of_set: str | None = None) -> tuple[list[float], list[float]]:
+        """Costs in ascending order, to the largest of any attempt, and the share that a row has reached at each."""
+        own = self.of(row, of_set)
+        costs = [at[COST] for one in own for at in self.reached[one.key]]
+        known = np.sort([cost for cost in costs if isfinite(cost)])
+        if not own:
+            return [], []
+        steps = np.unique(known).tolist()
+        shares = [float(np.searchsorted(known, cost, side="right")) / len(costs) for cost in steps]
+        return [*steps[:1], *steps, max(one.cost for one in own)], [0.0, *shares, *shares[-1:]] if steps else []
+
+    @cached_property
+    def reference(self) -> str | None:
+        """The row by whose costs others are divided; None where there is none."""
+        return next((row for row in self.rows if self.preset(row) == REFERENCE), None)
+
+    def ratio(self, row: str, of: int = COST) -> Interval | None:
+        """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
+
+        Args:
+            of: `COST`, or `SECONDS`, of attempts on the same machine alone.
+        """
+        if self.reference in (None, row):
+            return None
+        others = {one.key[:3]: one for one in self.of(str(self.reference))}
+        scenes: dict[str, list[tuple[float, float]]] = {}
+        for one in self.of(row):
+            other = others.get(one.key[:3])
+            if other is None or (of == SECONDS and one.machine != other.machine):
+                continue
+            pairs = zip(self.reached[one.key], self.reached[other.key], strict=True)
+            both = [(a[of], b[of]) for a, b in pairs if isfinite(a[of]) and isfinite(b[of])]
+            scenes.setdefault(one.scene, []).extend((max(a, 1e-9), max(b, 1e-9)) for a, b in both)
+        groups = [np.array(pairs).T for pairs in scenes.values() if pairs]
+        return statistics.ratio([g[0] for g in groups], [g[1] for g in groups]) if groups else None
+
+    @cached_property
+    def ranks(self) -> dict[str, int]:
+        """The rank of each row that lacks no problem; rows that cannot be told from the first of a rank share it.
+
+        Two rows are told apart where the interval of the mean difference of their shares over scenes leaves out 0.
+        """
+        found, first, rank = dict[str, int](), "", 1
+        for place, row in enumerate([row for row in self.rows if not self.lacking(row)], 1):
+            if not first or self._apart(first, row):
+                first, rank = row, place
+            found[row] = rank
+        return found
+
+    def _apart(self, first: str, second: str) -> bool:
+        one, other = self._solved(first), self._solved(second)
+        differences = [np.array([np.mean(one[scene]) - np.mean(other[scene])]) for scene in one]
+        found = statistics.bootstrap(differences, lambda drawn: np.mean(drawn, axis=-1), seed=0)
+        return found.known and not found.low <= 0 <= found.high

@@ -1,0 +1,151 @@
+"""The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
+
+from math import isfinite
+from typing import Any
+
+from bench.report.data.runs import together
+from bench.report.study import Result, Runs, Selection, chart, format, statistics, table
+from bench.report.suite.attempts import EXPERIMENT, attempts_of, joined, read_attempts, suite
+from bench.report.suite.standing import SECONDS, Standing
+from bench.report.write import paper
+
+PLACE = 1
+READS = tuple(
+    Selection(f"{EXPERIMENT}{name}", ("task.points", "task.degrees", "task.images.texture")) for name in suite().errors
+)
+VALUES = "field values (a gradient counts as 2, a coarse value as 1/8)"
+LOADED = 0.1  # share of its time that a run waited for a processor, from which on its seconds say little
+NOTES = (
+    "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
+    f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
+    "checkpoint from which the error stays there to the end of the run.",
+    "A run that did not end ok reaches nothing. All rows have one setting and one loss of the mask in a set.",
+    "Share: with exact intervals over scenes (Clopper and Pearson). Ratios: over the targets that both rows reach, the "
+    "median over scenes of the geometric mean. Rows of one rank are not told apart by the bootstrap over scenes.",
+)
+
+
+def make(*several: Runs | None) -> Result:
+    """The chart of all sets and of each, and a line per row."""
+    runs = together(*several)
+    kept, problems = read_attempts(runs.results_dir)
+    shipped, _ = read_attempts(paper.SHIPPED)
+    standing = Standing([*joined(shipped, kept, attempts_of(runs.records, runs.results_dir)).values()])
+    lines = [_line(standing, row) for row in standing.rows]
+    panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
+    figure = chart.draw(panels, 5.0, lines=2, legend=4)
+    return Result(
+        runs,
+        "The suite.",
+        "Share of problems and targets that a renderer has reached over its cost; a run ends at its set's budget.",
+        question="Which renderer gets how much done, and at what cost?",
+        verdict=_verdict(standing, lines),
+        n=_sample(standing),
+        interval="95 % intervals over scenes",
+        estimates=[line["share"] for line in lines],
+        remarks=[*NOTES, *_doubts(standing), *(f"Not read: {problem}" for problem in problems)],
+        columns=_columns(standing),
+        lines=lines,
+        figure=figure,
+        chart={"panels": panels},
+    )
+
+
+def _line(standing: Standing, row: str) -> dict[str, Any]:
+    failures, lacking = standing.failures(row), standing.lacking(row)
+    failed = ", ".join(f"{count} {status}" for status, count in failures.most_common())
+    return {
+        **{"rank": standing.ranks.get(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
+        **{name: standing.share(row, name).value for name in standing.sets},
+        **{"ratio": standing.ratio(row), "seconds": standing.ratio(row, SECONDS)},
+        "failed": ", ".join(filter(None, [failed, f"{lacking} missing" if lacking else ""])),
+    }
+
+
+def _columns(standing: Standing) -> list[table.Column]:
+    def ratio(line: Any, name: str) -> str:
+        return format.MISSING if line[name] is None else str(line[name])
+
+    def value(line: Any, name: str) -> float | None:
+        return None if line[name] is None else line[name].value
+
+    return [
+        table.Column("rank", "Rank", show=table.whole),
+        table.text("row", "Renderer"),
+        table.Column(
+            "share",
+            "Reached",
+            lambda line: line["share"].value,
+            words=lambda line: f"{table.percent(line['share'].value)} {line['share'].ends(100)}".strip(),
+        ),
+        *(table.Column(name, name, show=table.percent) for name in standing.sets),
+        *(
+            table.Column(name, heading, lambda line, n=name: value(line, n), words=lambda line, n=name: ratio(line, n))
+            for name, heading in (("ratio", "Field values over DIST's"), ("seconds", "Seconds over DIST's"))
+        ),
+        table.text("failed", "Failed"),
+        table.PRESET,
+    ]
+
+
+def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
+    lines = []
+    for row in standing.rows:
+        costs, shares = standing.profile(row, of_set)
+        if shares and shares[-1] > 0:
+            lines.append(chart.curve(row, standing.preset(row), costs, shares, step=True))
+    return chart.panel_data(of_set or "all sets", "field values", "share reached", lines)
+
+
+def _sample(standing: Standing) -> str:
+    scenes = {one.scene for one in standing.judged}
+    problems = {(one.set, one.problem) for one in standing.judged}
+    seeds = {one.seed for one in standing.judged}
+    parts = [format.plural(len(scenes), "scene"), format.plural(len(seeds), "seed")]
+    return f"{format.plural(len(problems), 'problem')} ({', '.join(parts)}) of {suite().id}, {len(standing.rows)} rows"
+
+
+def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
+    ranked = [line for line in lines if line["rank"]]
+    if not ranked or not isfinite(ranked[0]["share"].value):
+        return ""
+    best = ranked[0]
+    said = [f"{best['row']} reaches the most, *{table.percent(best['share'].value)}* of problems and targets."]
+    alike = [line["row"] for line in ranked[1:] if line["rank"] == best["rank"]]
+    said += [f"Not told apart from it over {_scenes(standing)}: {', '.join(alike)}."] if alike else []
+    known = [line for line in ranked if line["ratio"] is not None]
+    sure = [
+        line for line, found in zip(known, statistics.differ([one["ratio"] for one in known]), strict=True) if found
+    ]
+    if sure and (least := min(sure, key=lambda line: line["ratio"].value))["ratio"].value < 1:
+        said.append(f"For few field values take {least['row']}: *{format.number(least['ratio'].value)}* of DIST's.")
+    if most := max(lines, key=lambda line: sum(standing.failures(line["row"]).values())):
+        count = sum(standing.failures(most["row"]).values())
+        said += [f"{most['row']} fails most often: *{count}* runs."] if count else []
+    return " ".join([*said, "CPU, small networks and images: of others it says nothing."])
+
+
+def _scenes(standing: Standing) -> str:
+    return format.plural(len({one.scene for one in standing.judged}), "scene")
+
+
+def _doubts(standing: Standing) -> list[str]:
+    """Notes on what may not be trusted: several codes, incomplete rows, processors that were shared."""
+    codes = {row: {one.code for one in standing.attempts if one.row == row} for row in standing.rows}
+    mixed = [row for row, found in codes.items() if len(found) > 1]
+    loaded = sum((one.waited or 0) > LOADED for one in standing.attempts)
+    machines = len({one.machine for one in standing.attempts})
+    return [
+        f"Runs of more than one version of the code: {', '.join(mixed)}." if mixed else "",
+        f"{loaded} of {len(standing.attempts)} runs waited for a processor for more than {table.percent(LOADED)} of "
+        "their time: their seconds say little."
+        if loaded
+        else "",
+        f"Runs of {machines} machines: seconds are compared on the same one alone." if machines > 1 else "",
+        f"Not judged, since the start is as good as the reference: {'; '.join(standing.left_out)}."
+        if standing.left_out
+        else "",
+    ]
+
+
+PAGES = {"suite": make}

@@ -1,0 +1,158 @@
+"""`python -m bench.suite`: the suite, every renderer on the same problems; what has been run is not run again.
+
+    python -m bench.suite                                       the quick size, all renderers that the suite lists
+    python -m bench.suite renderer=newton                       one, beside the results that are shipped
+    python -m bench.suite renderer=custom renderer._target_=mypkg.Mine label=Mine       your own
+    python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
+    python -m bench.suite set=pose,complete                     some sets of problems
+    python -m bench.suite plan=true                             what would run, and for how long
+    python -m bench.suite verify=3                              three of the results again: which agree
+
+Any other KEY=VALUE is that of `python -m bench`.
+"""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from hashlib import sha256
+from math import log
+from pathlib import Path
+
+from bench.records.format import number
+from bench.records.read import RESULTS, read_records
+from bench.records.record import read_record
+from bench.report.suite.attempts import (
+    EXPERIMENT,
+    Attempt,
+    attempts_of,
+    joined,
+    place,
+    read_attempts,
+    suite,
+    write_attempts,
+)
+from bench.report.suite.standing import Standing
+from bench.report.write import paper
+from bench.report.write.html import page_lock
+from bench.report.write.table import percent
+from bench.tables import nearest
+
+PAGE = "suite"  # its name in the folder `paper`
+GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
+AGREE = 0.05  # of an error's logarithm and of a cost: what rounding on another processor may change
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs what is missing of each set, writes the suite's page and prints the standing; gives the exit status."""
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return 0
+    try:
+        own, passed = parsed(arguments)
+        results_dir = Path(next((t.partition("=")[2] for t in passed if t.startswith("results_dir=")), RESULTS))
+        if "verify" in own:
+            return verify(results_dir, int(own["verify"]))
+        for name in own["set"].split(","):
+            code = _sweep(name, suite().sizes[own["suite"]], passed)
+            if code not in GOES_ON:
+                return code
+        return 0 if "plan=true" in passed else show(results_dir)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """The keys of this command, with their defaults, and what is passed on.
+
+    Raises:
+        ValueError: for an unknown size or set, or a number that is none.
+    """
+    own, passed = {"suite": "quick", "set": ",".join(suite().errors)}, list[str]()
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in ("suite", "set", "verify"):
+            own[key] = value
+        elif "=" in argument:
+            passed.append(argument)
+        else:
+            raise ValueError(f"{argument!r} is no KEY=VALUE: python -m bench.suite --help has examples")
+    for known, given in ((suite().sizes, [own["suite"]]), (suite().errors, own["set"].split(","))):
+        for word in given:
+            if word not in known:
+                raise ValueError(
+                    f"unknown {'suite' if known is suite().sizes else 'set'} {word!r}{nearest(word, [*known])}"
+                )
+    if not own.get("verify", "1").isdecimal() or own.get("verify") == "0":
+        raise ValueError(f"verify must be a number of results, such as verify=3, not {own['verify']!r}")
+    return own, passed
+
+
+def _sweep(name: str, size: str, passed: list[str]) -> int:
+    command = [sys.executable, "-m", "bench", "-m", f"+experiment={EXPERIMENT}{name}", f"sizes.chosen={size}", *passed]
+    return subprocess.run(command, check=False).returncode
+
+
+def show(results_dir: Path) -> int:
+    """Keeps the attempts of a results folder, writes the suite's page, and prints a line a set and the standing."""
+    with page_lock(results_dir):
+        records, _ = read_records(results_dir)
+        write_attempts(attempts_of(records, results_dir), results_dir)
+        written = paper.write_paper(records, results_dir, only=PAGE)
+    kept, problems = read_attempts(results_dir)
+    standing = Standing([*joined(read_attempts(paper.SHIPPED)[0], kept).values()])
+    for problem in problems:
+        print(f"not read: {problem}", file=sys.stderr)
+    for row in standing.rows:
+        parts = [
+            f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
+        ]
+        ratio, failed = standing.ratio(row), sum(standing.failures(row).values())
+        parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
+        parts += [f"{failed} failed"] if failed else []
+        parts += [f"{lacking} not run"] if (lacking := standing.lacking(row)) else []
+        rank = str(standing.ranks.get(row, "-"))
+        print(f"{rank:>3}  {row:<24} {percent(standing.share(row).value):>5}  {', '.join(parts)}")
+    print(*(path.with_suffix(".png") for path in written), sep="\n")
+    return 0
+
+
+def verify(results_dir: Path, count: int) -> int:
+    """Runs some of the kept attempts again, the same ones each time, and says which agree; 1 where one does not.
+
+    Raises:
+        ValueError: where there is none.
+    """
+    kept, problems = read_attempts(results_dir)
+    found = [one for one in kept if one.ok]
+    if not found:
+        raise ValueError(f"{place(results_dir)} has no results that ended ok: type python -m bench.suite")
+    chosen = sorted(found, key=lambda one: sha256(repr(one.key).encode()).digest())[:count]
+    agree = [_agrees(one) for one in chosen]
+    for problem in problems:
+        print(f"not read: {problem}", file=sys.stderr)
+    return 0 if all(agree) and not problems else 1
+
+
+def _agrees(attempt: Attempt) -> bool:
+    """Whether an attempt gives the same errors and costs once more; prints a line about it."""
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = [text for text in attempt.overrides if not text.lstrip("+~").startswith(("hydra", "-"))]
+        command = [sys.executable, "-m", "bench", *overrides, f"results_dir={folder}"]
+        said = subprocess.run(command, check=False, capture_output=True, text=True)
+        runs = [*(Path(folder) / "runs").glob("*/record.json")]
+        again = attempts_of(map(read_record, (path.parent for path in runs)), Path(folder))
+    name = f"{attempt.set}: {attempt.problem}, seed {attempt.seed}, {attempt.row}"
+    if not again:
+        print(f"not run again: {name}: {' '.join(said.stderr.split())[-300:]}")
+        return False
+    pairs = [(attempt.final, again[0].final), (attempt.cost, again[0].cost)]
+    same = all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
+    told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
+    print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}")
+    return same
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

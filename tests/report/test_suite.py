@@ -1,0 +1,222 @@
+"""The suite: what an attempt has reached and when, how rows stand, and that results outlive their run folders."""
+
+import json
+from dataclasses import replace
+from itertools import permutations
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from bench import merge
+from bench.records.read import read_records
+from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
+from bench.report.suite.standing import SECONDS, Standing
+from bench.suite import main, parsed, show
+from bench.tables import read_yaml
+from tests.report.test_report_paper import write_run
+
+SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
+
+
+def attempt(row: str, scene: str, errors: dict[float, float], **changed) -> Attempt:
+    """One whose curve has these errors by cost, the first the start and the last the end; a second is 1000 values."""
+    curve = [[cost, cost / 1000, error] for cost, error in errors.items()]
+    known = {
+        **{"set": "complete", "problem": f"{scene}, 20 points", "scene": scene, "seed": 0, "row": row},
+        **{"preset": row.lower(), "status": "ok", "reason": "", "start": curve[0][2], "final": curve[-1][2]},
+        **{"cost": curve[-1][0], "operations": None, "seconds": 1.0, "waited": None, "cpu": "one", "device": "cpu"},
+        **{"threads": 1, "kernels": "torch", "started": "2026-01-01T00:00:00+00:00", "commit": "", "code": "a"},
+        **{"settings": "", "curve": curve, "overrides": ["+experiment=core_complete", "task.points=20"]},
+    }
+    return Attempt(**(known | changed))
+
+
+def field(of: list[tuple[str, float, float]]) -> Standing:
+    """Rows with their final error and what they pay for each step, on all scenes."""
+    return Standing(
+        [
+            attempt(row, scene, {0: 1.0, pay: max(final, 0.1), 2 * pay: final})
+            for row, final, pay in of
+            for scene in SCENES
+        ]
+    )
+
+
+def write_completion(results: Path, errors: list[float], **changed) -> Path:
+    """A run of the suite whose line n has these errors and n + 1 thousand values; the last error is that of its end."""
+    settings = {
+        "split": "test",
+        "task": {"points": "20"},
+        "renderer": {"_label_": "Mine"},
+        **changed.pop("settings", {}),
+    }
+    changed = {"metrics": {"chamfer_l1": errors[-1]}, "metrics_start": {"chamfer_l1": errors[0]}} | changed
+    folder = write_run(
+        results, "core_complete", None, overrides=["task.points=20", "results_dir=x"], settings=settings, **changed
+    )
+    lines = [
+        {"iteration": n, "seconds": n + 1.0, "cost": 1000.0 * (n + 1), "total": 1.0, "chamfer_l1": error}
+        for n, error in enumerate(errors[:-1])
+    ]
+    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def test_a_checkpoint_has_the_costs_of_the_line_before_it(tmp_path):
+    write_completion(tmp_path, [0.8, 0.4, 0.2])
+    (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
+    assert found.curve == [[0, 0, 0.8], [1000, 1, 0.4], [2000, 2, 0.2]]
+    assert (found.set, found.problem, found.row, found.start, found.final) == (
+        "complete", "car test 0, 20 points", "Mine", 0.8, 0.2,
+    )  # fmt: skip
+    assert found.overrides == ["task.points=20"]
+
+
+def test_an_error_is_reached_where_it_stays_reached():
+    one = attempt("A", "s", {0: 8, 10: 1, 20: 4, 30: 2, 40: 1})
+    assert one.reached(5) == (10, 0.01)
+    assert one.reached(3) == (30, 0.03)  # it was below at 10, and above again at 20
+    assert one.reached(0.5) is None
+    assert replace(one, status="nan").reached(5) is None
+
+
+def test_targets_are_shares_of_the_logarithm_between_start_and_reference():
+    standing = Standing([attempt("Dist", "s", {0: 100, 7: 10, 9: 1}), attempt("B", "s", {0: 100, 3: 10.5})])
+    assert standing.references == {("complete", "s, 20 points"): 1}
+    assert standing.reached["complete", "s, 20 points", 0, "Dist"] == [(7, 0.007), *[(9, 0.009)] * 4]
+    assert standing.reached["complete", "s, 20 points", 0, "B"] == [(inf, inf)] * 5  # 10.5 is above the root of 100
+
+
+def test_the_shipped_references_are_used_where_there_are_any():
+    known = suite().references["complete"]
+    scene, error = next(iter(known.items()))
+    assert Standing([attempt("A", scene, {0: 1.0, 1: 0.9})]).references == {("complete", f"{scene}, 20 points"): error}
+    assert all(0 < error < 0.1 for error in known.values())
+
+
+def test_rows_stand_by_what_they_reach_and_share_a_rank_where_they_cannot_be_told_apart():
+    standing = field([("Dist", 0.011, 100.0), ("Exact", 0.01, 300.0), ("Same", 0.011, 100.0), ("Lost", 0.5, 1.0)])
+    assert standing.rows == ["Exact", "Dist", "Same", "Lost"]
+    assert [standing.share(row).value for row in standing.rows] == [1.0, 0.8, 0.8, 0.0]
+    assert standing.ranks == {"Exact": 1, "Dist": 2, "Same": 2, "Lost": 4}
+    assert standing.ratio("Exact").value == pytest.approx(3) and standing.ratio("Dist") is None
+    assert standing.ratio("Lost") is None  # no target that both reach
+    assert standing.profile("Exact") == ([300, 300, 600, 600], [0, 0.2, 1, 1])
+
+
+def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
+    whole = field([("Dist", 0.01, 100.0), ("Part", 0.01, 100.0)]).attempts
+    standing = Standing([replace(one, status="unsupported") if one.row == "Dist" else one for one in whole[:-1]])
+    assert standing.ranks == {"Dist": 1} and standing.lacking("Part") == 1
+    assert standing.share("Dist").value == 0 and standing.failures("Dist") == {"unsupported": len(SCENES)}
+
+
+def test_seconds_are_compared_on_the_same_machine_alone():
+    whole = field([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)]).attempts
+    assert Standing(whole).ratio("Mine", SECONDS).value == pytest.approx(2)
+    moved = [replace(one, cpu="another") if one.row == "Mine" else one for one in whole]
+    assert Standing(moved).ratio("Mine", SECONDS) is None and Standing(moved).ratio("Mine").value == pytest.approx(2)
+
+
+def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
+    good = attempt("A b", "s", {0: 1.0, 5: 0.5}, reason='said "no", twice', started="2026-01-02T00:00:00+00:00")
+    killed = replace(good, status="oom", final=inf, started="2026-01-03T00:00:00+00:00")
+    older = replace(good, started="2026-01-01T00:00:00+00:00")
+    other = replace(good, row="A-b")  # whose file has the same name
+    for order in permutations([good, killed, older, other]):
+        assert joined(order) == {good.key: good, other.key: other}
+    write_attempts([killed, other], tmp_path)
+    write_attempts([good], tmp_path)
+    assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [good, other]
+    assert [path.name for path in place(tmp_path).iterdir()] == ["a_b.csv"]
+
+
+def test_two_halves_merged_are_the_whole(tmp_path):
+    whole = field([("Dist", 0.01, 100.0), ("B", 0.02, 50.0)]).attempts
+    write_attempts(whole[:5], tmp_path / "one")
+    write_attempts(whole[5:], tmp_path / "two")
+    merge.merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
+    assert joined(read_attempts(tmp_path / "both")[0]) == joined(whole)
+
+
+def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
+    write_attempts([attempt("A", "s", {0: 1.0, 5: 0.5})], tmp_path)
+    (place(tmp_path) / "b.csv").write_text("set,problem\ncomplete,s\n")
+    found, problems = read_attempts(tmp_path)
+    assert len(found) == 1 and problems[0].startswith("b.csv")
+
+
+def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, monkeypatch, capsys):
+    shipped = tmp_path / "shipped"
+    write_attempts([attempt("Dist", "car test 0", {0: 0.8, 500: 0.011, 600: 0.01})], shipped)
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
+    write_completion(tmp_path / "own", [0.8, 0.4, 0.05])
+    assert show(tmp_path / "own") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].split()[:2] == ["1", "Dist"] and "Mine" in said[1] and Path(said[-1]).is_file()
+    table = (tmp_path / "own" / "paper" / "suite.md").read_text()
+    assert "| Dist |" in table and "| Mine |" in table and "reaches the most" in table
+    assert [one.row for one in read_attempts(tmp_path / "own")[0]] == ["Mine"]
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [("suite=large", "unknown suite 'large'"), ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
+     ("verify=0", "verify must be")],
+)  # fmt: skip
+def test_a_wrong_argument_is_told(argument, said, capsys):
+    assert main([argument]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_what_is_not_its_own_is_passed_on():
+    own, passed = parsed(["suite=core", "renderer=custom", "renderer._target_=a.B", "label=Mine"])
+    assert own["suite"] == "core" and passed == ["renderer=custom", "renderer._target_=a.B", "label=Mine"]
+
+
+def test_every_set_is_an_experiment_with_each_size():
+    for name in suite().errors:
+        sizes = read_yaml(Path("conf") / "experiment" / f"core_{name}.yaml")["sizes"]
+        assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
+
+
+MINE = '''
+import time
+from tests.user_renderer import Mine as Exact
+
+class Shifted(Exact):
+    """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: its hits are off."""
+    def render(self, field, rays):
+        found = super().render(field, rays)
+        points = found.points + 0.01 * rays.directions
+        return type(found)(found.distance + 0.01, found.status, points, found.residual, found.closest)
+
+class Slow(Exact):
+    """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: it sleeps."""
+    def render(self, field, rays):
+        time.sleep(0.05)
+        return super().render(field, rays)
+'''
+
+
+@pytest.mark.slow
+def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_path, monkeypatch):
+    (tmp_path / "odd.py").write_text(MINE)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path.cwd()}")
+    results = tmp_path / "results"
+    asked = ["set=complete", "task.points=dense", "index=0,1", "dataset=sofa,plane", f"results_dir={results}"]
+    own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}
+    for label, target in own.items():
+        assert main([*asked, "renderer=custom", f"renderer._target_={target}", f"label={label}"]) == 0
+    standing = Standing(read_attempts(results)[0])
+    assert standing.share("Shifted").value < standing.share("Exact").value == standing.share("Slow").value
+    spent = {row: [(one.cost, one.seconds) for one in standing.of(row)] for row in standing.rows}
+    assert [cost for cost, _ in spent["Slow"]] == [cost for cost, _ in spent["Exact"]]
+    assert all(slow > 5 + exact / 2 for (_, slow), (_, exact) in zip(spent["Slow"], spent["Exact"], strict=True))
+    assert main(["verify=1", f"results_dir={results}"]) == 0
+    kept = [replace(one, final=one.final / 2) for one in read_attempts(results)[0]]
+    for path in place(results).iterdir():
+        path.unlink()
+    write_attempts(kept, results)
+    assert main(["verify=1", f"results_dir={results}"]) == 1
