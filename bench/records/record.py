@@ -307,4 +307,6 @@ def decoded(value: Any) -> Any:
     """The same data with the strings "inf", "-inf" and "nan" as floats: the inverse of `plain`."""
     if isinstance(value, dict):
         return {name: decoded(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [decoded(inner) for inner in value]
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value

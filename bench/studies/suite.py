@@ -14,14 +14,13 @@ READS = tuple(
     Selection(f"{EXPERIMENT}{name}", ("task.points", "task.degrees", "task.images.texture")) for name in suite().errors
 )
 VALUES = "field values (a gradient counts as 2, a coarse value as 1/8)"
-LOADED = 0.1  # share of its time that a run waited for a processor, from which on its seconds say little
 NOTES = (
     "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
     f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
     "checkpoint from which the error stays there to the end of the run.",
     "A run that did not end ok reaches nothing. All rows have one setting and one loss of the mask in a set.",
-    "Share: with exact intervals over scenes (Clopper and Pearson). Ratios: over the targets that both rows reach, the "
-    "median over scenes of the geometric mean. Rows of one rank are not told apart by the bootstrap over scenes.",
+    "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Rows share a rank "
+    "where the bootstrap over scenes does not tell their shares apart.",
 )
 
 
@@ -41,7 +40,7 @@ def make(*several: Runs | None) -> Result:
         question="Which renderer gets how much done, and at what cost?",
         verdict=_verdict(standing, lines),
         n=_sample(standing),
-        interval="95 % intervals over scenes",
+        interval="95 % intervals by the bootstrap over scenes",
         estimates=[line["share"] for line in lines],
         remarks=[*NOTES, *_doubts(standing), *(f"Not read: {problem}" for problem in problems)],
         columns=_columns(standing),
@@ -112,7 +111,9 @@ def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
     best = ranked[0]
     said = [f"{best['row']} reaches the most, *{table.percent(best['share'].value)}* of problems and targets."]
     alike = [line["row"] for line in ranked[1:] if line["rank"] == best["rank"]]
-    said += [f"Not told apart from it over {_scenes(standing)}: {', '.join(alike)}."] if alike else []
+    if standing.resolution is not None:
+        told = f"{_scenes(standing)} tell shares apart that differ by *{table.percent(standing.resolution)}* or more"
+        said.append(f"{told}: {len(alike) or 'none'} of {len(ranked) - 1} others are not told from it.")
     known = [line for line in ranked if line["ratio"] is not None]
     sure = [
         line for line, found in zip(known, statistics.differ([one["ratio"] for one in known]), strict=True) if found
@@ -133,14 +134,9 @@ def _doubts(standing: Standing) -> list[str]:
     """Notes on what may not be trusted: several codes, incomplete rows, processors that were shared."""
     codes = {row: {one.code for one in standing.attempts if one.row == row} for row in standing.rows}
     mixed = [row for row, found in codes.items() if len(found) > 1]
-    loaded = sum((one.waited or 0) > LOADED for one in standing.attempts)
     machines = len({one.machine for one in standing.attempts})
     return [
         f"Runs of more than one version of the code: {', '.join(mixed)}." if mixed else "",
-        f"{loaded} of {len(standing.attempts)} runs waited for a processor for more than {table.percent(LOADED)} of "
-        "their time: their seconds say little."
-        if loaded
-        else "",
         f"Runs of {machines} machines: seconds are compared on the same one alone." if machines > 1 else "",
         f"Not judged, since the start is as good as the reference: {'; '.join(standing.left_out)}."
         if standing.left_out

@@ -121,12 +121,15 @@ def test_seconds_are_compared_on_the_same_machine_alone():
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
     good = attempt("A b", "s", {0: 1.0, 5: 0.5}, reason='said "no", twice', started="2026-01-02T00:00:00+00:00")
-    killed = replace(good, status="oom", final=inf, started="2026-01-03T00:00:00+00:00")
+    killed = replace(
+        good, status="oom", final=inf, curve=[[0.0, 0.0, 1.0], [5.0, 0.005, inf]], started="2026-01-03T00:00:00+00:00"
+    )
     older = replace(good, started="2026-01-01T00:00:00+00:00")
     other = replace(good, row="A-b")  # whose file has the same name
     for order in permutations([good, killed, older, other]):
         assert joined(order) == {good.key: good, other.key: other}
     write_attempts([killed, other], tmp_path)
+    assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(killed), repr(other)}
     write_attempts([good], tmp_path)
     assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [good, other]
     assert [path.name for path in place(tmp_path).iterdir()] == ["a_b.csv"]

@@ -144,9 +144,10 @@ class Runs:
 
     def mixed(self) -> list[str]:
         """The settings of view and evaluation in which an experiment's runs differ, of prior and field in a family."""
-        experiments = grouped(self.records, lambda record: record["config"].get("experiment"))
-        together = [(records, ("view", "evaluation")) for records in experiments.values()]
-        together += [(records, ("prior", "field")) for records in self.families().values()]
+        experiments = grouped(self.records, lambda record: record["config"].get("experiment")).values()
+        together = [(records, ("view", "evaluation")) for records in experiments]
+        families = (records for own in experiments for records in grouped(own, family).values())
+        together += [(records, ("prior", "field")) for records in families]
         found: dict[str, None] = {}
         for records, parts in together:
             known = [flat({part: record["config"].get(part) for part in parts}, "") for record in records]
@@ -230,7 +231,8 @@ def _part(record: Record, key: str, selection: Selection) -> Any:
     found = setting(record["config"], *key.split("."))
     if not isinstance(found, dict):
         return found
-    return {name: value for name, value in found.items() if f"{key}.{name}" not in selection.conditions}
+    own = {name: _part(record, f"{key}.{name}", selection) for name in found}
+    return {name: value for name, value in own.items() if f"{key}.{name}" not in selection.conditions}
 
 
 def _row(record: Record) -> Hashable:

@@ -6,6 +6,7 @@ at the reference, and a target is an r that is reached once the error stays at o
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, isfinite, nan
@@ -95,15 +96,15 @@ class Standing:
 
     def share(self, row: str, of_set: str | None = None) -> Interval:
         """The share of problems and targets that a row reaches, with its interval over scenes; nan without any."""
-        own = self._solved(row, of_set)
-        if not own:
-            return Interval(nan, nan, nan)
-        return statistics.share([sum(hits) for hits in own.values()], [len(hits) for hits in own.values()])
+        return _mean(self._solved(row, of_set).values())
 
-    def _solved(self, row: str, of_set: str | None = None) -> dict[str, list[bool]]:
-        """Of each scene, which targets of its problems a row reaches."""
-        scenes = grouped(self.of(row, of_set), lambda one: one.scene)
-        return {s: [isfinite(at[COST]) for one in own for at in self.reached[one.key]] for s, own in scenes.items()}
+    def _solved(self, row: str, of_set: str | None = None) -> dict[str, np.ndarray]:
+        """Of each scene, which targets of its problems a row reaches: 1 or 0."""
+        scenes = grouped(sorted(self.of(row, of_set), key=lambda one: one.key), lambda one: one.scene)
+        return {
+            scene: np.array([float(isfinite(at[COST])) for one in own for at in self.reached[one.key]])
+            for scene, own in scenes.items()
+        }
 
     def profile(self, row: str, of_set: str | None = None) -> tuple[list[float], list[float]]:
         """Costs in ascending order, to the largest of any attempt, and the share that a row has reached at each."""
@@ -143,19 +144,33 @@ class Standing:
 
     @cached_property
     def ranks(self) -> dict[str, int]:
-        """The rank of each row that lacks no problem; rows that cannot be told from the first of a rank share it.
-
-        Two rows are told apart where the interval of the mean difference of their shares over scenes leaves out 0.
-        """
+        """The rank of each row that lacks no problem; rows that cannot be told from the first of a rank share it."""
         found, first, rank = dict[str, int](), "", 1
         for place, row in enumerate([row for row in self.rows if not self.lacking(row)], 1):
-            if not first or self._apart(first, row):
+            if not first or (between := self.difference(first, row)).low > 0 or between.high < 0:
                 first, rank = row, place
             found[row] = rank
         return found
 
-    def _apart(self, first: str, second: str) -> bool:
+    def difference(self, first: str, second: str) -> Interval:
+        """By how much the share of one row is larger than that of another with the same problems."""
         one, other = self._solved(first), self._solved(second)
-        differences = [np.array([np.mean(one[scene]) - np.mean(other[scene])]) for scene in one]
-        found = statistics.bootstrap(differences, lambda drawn: np.mean(drawn, axis=-1), seed=0)
-        return found.known and not found.low <= 0 <= found.high
+        return _mean(one[scene] - other[scene] for scene in one)
+
+    @cached_property
+    def resolution(self) -> float | None:
+        """The difference of shares that so many scenes just tell apart, in the median of rows; None if they tell none.
+
+        It is half the width of the interval of a row's difference from the first one.
+        """
+        first, *others = self.ranks or [""]
+        found = [self.difference(first, row) for row in others]
+        return float(np.median([(one.high - one.low) / 2 for one in found])) if found and found[0].known else None
+
+
+def _mean(scenes: Iterable[np.ndarray]) -> Interval:
+    """The mean over all targets, with the bootstrap interval over scenes; nan without a target."""
+    groups = [*scenes]
+    if not groups:
+        return Interval(nan, nan, nan)
+    return statistics.bootstrap(groups, lambda drawn: np.mean(drawn, axis=-1), seed=0)
