@@ -108,9 +108,9 @@ def show(results_dir: Path) -> int:
         parts = [
             f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
         ]
-        ratio, failed = standing.ratio(row), sum(standing.failures(row).values())
+        ratio = standing.ratio(row)
         parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
-        parts += [f"{failed} failed"] if failed else []
+        parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
         parts += [f"{lacking} not run"] if (lacking := standing.lacking(row)) else []
         rank = str(standing.ranks.get(row, "-"))
         print(f"{rank:>3}  {row:<24} {percent(standing.share(row).value):>5}  {', '.join(parts)}")

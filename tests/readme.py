@@ -7,14 +7,12 @@ from pathlib import Path
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
-ROWS = {  # of README's table: the methods of one_loss and the renderers of the atlas
-    **{"Newton": ("newton_mask", "newton"), "DIST": ("dist_mask", "dist"), "IDR": ("idr_mask", "idr")},
-    **{"DVR": ("dvr_mask", "dvr"), "NeuS": ("neus_mask", "neus"), "VolSDF": ("volsdf_mask", "volsdf_budget")},
-    **{"UNISURF": ("unisurf_mask", "unisurf"), "Naive": ("naive_mask", "naive_parallel")},
-    **{"Range analysis": ("range_analysis_mask", "range_analysis"), "Mesh proxy": ("mesh_mask", "mesh_proxy")},
-    "Relaxed boundary": ("relaxed_boundary_mask", "relaxed_boundary"),
+ROWS = {  # of README's table: the rows of the suite and the renderers of the atlas
+    **{"newton": "newton", "dist": "dist", "idr": "idr", "dvr_64_early_stop": "dvr", "neus_budget": "neus"},
+    **{"volsdf_budget": "volsdf_budget", "unisurf_budget": "unisurf", "naive": "naive_parallel"},
+    **{"range_analysis": "range_analysis", "mesh_48": "mesh_proxy", "relaxed_boundary": "relaxed_boundary"},
 }
-HEAD = "| renderer | error, times DIST's | seconds of the loop | mean rank on hard scenes |\n|---|---|---|---|\n"
+HEAD = "| renderer | targets reached | field values, times DIST's | mean rank on hard scenes |\n|---|---|---|---|\n"
 LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
 BLOCK = re.compile(r"^```[\s\S]*?^```$|^ {4}.*$|<[^>]*>", re.MULTILINE)  # what is typed, and HTML
 ADDRESS = re.compile(r"!?\[([^]]*)\]\([^)]*\)")  # the text of a link stays
@@ -36,19 +34,18 @@ def wrongs(text: str) -> list[str]:
 
 
 def table() -> str:
-    """README's table, from the committed CSVs of one_loss and of the atlas, the quickest row first."""
-    errors, ranks = ({row["preset"]: row for row in reversed(_rows(name))} for name in ("one_loss", "stability_cost"))
-    lines = [(float(errors[method]["seconds"]), name, method, preset) for name, (method, preset) in ROWS.items()]
-    error = {method: float(row["error"]) for method, row in errors.items()}
+    """README's table, from the committed CSVs of the suite and of the atlas, in the order of the suite."""
+    ranks = {row["preset"]: float(row["rank"]) for row in reversed(_rows("stability_cost"))}
     return HEAD + "\n".join(
-        f"| {name} | {_ratio(error[method], error['dist_mask'])} | {seconds:.0f} | {float(ranks[preset]['rank']):.1f} |"
-        for seconds, name, method, preset in sorted(lines)
+        f"| {row['row']} | {100 * float(row['share']):.0f} % | {_ratio(row['ratio'])} | "
+        f"{ranks[ROWS[row['preset']]]:.1f} |"
+        for row in _rows("suite")
     )
 
 
-def _ratio(error: float, reference: float) -> str:
-    """The ratio of two errors, rounded once; 1 of DIST itself."""
-    return "1" if error == reference else f"{error / reference:.2f}"
+def _ratio(text: str) -> str:
+    """A ratio to two digits; 1 of DIST itself, which has none."""
+    return f"{float(text):.2g}" if text else "1"
 
 
 def _rows(name: str) -> list[dict[str, str]]:
