@@ -24,6 +24,8 @@ from bench.records.read import RESULTS, read_records
 from bench.records.record import read_record
 from bench.report.suite.attempts import (
     EXPERIMENT,
+    GIVEN,
+    STATED,
     Attempt,
     attempts_of,
     joined,
@@ -50,14 +52,14 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     try:
         own, passed = parsed(arguments)
-        results_dir = Path(next((t.partition("=")[2] for t in passed if t.startswith("results_dir=")), RESULTS))
+        results_dir = Path(dict(text.split("=", 1) for text in passed).get("results_dir", RESULTS))
         if "verify" in own:
             return verify(results_dir, int(own["verify"]))
         for name in own["set"].split(","):
             code = _sweep(name, suite().sizes[own["suite"]], passed)
             if code not in GOES_ON:
                 return code
-        return 0 if "plan=true" in passed else show(results_dir)
+        return 0 if "plan=true" in map(str.lower, passed) else show(results_dir)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -74,6 +76,8 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "verify"):
             own[key] = value
+        elif key.lstrip("+~").partition(".")[0] in STATED and key not in [given for given, _ in GIVEN.values()]:
+            raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
         elif "=" in argument:
             passed.append(argument)
         else:
@@ -91,7 +95,11 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
 
 def _sweep(name: str, size: str, passed: list[str]) -> int:
     command = [sys.executable, "-m", "bench", "-m", f"+experiment={EXPERIMENT}{name}", f"sizes.chosen={size}", *passed]
-    return subprocess.run(command, check=False).returncode
+    with subprocess.Popen(command) as sweep:
+        try:
+            return sweep.wait()
+        except KeyboardInterrupt:  # it got one too, and says what has ended
+            return sweep.wait()
 
 
 def show(results_dir: Path) -> int:
@@ -124,7 +132,7 @@ def verify(results_dir: Path, count: int) -> int:
     Raises:
         ValueError: where there is none.
     """
-    kept, problems = read_attempts(results_dir)
+    kept, problems = read_attempts(results_dir if place(results_dir).is_dir() else paper.SHIPPED)
     found = [one for one in kept if one.ok]
     if not found:
         raise ValueError(f"{place(results_dir)} has no results that ended ok: type python -m bench.suite")
@@ -148,9 +156,10 @@ def _agrees(attempt: Attempt) -> bool:
         print(f"not run again: {name}: {' '.join(said.stderr.split())[-300:]}")
         return False
     pairs = [(attempt.final, again[0].final), (attempt.cost, again[0].cost)]
-    same = all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
+    same = again[0].ok and all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
     told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
-    print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}")
+    ended = "" if again[0].ok else f"; {again[0].status}: {again[0].reason}"
+    print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}{ended}")
     return same
 
 

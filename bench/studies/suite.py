@@ -13,7 +13,6 @@ PLACE = 1
 READS = tuple(
     Selection(f"{EXPERIMENT}{name}", ("task.points", "task.degrees", "task.images.texture")) for name in suite().errors
 )
-VALUES = "field values (a gradient counts as 2, a coarse value as 1/8)"
 NOTES = (
     "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
     f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
@@ -131,14 +130,21 @@ def _scenes(standing: Standing) -> str:
 
 
 def _doubts(standing: Standing) -> list[str]:
-    """Notes on what may not be trusted: several codes, incomplete rows, processors that were shared."""
+    """Notes on what may not be trusted: several codes or settings, attempts that are not judged."""
+    stated = {(one.set, one.settings) for one in standing.attempts if one.row == standing.reference}
+    other = sorted({one.row for one in standing.attempts if stated and (one.set, one.settings) not in stated})
+    alone = len(standing.everything) - len(standing.attempts)
     codes = {row: {one.code for one in standing.attempts if one.row == row} for row in standing.rows}
     mixed = [row for row, found in codes.items() if len(found) > 1]
     machines = len({one.machine for one in standing.attempts})
     return [
+        f"Of other settings than the suite's, so not to be compared: {', '.join(other)}." if other else "",
+        f"Not shown: {alone} runs at problems that DIST has no run at: python -m bench.suite renderer=dist makes them."
+        if alone
+        else "",
         f"Runs of more than one version of the code: {', '.join(mixed)}." if mixed else "",
         f"Runs of {machines} machines: seconds are compared on the same one alone." if machines > 1 else "",
-        f"Not judged, since the start is as good as the reference: {'; '.join(standing.left_out)}."
+        f"Not judged, since there is no start that is worse than the reference: {'; '.join(standing.left_out)}."
         if standing.left_out
         else "",
     ]

@@ -13,9 +13,10 @@ from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
 from bench.suite import main, parsed, show
-from bench.tables import read_yaml
+from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
 
+DIST = choice("renderer", "dist")["_label_"]
 SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
 
 
@@ -112,6 +113,24 @@ def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
     assert standing.share("Dist").value == 0 and standing.failures("Dist") == {"unsupported": len(SCENES)}
 
 
+def test_problems_that_the_reference_row_lacks_are_not_judged():
+    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]).attempts
+    standing = Standing([*whole, replace(whole[-1], problem="another", scene="another")])
+    assert standing.ranks.keys() == {"Dist", "B"} and len(standing.attempts) == len(whole)
+    tweaked = [replace(one, row="A tweak") for one in whole if one.row == "Dist"]
+    named = [replace(one, row=DIST) if one.row == "Dist" else one for one in whole]
+    assert Standing([*tweaked, *named]).reference == DIST
+
+
+def test_a_start_that_was_not_measured_is_that_of_the_other_rows():
+    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]).attempts
+    lost = [replace(one, start=inf, final=inf, status="crashed") if one.row == "B" else one for one in whole]
+    standing = Standing(lost)
+    assert standing.share("B").value == 0 and len(standing.of("B")) == len(SCENES)
+    without = replace(whole[0], start=inf, final=inf, curve=[[0.0, 0.0, inf], [5.0, 1.0, inf]])
+    assert Standing([without]).judged == [] and without.reached(inf) is None
+
+
 def test_seconds_are_compared_on_the_same_machine_alone():
     whole = field([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)]).attempts
     assert Standing(whole).ratio("Mine", SECONDS).value == pytest.approx(2)
@@ -148,6 +167,11 @@ def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     (place(tmp_path) / "b.csv").write_text("set,problem\ncomplete,s\n")
     found, problems = read_attempts(tmp_path)
     assert len(found) == 1 and problems[0].startswith("b.csv")
+    with pytest.raises(ValueError, match=r"b\.csv"):  # whose lines would be lost
+        write_attempts(found, tmp_path)
+    for wrong in ({"final": -1.0}, {"set": "none"}, {"status": "fine"}):
+        write_attempts([replace(found[0], **wrong)], tmp_path / str(wrong))
+        assert read_attempts(tmp_path / str(wrong))[0] == []
 
 
 def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, monkeypatch, capsys):
@@ -166,7 +190,7 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
 @pytest.mark.parametrize(
     ("argument", "said"),
     [("suite=large", "unknown suite 'large'"), ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
-     ("verify=0", "verify must be")],
+     ("verify=0", "verify must be"), ("task.optimiser.budget=1e9", "is stated by the suite")],
 )  # fmt: skip
 def test_a_wrong_argument_is_told(argument, said, capsys):
     assert main([argument]) == 2

@@ -11,18 +11,24 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from io import StringIO
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
+from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import as_number, decoded, is_plain_name, plain, write_text
+from bench.records.record import RunStatus, as_number, decoded, digest, is_plain_name, plain, write_text
 from bench.report.data.records import Record, base_renderer, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
+NO_ATTEMPTS = ("not_run", "killed", "refused")  # statuses of runs that say nothing of a renderer
 FOLDER = "suite"  # of a results folder, with a folder a version in it
 EXPERIMENT = "core_"  # in front of the name of a set
-NAMES = {"task.points": "{} points", "task.degrees": "{} degrees", "task.images.texture": "{}"}  # within a set
+GIVEN = {  # the setting in which the problems of a scene differ, and its name
+    **{"complete": ("task.points", "{} points"), "pose": ("task.degrees", "{:g} degrees")},
+    "reconstruct": ("task.images.texture", "{}"),
+}
+STATED = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")  # by a set, for all renderers
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Attempt:
         start, final: the errors before and after; `final` is infinite where the run did not end ok.
         cost, operations, seconds: of the loop; `cost` in field values, see `renderers.field.Counts.cost`.
         waited: share of its time that the run waited for a processor.
-        settings, code: hashes of the configuration and of the code.
+        settings, code: hashes of what the set states for all renderers, and of the code.
         curve: at each checkpoint the cost, the seconds and the error.
         overrides: the command line that makes it again.
     """
@@ -106,6 +112,8 @@ class Attempt:
     def reached(self, error: float) -> tuple[float, float] | None:
         """The cost and the seconds from which on the error stays at or below this one; None where it does not."""
         found = None
+        if not isfinite(error):
+            return None
         for cost, seconds, at in reversed(self.curve if self.ok else []):
             if not at <= error:
                 break
@@ -120,11 +128,11 @@ def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
 
 
 def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
-    """One attempt of each key: of several the last one that ended ok, or else the last one."""
+    """One attempt of each key: of several the last one that ended ok, or else the last one, in whatever order."""
     found: dict[tuple[Any, ...], Attempt] = {}
     for attempt in (one for attempts in several for one in attempts):
         other = found.setdefault(attempt.key, attempt)
-        if (attempt.ok, attempt.started) > (other.ok, other.started):
+        if (attempt.ok, attempt.started, repr(attempt)) > (other.ok, other.started, repr(other)):
             found[attempt.key] = attempt
     return found
 
@@ -132,15 +140,16 @@ def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
 def _attempt(record: Record, folder: Path) -> Attempt | None:
     config, said = record["config"], record["environment"]
     of_set = str(config.get("experiment") or "").removeprefix(EXPERIMENT)
-    if of_set not in suite().errors or config["experiment"] == of_set or record["status"] in ("not_run", "killed"):
+    if of_set not in suite().errors or config["experiment"] == of_set or record["status"] in NO_ATTEMPTS:
         return None
     error, ok = suite().errors[of_set], record["status"] == "ok"
     scene = f"{record['dataset']} {config.get('split')} {config.get('index')}"
-    given = [text.format(value) for key, text in NAMES.items() if (value := _swept(record, key)) is not None]
+    given, text = GIVEN.get(of_set, ("", ""))
+    named = [text.format(setting(config, *given.split(".")))] if given else []
     final, start = (as_number(record[part].get(error)) for part in ("metrics", "metrics_start"))
     curve = _curve(folder, error, final if ok else None)
     return Attempt(
-        **{"set": of_set, "problem": ", ".join([scene, *given]), "scene": scene, "seed": record["seed"]},
+        **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
         row=_row(record),
         preset=record.get("method") or record["renderer"],
         status=str(record["status"]),
@@ -153,7 +162,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         waited=said.get("waited_share"),
         **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
         threads=said.get("threads"),
-        **{"started": record["started"], "code": record.get("code", ""), "settings": record.get("config_hash", "")},
+        **{"started": record["started"], "code": record.get("code", ""), "settings": _settings(config, given)},
         curve=curve,
         overrides=[text for text in record.get("overrides", ()) if not text.startswith(("results_dir=", "hydra"))],
     )
@@ -166,10 +175,10 @@ def _row(record: Record) -> str:
     return str(config.get("label") or own.get("_label_") or base_renderer(record))
 
 
-def _swept(record: Record, key: str) -> Any:
-    """The value of a setting in which problems of a scene differ; None where the run's set does not sweep over it."""
-    swept = any(text.startswith(f"{key}=") for text in record.get("overrides", ()))
-    return setting(record["config"], *key.split(".")) if swept else None
+def _settings(config: dict[str, Any], given: str) -> str:
+    """A hash of what a set states for all renderers, without what its problems differ in."""
+    known = flat({part: config.get(part) for part in STATED})
+    return digest({key: str(value) for key, value in known.items() if key != given})
 
 
 def _curve(folder: Path, error: str, final: float | None) -> list[list[float]]:
@@ -189,9 +198,15 @@ def place(results_dir: Path) -> Path:
 
 
 def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]:
-    """Joins attempts to those of a results folder; gives the files, one a row."""
-    folder = place(results_dir)
-    files = grouped(joined(attempts, read_attempts(results_dir)[0]).values(), lambda one: _file_name(one.row))
+    """Joins attempts to those of a results folder; gives the files, one a row.
+
+    Raises:
+        ValueError: where a file of the folder cannot be read, whose content would be lost.
+    """
+    folder, (kept, problems) = place(results_dir), read_attempts(results_dir)
+    if problems:
+        raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
+    files = grouped(joined(attempts, kept).values(), lambda one: _file_name(one.row))
     folder.mkdir(parents=True, exist_ok=True)
     return [_write(folder / f"{name}.csv", own) for name, own in sorted(files.items())]
 
@@ -233,8 +248,11 @@ def _read(line: dict[str, str]) -> Attempt:
         name: line[name] if is_text else decoded(json.loads(line[name])) for name, is_text in texts.items()
     }
     numbers = [values["start"], values["final"], values["cost"], *(n for point in values["curve"] for n in point)]
-    if any(as_number(number) is None for number in numbers) or any(len(point) != 3 for point in values["curve"]):
-        raise ValueError(f"{values['problem']}: errors and costs must be numbers")
+    sound = all(as_number(number) is not None and number >= 0 for number in numbers)
+    if not sound or any(len(point) != 3 for point in values["curve"]):
+        raise ValueError(f"{values['problem']}: errors and costs must be numbers of 0 or more")
+    if values["set"] not in suite().errors or values["status"] not in [*RunStatus]:
+        raise ValueError(f"{values['problem']}: there is no set {values['set']!r} or status {values['status']!r}")
     return Attempt(**values)
 
 

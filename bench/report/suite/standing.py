@@ -18,6 +18,7 @@ from bench.report.data import statistics
 from bench.report.data.records import grouped
 from bench.report.data.statistics import Interval
 from bench.report.suite.attempts import Attempt, suite
+from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
 COST, SECONDS = 0, 1  # places in what a target was reached at
@@ -25,16 +26,32 @@ COST, SECONDS = 0, 1  # places in what a target was reached at
 
 @dataclass(frozen=True)
 class Standing:
-    """Attempts of several rows at the same problems, one of each row at a problem and seed."""
+    """Attempts of several rows, one of each at a problem and seed.
 
-    attempts: list[Attempt]
+    Args:
+        everything: of which those at problems that the reference row has no attempt at are not judged.
+    """
+
+    everything: list[Attempt]
+
+    @cached_property
+    def reference(self) -> str | None:
+        """The row by whose costs others are divided; None where there is none."""
+        label = choice("renderer", REFERENCE).get("_label_")
+        rows = sorted({one.row for one in self.everything if one.preset == REFERENCE})
+        return label if label in rows else next(iter(rows), None)
+
+    @cached_property
+    def attempts(self) -> list[Attempt]:
+        """The attempts at problems and seeds that the reference row has one at; all where there is no such row."""
+        known = {one.key[:3] for one in self.everything if one.row == self.reference}
+        return [one for one in self.everything if not known or one.key[:3] in known]
 
     @cached_property
     def rows(self) -> list[str]:
         """The rows, the one that reaches the most first; of those that lack a problem, last."""
-        return sorted(
-            grouped(self.attempts, lambda one: one.row), key=lambda row: (self.lacking(row), -self.share(row).value)
-        )
+        found = grouped(self.attempts, lambda one: one.row)
+        return sorted(found, key=lambda row: (self.lacking(row), -self.share(row).value, row))
 
     @cached_property
     def sets(self) -> list[str]:
@@ -52,9 +69,19 @@ class Standing:
         return found
 
     @cached_property
+    def starts(self) -> dict[tuple[Any, ...], float]:
+        """The error before, of each problem and seed: the median of the finite ones of all rows."""
+        known = grouped((one for one in self.attempts if isfinite(one.start)), lambda one: one.key[:3])
+        return {key: float(np.median([one.start for one in own])) for key, own in known.items()}
+
+    @cached_property
     def judged(self) -> list[Attempt]:
         """The attempts at problems whose start is worse than the reference, so that there is something to do."""
-        return [one for one in self.attempts if one.start > self.references[one.set, one.problem] > 0]
+        return [
+            one
+            for one in self.attempts
+            if self.starts.get(one.key[:3], 0.0) > self.references[one.set, one.problem] > 0
+        ]
 
     @cached_property
     def left_out(self) -> list[str]:
@@ -70,7 +97,8 @@ class Standing:
         found = {}
         for one in self.judged:
             reference = self.references[one.set, one.problem]
-            errors = [reference * (one.start / reference) ** target for target in suite().targets]
+            start = self.starts[one.key[:3]]
+            errors = [reference * (start / reference) ** target for target in suite().targets]
             found[one.key] = [one.reached(error) or (inf, inf) for error in errors]
         return found
 
@@ -116,11 +144,6 @@ class Standing:
         steps = np.unique(known).tolist()
         shares = [float(np.searchsorted(known, cost, side="right")) / len(costs) for cost in steps]
         return [*steps[:1], *steps, max(one.cost for one in own)], [0.0, *shares, *shares[-1:]] if steps else []
-
-    @cached_property
-    def reference(self) -> str | None:
-        """The row by whose costs others are divided; None where there is none."""
-        return next((row for row in self.rows if self.preset(row) == REFERENCE), None)
 
     def ratio(self, row: str, of: int = COST) -> Interval | None:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
