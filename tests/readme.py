@@ -10,7 +10,7 @@ PAPER = README.parent / "results" / "paper"
 ROWS = {  # of README's table: the rows of the suite and the renderers of the atlas
     **{"newton": "newton", "dist": "dist", "idr": "idr", "dvr_64_early_stop": "dvr", "neus_budget": "neus"},
     **{"volsdf_budget": "volsdf_budget", "unisurf_budget": "unisurf", "naive": "naive_parallel"},
-    **{"range_analysis": "range_analysis", "mesh_48": "mesh_proxy", "relaxed_boundary": "relaxed_boundary"},
+    **{"range_analysis": "range_analysis", "mesh_proxy_48": "mesh_proxy", "relaxed_boundary": "relaxed_boundary"},
 }
 HEAD = "| renderer | targets reached | field values, times DIST's | mean rank on hard scenes |\n|---|---|---|---|\n"
 LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
