@@ -1,5 +1,6 @@
 """The suite: what an attempt has reached and when, how rows stand, and that results outlive their run folders."""
 
+import csv
 import json
 from dataclasses import replace
 from itertools import permutations
@@ -247,3 +248,11 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
         path.unlink()
     write_attempts(kept, results)
     assert main(["verify=1", f"results_dir={results}"]) == 1
+
+
+def test_the_shipped_page_is_that_of_the_shipped_rows():
+    results = Path(__file__).resolve().parents[2] / "results"
+    standing = Standing(read_attempts(results)[0])
+    with (results / "paper" / "suite.csv").open(encoding="utf-8") as file:
+        shown = {line["row"]: float(line["share"]) for line in csv.DictReader(file)}
+    assert {row: standing.share(row).value for row in standing.rows} == pytest.approx(shown)
