@@ -30,6 +30,7 @@ from bench.report.suite.attempts import (
     attempts_of,
     joined,
     place,
+    portable,
     read_attempts,
     suite,
     write_attempts,
@@ -103,7 +104,7 @@ def _sweep(name: str, size: str, passed: list[str]) -> int:
 
 
 def show(results_dir: Path) -> int:
-    """Keeps the attempts of a results folder, writes the suite's page, and prints a line a set and the standing."""
+    """Keeps the attempts of a results folder, writes the suite's page, and prints a line a row."""
     with page_lock(results_dir):
         records, _ = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
@@ -146,8 +147,7 @@ def verify(results_dir: Path, count: int) -> int:
 def _agrees(attempt: Attempt) -> bool:
     """Whether an attempt gives the same errors and costs once more; prints a line about it."""
     with tempfile.TemporaryDirectory() as folder:
-        overrides = [text for text in attempt.overrides if not text.lstrip("+~").startswith(("hydra", "-"))]
-        command = [sys.executable, "-m", "bench", *overrides, f"results_dir={folder}"]
+        command = [sys.executable, "-m", "bench", *portable(attempt.overrides), f"results_dir={folder}"]
         said = subprocess.run(command, check=False, capture_output=True, text=True)
         runs = [*(Path(folder) / "runs").glob("*/record.json")]
         again = attempts_of(map(read_record, (path.parent for path in runs)), Path(folder))

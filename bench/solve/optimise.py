@@ -51,7 +51,7 @@ class OptimiserSettings:
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
-            check_positive("task.optimiser.budget", self.budget, "1e7 is a tenth of a minute of the shipped priors")
+            check_positive("task.optimiser.budget", self.budget, "the suite has 6e6 to 2e7, null is none")
 
     def rate(self, iteration: int) -> float:
         """The learning rate of an iteration, counted from 0."""

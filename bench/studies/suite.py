@@ -5,14 +5,13 @@ from typing import Any
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, statistics, table
-from bench.report.suite.attempts import EXPERIMENT, attempts_of, joined, read_attempts, suite
+from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, joined, read_attempts, suite
 from bench.report.suite.standing import SECONDS, Standing
 from bench.report.write import paper
 
 PLACE = 1
-READS = tuple(
-    Selection(f"{EXPERIMENT}{name}", ("task.points", "task.degrees", "task.images.texture")) for name in suite().errors
-)
+DIFFERING = tuple(given for given, _ in GIVEN.values())
+READS = tuple(Selection(f"{EXPERIMENT}{name}", DIFFERING) for name in suite().errors)
 NOTES = (
     "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
     f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
@@ -90,16 +89,15 @@ def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
     lines = []
     for row in standing.rows:
         costs, shares = standing.profile(row, of_set)
-        if shares and shares[-1] > 0:
+        if costs:
             lines.append(chart.curve(row, standing.preset(row), costs, shares, step=True))
     return chart.panel_data(of_set or "all sets", "field values", "share reached", lines)
 
 
 def _sample(standing: Standing) -> str:
-    scenes = {one.scene for one in standing.judged}
     problems = {(one.set, one.problem) for one in standing.judged}
     seeds = {one.seed for one in standing.judged}
-    parts = [format.plural(len(scenes), "scene"), format.plural(len(seeds), "seed")]
+    parts = [_scenes(standing), format.plural(len(seeds), "seed")]
     return f"{format.plural(len(problems), 'problem')} ({', '.join(parts)}) of {suite().id}, {len(standing.rows)} rows"
 
 
@@ -119,14 +117,14 @@ def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
     ]
     if sure and (least := min(sure, key=lambda line: line["ratio"].value))["ratio"].value < 1:
         said.append(f"For few field values take {least['row']}: *{format.number(least['ratio'].value)}* of DIST's.")
-    if most := max(lines, key=lambda line: sum(standing.failures(line["row"]).values())):
-        count = sum(standing.failures(most["row"]).values())
-        said += [f"{most['row']} fails most often: *{count}* runs."] if count else []
+    failures = {line["row"]: standing.failures(line["row"]).total() for line in lines}
+    if count := failures[most := max(failures, key=lambda row: failures[row])]:
+        said.append(f"{most} fails most often: *{count}* runs.")
     return " ".join([*said, "CPU, small networks and images: of others it says nothing."])
 
 
 def _scenes(standing: Standing) -> str:
-    return format.plural(len({one.scene for one in standing.judged}), "scene")
+    return format.plural(len(standing.scenes), "scene")
 
 
 def _doubts(standing: Standing) -> list[str]:

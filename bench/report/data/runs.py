@@ -229,10 +229,10 @@ def renderer_settings(record: Record) -> dict[str, str]:
 
 def _part(record: Record, key: str, selection: Selection) -> Any:
     found = setting(record["config"], *key.split("."))
-    if not isinstance(found, dict):
+    if not isinstance(found, dict) or not any(one.startswith(f"{key}.") for one in selection.conditions):
         return found
-    own = {name: _part(record, f"{key}.{name}", selection) for name in found}
-    return {name: value for name, value in own.items() if f"{key}.{name}" not in selection.conditions}
+    kept = [name for name in found if f"{key}.{name}" not in selection.conditions]
+    return {name: _part(record, f"{key}.{name}", selection) for name in kept}
 
 
 def _row(record: Record) -> Hashable:

@@ -17,8 +17,8 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import RunStatus, as_number, decoded, digest, is_plain_name, plain, write_text
-from bench.report.data.records import Record, base_renderer, grouped, loop_seconds, setting
+from bench.records.record import RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
+from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
 NO_ATTEMPTS = ("not_run", "killed", "refused")  # statuses of runs that say nothing of a renderer
@@ -123,8 +123,7 @@ class Attempt:
 
 def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
     """The attempts among the records of a results folder; a run that was planned and not made is none."""
-    found = [one for record in records if (one := _attempt(record, results_dir / "runs" / record["folder"]))]
-    return list(joined(found).values())
+    return [one for record in records if (one := _attempt(record, results_dir / "runs" / record["folder"]))]
 
 
 def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
@@ -132,25 +131,26 @@ def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
     found: dict[tuple[Any, ...], Attempt] = {}
     for attempt in (one for attempts in several for one in attempts):
         other = found.setdefault(attempt.key, attempt)
-        if (attempt.ok, attempt.started, repr(attempt)) > (other.ok, other.started, repr(other)):
+        mine, theirs = (attempt.ok, attempt.started), (other.ok, other.started)
+        if mine > theirs or (mine == theirs and repr(attempt) > repr(other)):
             found[attempt.key] = attempt
     return found
 
 
 def _attempt(record: Record, folder: Path) -> Attempt | None:
     config, said = record["config"], record["environment"]
-    of_set = str(config.get("experiment") or "").removeprefix(EXPERIMENT)
-    if of_set not in suite().errors or config["experiment"] == of_set or record["status"] in NO_ATTEMPTS:
+    of_set = {f"{EXPERIMENT}{name}": name for name in suite().errors}.get(config.get("experiment"))
+    if of_set is None or record["status"] in NO_ATTEMPTS:
         return None
     error, ok = suite().errors[of_set], record["status"] == "ok"
-    scene = f"{record['dataset']} {config.get('split')} {config.get('index')}"
+    scene = f"{family(record)} {config.get('split')} {config.get('index')}"
     given, text = GIVEN.get(of_set, ("", ""))
     named = [text.format(setting(config, *given.split(".")))] if given else []
     final, start = (as_number(record[part].get(error)) for part in ("metrics", "metrics_start"))
     curve = _curve(folder, error, final if ok else None)
     return Attempt(
         **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
-        row=_row(record),
+        row=renderer_name(config, record["renderer"]),  # without the loss of the mask, which is the set's
         preset=record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
@@ -164,15 +164,13 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         threads=said.get("threads"),
         **{"started": record["started"], "code": record.get("code", ""), "settings": _settings(config, given)},
         curve=curve,
-        overrides=[text for text in record.get("overrides", ()) if not text.startswith(("results_dir=", "hydra"))],
+        overrides=portable(record.get("overrides", ())),
     )
 
 
-def _row(record: Record) -> str:
-    """The name of its row, without the loss of the mask, which all rows of a set share."""
-    config = record["config"]
-    own = config.get("renderer") or {}
-    return str(config.get("label") or own.get("_label_") or base_renderer(record))
+def portable(overrides: Iterable[str]) -> list[str]:
+    """Those of a run that say what it is, not where: no option of the command, no setting of Hydra's."""
+    return [text for text in overrides if not text.lstrip("+~").startswith(("results_dir=", "hydra", "-"))]
 
 
 def _settings(config: dict[str, Any], given: str) -> str:
@@ -206,7 +204,9 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
     folder, (kept, problems) = place(results_dir), read_attempts(results_dir)
     if problems:
         raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
-    files = grouped(joined(attempts, kept).values(), lambda one: _file_name(one.row))
+    files = grouped(
+        joined(attempts, kept).values(), lambda one: re.sub(r"[^a-z0-9]+", "_", one.row.lower()).strip("_") or "row"
+    )
     folder.mkdir(parents=True, exist_ok=True)
     return [_write(folder / f"{name}.csv", own) for name, own in sorted(files.items())]
 
@@ -254,9 +254,3 @@ def _read(line: dict[str, str]) -> Attempt:
     if values["set"] not in suite().errors or values["status"] not in [*RunStatus]:
         raise ValueError(f"{values['problem']}: there is no set {values['set']!r} or status {values['status']!r}")
     return Attempt(**values)
-
-
-def _file_name(row: str) -> str:
-    """A file's name for a row, whatever it is called."""
-    name = re.sub(r"[^a-z0-9]+", "_", row.lower()).strip("_")
-    return name if is_plain_name(name) else "row"

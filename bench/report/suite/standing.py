@@ -84,12 +84,15 @@ class Standing:
         ]
 
     @cached_property
+    def scenes(self) -> set[str]:
+        """The scenes of the judged attempts."""
+        return {one.scene for one in self.judged}
+
+    @cached_property
     def left_out(self) -> list[str]:
         """The problems that are not judged."""
-        return sorted(
-            {f"{one.set}: {one.problem}" for one in self.attempts}
-            - {f"{one.set}: {one.problem}" for one in self.judged}
-        )
+        every, judged = ({f"{one.set}: {one.problem}" for one in of} for of in (self.attempts, self.judged))
+        return sorted(every - judged)
 
     @cached_property
     def reached(self) -> dict[tuple[Any, ...], list[tuple[float, float]]]:
@@ -139,11 +142,11 @@ class Standing:
         own = self.of(row, of_set)
         costs = [at[COST] for one in own for at in self.reached[one.key]]
         known = np.sort([cost for cost in costs if isfinite(cost)])
-        if not own:
+        if not len(known):
             return [], []
         steps = np.unique(known).tolist()
         shares = [float(np.searchsorted(known, cost, side="right")) / len(costs) for cost in steps]
-        return [*steps[:1], *steps, max(one.cost for one in own)], [0.0, *shares, *shares[-1:]] if steps else []
+        return [steps[0], *steps, max(one.cost for one in own)], [0.0, *shares, shares[-1]]
 
     def ratio(self, row: str, of: int = COST) -> Interval | None:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
@@ -161,7 +164,7 @@ class Standing:
                 continue
             pairs = zip(self.reached[one.key], self.reached[other.key], strict=True)
             both = [(a[of], b[of]) for a, b in pairs if isfinite(a[of]) and isfinite(b[of])]
-            scenes.setdefault(one.scene, []).extend((max(a, 1e-9), max(b, 1e-9)) for a, b in both)
+            scenes.setdefault(one.scene, []).extend(both)
         groups = [np.array(pairs).T for pairs in scenes.values() if pairs]
         return statistics.ratio([g[0] for g in groups], [g[1] for g in groups]) if groups else None
 
