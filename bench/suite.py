@@ -28,7 +28,6 @@ from bench.report.suite.attempts import (
     STATED,
     Attempt,
     attempts_of,
-    joined,
     place,
     portable,
     read_attempts,
@@ -110,7 +109,7 @@ def show(results_dir: Path) -> int:
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
     kept, problems = read_attempts(results_dir)
-    standing = Standing([*joined(read_attempts(paper.SHIPPED)[0], kept).values()])
+    standing = Standing.of_all([*read_attempts(paper.SHIPPED)[0], *kept])
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
     for row in standing.rows:

@@ -7,11 +7,6 @@ from pathlib import Path
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
-ROWS = {  # of README's table: the rows of the suite and the renderers of the atlas
-    **{"newton": "newton", "dist": "dist", "idr": "idr", "dvr_64_early_stop": "dvr", "neus_budget": "neus"},
-    **{"volsdf_budget": "volsdf_budget", "unisurf_budget": "unisurf", "naive": "naive_parallel"},
-    **{"range_analysis": "range_analysis", "mesh_proxy_48": "mesh_proxy", "relaxed_boundary": "relaxed_boundary"},
-}
 HEAD = "| renderer | targets reached | field values, times DIST's | mean rank on hard scenes |\n|---|---|---|---|\n"
 LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
 BLOCK = re.compile(r"^```[\s\S]*?^```$|^ {4}.*$|<[^>]*>", re.MULTILINE)  # what is typed, and HTML
@@ -34,23 +29,18 @@ def wrongs(text: str) -> list[str]:
 
 
 def table() -> str:
-    """README's table, from the committed CSVs of the suite and of the atlas, in the order of the suite."""
-    ranks = {row["preset"]: float(row["rank"]) for row in reversed(_rows("stability_cost"))}
+    """README's table, from the committed CSV of the suite."""
+    with (PAPER / "suite.csv").open(encoding="utf-8") as file:
+        rows = [*csv.DictReader(file)]
     return HEAD + "\n".join(
-        f"| {row['row']} | {100 * float(row['share']):.0f} % | {_ratio(row['ratio'])} | "
-        f"{ranks[ROWS[row['preset']]]:.1f} |"
-        for row in _rows("suite")
+        f"| {row['row']} | {100 * float(row['share']):.0f} % | {_ratio(row['ratio'])} | {float(row['hard']):.1f} |"
+        for row in rows
     )
 
 
 def _ratio(text: str) -> str:
     """A ratio to two digits; 1 of DIST itself, which has none."""
     return f"{float(text):.2g}" if text else "1"
-
-
-def _rows(name: str) -> list[dict[str, str]]:
-    with (PAPER / f"{name}.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 if __name__ == "__main__":

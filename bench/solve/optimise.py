@@ -127,7 +127,7 @@ def optimise(
             **dict(zip(terms, numbers, strict=True)),
         }
         history.curve.append(line)
-        history.peak_memory_bytes = memory.growth()
+        history.peak_memory_bytes = memory.repeatable()
         over = _failed(history, largest, least_reference) or line["cost"] >= (settings.budget or inf)
         with memory.pause():
             on_step(line)

@@ -40,7 +40,7 @@ COSTS = {
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
     "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
-    "peak_memory_bytes": "highest rise, in the loop, of the process's memory without files (CPU) or PyTorch's (GPU)",
+    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in the loop; of no CPU, where it does not repeat",
     "flops": "evaluations times the field's operations per evaluation, coarse ones included",
     "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
     "coarse values, in bfloat16, over the loop's seconds",

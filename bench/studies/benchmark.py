@@ -26,7 +26,6 @@ NOTES = (
     "Values are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
     "decide nothing.",
     "Work over bound: the operations of a step over those of one value and one gradient per hit.",
-    "Memory: the largest growth of the memory of the process (CPU) or of PyTorch (GPU) in a step.",
     "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
     "hit.",
 )
@@ -113,7 +112,7 @@ COLUMNS = (
     *map(table.Column, ("forward_cpu", "step_cpu")),
     *map(_ratio, COSTS),
     *(table.Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
-    table.Column("peak_memory_bytes", "Memory of a step", show=format.size),
+    table.Column("peak_memory_bytes"),
     table.Column("work_over_bound", "Work over bound"),
     *map(table.Column, ("rays", "hits", "lost", "false", "wrong")),
     table.shown("Missed / spurious / wrong depth", table.together(dict.get, table.whole, "lost", "false", "wrong")),

@@ -1,17 +1,24 @@
 """The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
 
+import csv
+from io import StringIO
 from math import isfinite
 from typing import Any
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, statistics, table
-from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, joined, read_attempts, suite
+from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, read_attempts, suite
 from bench.report.suite.standing import SECONDS, Standing
 from bench.report.write import paper
+from bench.tables import choice, names
 
 PLACE = 1
 DIFFERING = tuple(given for given, _ in GIVEN.values())
 READS = tuple(Selection(f"{EXPERIMENT}{name}", DIFFERING) for name in suite().errors)
+BESIDE = {  # of what the project ships: the table, the lines of it, the number, its heading here
+    "outline": ("gradients", {"band": "silhouette"}, "image_cosine", "Outline gradient, cosine"),
+    "hard": ("stability_cost", {}, "rank", "Hard scenes, mean rank"),
+}
 NOTES = (
     "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
     f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
@@ -19,6 +26,8 @@ NOTES = (
     "A run that did not end ok reaches nothing. All rows have one setting and one loss of the mask in a set.",
     "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Rows share a rank "
     "where the bootstrap over scenes does not tell their shares apart.",
+    "Beside them stand, from the tables stability_cost and gradients, the rank over axes on which a renderer breaks, "
+    "and the gradient at outlines, of one shape; of a variant, those of the renderer that it is one of.",
 )
 
 
@@ -27,14 +36,15 @@ def make(*several: Runs | None) -> Result:
     runs = together(*several)
     kept, problems = read_attempts(runs.results_dir)
     shipped, _ = read_attempts(paper.SHIPPED)
-    standing = Standing([*joined(shipped, kept, attempts_of(runs.records, runs.results_dir)).values()])
-    lines = [_line(standing, row) for row in standing.rows]
+    standing = Standing.of_all([*shipped, *kept, *attempts_of(runs.records, runs.results_dir)])
+    lines = [_line(standing, row) | _beside(standing.preset(row)) for row in standing.rows]
     panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
-    figure = chart.draw(panels, 5.0, lines=2, legend=4)
+    figure = chart.draw_lead(panels, 5.4)
     return Result(
         runs,
         "The suite.",
-        "Share of problems and targets that a renderer has reached over its cost; a run ends at its set's budget.",
+        "Share of problems and targets that a renderer has reached over its field values, divided by those of DIST's "
+        "whole run in the set; a run ends at the set's budget.",
         question="Which renderer gets how much done, and at what cost?",
         verdict=_verdict(standing, lines),
         n=_sample(standing),
@@ -59,6 +69,29 @@ def _line(standing: Standing, row: str) -> dict[str, Any]:
     }
 
 
+def _beside(preset: str) -> dict[str, float | None]:
+    """What other tables say of a row's renderer: of the same preset, of the one it builds on, or of a variant of it."""
+    found = dict[str, float | None]()
+    for key, (name, wanted, number, _) in BESIDE.items():
+        path = paper.SHIPPED / "paper" / f"{name}.csv"
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        lines = [line for line in csv.DictReader(StringIO(text)) if wanted.items() <= line.items() and line[number]]
+        of = {line["renderer" if "renderer" in line else "preset"]: float(line[number]) for line in reversed(lines)}
+        chain = _bases(preset)
+        known = [of[one] for one in (*chain, *(other for other in of if _bases(other)[-1] == chain[-1])) if one in of]
+        found[key] = known[0] if known else None
+    return found
+
+
+def _bases(preset: str) -> list[str]:
+    """A preset and what it builds on, the last one a file of `conf/renderer`."""
+    try:
+        bases = [one for one in choice("renderer", preset).get("defaults", ()) if one in names("renderer")]
+    except KeyError:
+        bases = []
+    return [preset, *(_bases(bases[0]) if bases else ())]
+
+
 def _columns(standing: Standing) -> list[table.Column]:
     def ratio(line: Any, name: str) -> str:
         return format.MISSING if line[name] is None else str(line[name])
@@ -80,18 +113,21 @@ def _columns(standing: Standing) -> list[table.Column]:
             table.Column(name, heading, lambda line, n=name: value(line, n), words=lambda line, n=name: ratio(line, n))
             for name, heading in (("ratio", "Field values over DIST's"), ("seconds", "Seconds over DIST's"))
         ),
+        *(table.Column(key, heading) for key, (*_, heading) in BESIDE.items()),
         table.text("failed", "Failed"),
         table.PRESET,
     ]
 
 
 def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
-    lines = []
-    for row in standing.rows:
-        costs, shares = standing.profile(row, of_set)
-        if costs:
-            lines.append(chart.curve(row, standing.preset(row), costs, shares, step=True))
-    return chart.panel_data(of_set or "all sets", "field values", "share reached", lines)
+    found = {row: standing.profile(row, of_set) for row in standing.rows}
+    end = max((costs[-1] for costs, _ in found.values() if costs), default=1.0)
+    lines = [
+        chart.curve(row, standing.preset(row), [*costs, end], [*shares, shares[-1]], step=True)
+        for row, (costs, shares) in found.items()
+        if costs
+    ]
+    return chart.panel_data(of_set or "all sets", "field values over DIST's run", "share reached", lines)
 
 
 def _sample(standing: Standing) -> str:
@@ -112,14 +148,20 @@ def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
         told = f"{_scenes(standing)} tell shares apart that differ by *{table.percent(standing.resolution)}* or more"
         said.append(f"{told}: {len(alike) or 'none'} of {len(ranked) - 1} others are not told from it.")
     known = [line for line in ranked if line["ratio"] is not None]
-    sure = [
-        line for line, found in zip(known, statistics.differ([one["ratio"] for one in known]), strict=True) if found
-    ]
-    if sure and (least := min(sure, key=lambda line: line["ratio"].value))["ratio"].value < 1:
+    differ = dict(zip((one["row"] for one in known), statistics.differ([one["ratio"] for one in known]), strict=True))
+    fewer = [one for one in known if differ[one["row"]] and one["ratio"].value < 1]
+    if fewer and (least := min(fewer, key=lambda line: line["ratio"].value)):
         said.append(f"For few field values take {least['row']}: *{format.number(least['ratio'].value)}* of DIST's.")
-    failures = {line["row"]: standing.failures(line["row"]).total() for line in lines}
-    if count := failures[most := max(failures, key=lambda row: failures[row])]:
-        said.append(f"{most} fails most often: *{count}* runs.")
+    elif any(differ.values()):
+        alike = [row for row, found in differ.items() if not found]
+        said.append(f"For few field values take {' or '.join([*alike, str(standing.reference)])}.")
+    for key, text, better in (
+        ("outline", "For outlines that must move take {}: its gradient has a cosine of *{}*.", max),
+        ("hard", "Where the field is no distance take {}: mean rank *{}* on hard scenes.", min),
+    ):
+        if found := {line["row"]: line[key] for line in ranked if line[key] is not None}:
+            row = better(found, key=lambda name: found[name])
+            said.append(text.format(row, format.number(found[row])))
     return " ".join([*said, "CPU, small networks and images: of others it says nothing."])
 
 

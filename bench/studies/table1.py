@@ -22,7 +22,6 @@ NOTES = (
     "brackets the least and the largest.",
     "Queries are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
     "decide nothing.",
-    "Peak memory is the largest growth of the memory of the process (CPU) or of PyTorch (GPU) in a step.",
     "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
     "hit.",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
@@ -47,7 +46,7 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "The cost of each strategy of sphere tracing.",
-        "Computed field values (queries), times, peak memory and errors of one rendering and its gradient"
+        "Computed field values (queries), times and errors of one rendering and its gradient"
         + (f", times as medians of {times} repeats." if times else "."),
         question="What does one rendering and its gradient cost, and what does each strategy save?",
         verdict=_verdict(runs),
@@ -125,7 +124,6 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
     metric("forward_seconds", "Forward", format.seconds),
     metric("backward_seconds", "Backward", format.seconds),
     table.shown("Step", _step),
-    metric("peak_memory_bytes", "Peak memory", format.size),
     metric("hits", "Hits", table.whole),
     table.shown(
         "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")

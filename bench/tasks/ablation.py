@@ -53,8 +53,10 @@ DEFINITIONS = {
     "seconds.total": "the whole run, with making or loading shape, network and reference",
     "forward_gemm, step_gemm": "seconds that the floating-point operations take at the machine's peak rate of a matrix "
     "product, in float32 or, of coarse values, in bfloat16, over the median time",
-    "peak_memory_bytes": "largest growth of the process's memory without files (CPU) or of PyTorch's (GPU) in a step",
+    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in a step; of no CPU, where it does not repeat",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
+    "pixel_errors": "lost, false and wrong together; at the start: hits, those of an image in which nothing is hit",
+    "cost": "of one rendering, in field values: a coarse one counts as an eighth",
     "rays, hits": "pixels of the image; pixels that the reference hits",
     "wrong": "pixels that both hit, at depths that differ by more than task.wrong",
     "error_p95": "95th percentile of the difference of depth over the pixels that either hits, where a pixel that only "
@@ -175,7 +177,8 @@ class Ablation:
         numbers = {
             name: costs(one.forward, one.step, machine) | one.errors(self.wrong) for name, one in benches.items()
         }
-        record.metrics = {"size": bench.camera.height, **numbers[BASE]}
+        record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
+        record.metrics_start = {"pixel_errors": record.metrics["hits"]}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
         record.evaluations = counted(bench.step.counts, bench.decoder.at(bench.code))
         record.evaluations["per_ray"] = bench.forward.counts.value / bench.rays.shape.numel()
@@ -294,6 +297,7 @@ class Workbench:
             "false": int((found.mask & ~true.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
+        numbers["pixel_errors"] = numbers["lost"] + numbers["false"] + numbers["wrong"]
         beyond = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
         if beyond.numel():
             numbers["error_p95"] = beyond.sort().values[ceil(0.95 * len(beyond)) - 1].item()
@@ -333,7 +337,7 @@ class Workbench:
             clocked.second.append(work(Meter(field, clocked.counts)))
             clocked.seconds.append(stopwatch.seconds())
             clocked.cpu.append(time.process_time() - ran)
-            spent, grew = spent + field.spent, field.memory.growth()
+            spent, grew = spent + field.spent, field.memory.repeatable()
             clocked.memory = grew if clocked.memory is None else max(clocked.memory, grew or 0)
             if spent >= self.limits.values / 4:
                 break

@@ -13,11 +13,13 @@ from bench import merge
 from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
+from bench.studies import suite as page
 from bench.suite import main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
 
 DIST = choice("renderer", "dist")["_label_"]
+RESULTS = Path(__file__).resolve().parents[2] / "results"  # what is shipped
 SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
 
 
@@ -75,6 +77,26 @@ def test_a_checkpoint_has_the_costs_of_the_line_before_it(tmp_path):
     assert found.overrides == ["task.points=20"]
 
 
+def test_a_rendering_has_its_cost_and_its_pixel_errors(tmp_path):
+    settings = {"split": "train", "task": {"size": 64}, "renderer": {"_label_": "Mine"}}
+    metrics = {"pixel_errors": 3, "cost": 512.0, "forward_seconds": 0.25}
+    known = {"settings": settings, "metrics": metrics, "metrics_start": {"pixel_errors": 900}}
+    write_run(tmp_path, "core_render", None, seconds={"forward": 0.25, "backward": 1.0}, **known)
+    (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
+    assert (found.problem, found.start, found.curve) == ("car train 0, 64 pixels", 900, [[512, 0.25, 3]])
+    reached = Standing([found]).reached[found.key]
+    assert [cost for cost, _ in reached] == [512, 512, inf, inf, inf]  # of 30, 5.5, 2.0, 1.4 and 1.1 pixels
+
+
+def test_other_tables_are_asked_for_a_renderer_or_what_it_is_a_variant_of(monkeypatch):
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", RESULTS)
+    known = {preset: page._beside(preset) for preset in ("dvr_64_early_stop", "dvr", "naive", "neus", "neus_budget")}
+    assert known["dvr_64_early_stop"] == known["dvr"] and None not in known["dvr"].values()
+    assert known["neus"]["hard"] == known["neus_budget"]["hard"] and known["neus"] != known["neus_budget"]
+    assert known["naive"]["hard"] is not None  # of a variant alone
+    assert page._beside("custom") == {"outline": None, "hard": None}
+
+
 def test_an_error_is_reached_where_it_stays_reached():
     one = attempt("A", "s", {0: 8, 10: 1, 20: 4, 30: 2, 40: 1})
     assert one.reached(5) == (10, 0.01)
@@ -104,7 +126,8 @@ def test_rows_stand_by_what_they_reach_and_share_a_rank_where_they_cannot_be_tol
     assert standing.ranks == {"Exact": 1, "Dist": 2, "Same": 2, "Lost": 4}
     assert standing.ratio("Exact").value == pytest.approx(3) and standing.ratio("Dist") is None
     assert standing.ratio("Lost") is None  # no target that both reach
-    assert standing.profile("Exact") == ([300, 300, 600, 600], [0, 0.2, 1, 1])
+    assert standing.units == {"complete": 200}  # of a whole run of Dist
+    assert standing.profile("Exact") == ([1.5, 1.5, 3, 3], [0, 0.2, 1, 1])
 
 
 def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
@@ -137,6 +160,10 @@ def test_seconds_are_compared_on_the_same_machine_alone():
     assert Standing(whole).ratio("Mine", SECONDS).value == pytest.approx(2)
     moved = [replace(one, cpu="another") if one.row == "Mine" else one for one in whole]
     assert Standing(moved).ratio("Mine", SECONDS) is None and Standing(moved).ratio("Mine").value == pytest.approx(2)
+    slow = [[cost, 4 * seconds, error] for cost, seconds, error in whole[0].curve]
+    there = [replace(one, cpu="another", curve=slow) for one in whole if one.row == "Dist"]
+    assert Standing(moved, there).ratio("Mine", SECONDS).value == pytest.approx(0.5)
+    assert Standing.of_all([*moved, *there]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
 
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
@@ -251,8 +278,7 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
 
 
 def test_the_shipped_page_is_that_of_the_shipped_rows():
-    results = Path(__file__).resolve().parents[2] / "results"
-    standing = Standing(read_attempts(results)[0])
-    with (results / "paper" / "suite.csv").open(encoding="utf-8") as file:
+    standing = Standing(read_attempts(RESULTS)[0])
+    with (RESULTS / "paper" / "suite.csv").open(encoding="utf-8") as file:
         shown = {line["row"]: float(line["share"]) for line in csv.DictReader(file)}
     assert {row: standing.share(row).value for row in standing.rows} == pytest.approx(shown)

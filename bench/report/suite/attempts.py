@@ -26,7 +26,7 @@ FOLDER = "suite"  # of a results folder, with a folder a version in it
 EXPERIMENT = "core_"  # in front of the name of a set
 GIVEN = {  # the setting in which the problems of a scene differ, and its name
     **{"complete": ("task.points", "{} points"), "pose": ("task.degrees", "{:g} degrees")},
-    "reconstruct": ("task.images.texture", "{}"),
+    **{"reconstruct": ("task.images.texture", "{}"), "render": ("task.size", "{} pixels")},
 }
 STATED = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")  # by a set, for all renderers
 
@@ -62,7 +62,7 @@ class Attempt:
         set, problem, scene, seed: what was to be solved; a scene has a problem for each amount of what is given.
         row, preset: the renderer's name in tables, and what decides its look.
         start, final: the errors before and after; `final` is infinite where the run did not end ok.
-        cost, operations, seconds: of the loop; `cost` in field values, see `renderers.field.Counts.cost`.
+        cost, operations, seconds: of the loop, or of one rendering; `cost` as `renderers.field.Counts.cost`.
         waited: share of its time that the run waited for a processor.
         settings, code: hashes of what the set states for all renderers, and of the code.
         curve: at each checkpoint the cost, the seconds and the error.
@@ -147,7 +147,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     given, text = GIVEN.get(of_set, ("", ""))
     named = [text.format(setting(config, *given.split(".")))] if given else []
     final, start = (as_number(record[part].get(error)) for part in ("metrics", "metrics_start"))
-    curve = _curve(folder, error, final if ok else None)
+    curve = _curve(record, folder, final if ok else None)
     return Attempt(
         **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
         row=renderer_name(config, record["renderer"]),  # without the loss of the mask, which is the set's
@@ -179,10 +179,13 @@ def _settings(config: dict[str, Any], given: str) -> str:
     return digest({key: str(value) for key, value in known.items() if key != given})
 
 
-def _curve(folder: Path, error: str, final: float | None) -> list[list[float]]:
+def _curve(record: Record, folder: Path, final: float | None) -> list[list[float]]:
     """The checkpoints, and the end; a line has the error before its step, and the costs after it."""
-    found, spent = list[list[float]](), [0.0, 0.0]
-    for line in curve_lines(folder) or []:
+    error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT)]
+    lines = curve_lines(folder) or []
+    of_rendering = record["metrics"].get("cost"), record["seconds"].get("forward")  # of a run without a loop
+    found, spent = list[list[float]](), [0.0 if lines else as_number(number) or 0.0 for number in of_rendering]
+    for line in lines:
         if (value := as_number(line.get(error))) is not None:
             found.append([*spent, value])
         spent = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]

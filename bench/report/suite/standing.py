@@ -7,7 +7,7 @@ at the reference, and a target is an r that is reached once the error stays at o
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite, nan
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from bench.report.data import statistics
 from bench.report.data.records import grouped
 from bench.report.data.statistics import Interval
-from bench.report.suite.attempts import Attempt, suite
+from bench.report.suite.attempts import Attempt, joined, suite
 from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
@@ -30,9 +30,17 @@ class Standing:
 
     Args:
         everything: of which those at problems that the reference row has no attempt at are not judged.
+        clocks: attempts of the reference row on other machines too, by whose seconds those of other rows are divided.
     """
 
     everything: list[Attempt]
+    clocks: list[Attempt] = field(default_factory=list)
+
+    @classmethod
+    def of_all(cls, attempts: Iterable[Attempt]) -> "Standing":
+        """Of attempts that may have several at a key."""
+        every = [*attempts]
+        return cls([*joined(every).values()], every)
 
     @cached_property
     def reference(self) -> str | None:
@@ -97,13 +105,12 @@ class Standing:
     @cached_property
     def reached(self) -> dict[tuple[Any, ...], list[tuple[float, float]]]:
         """Of each judged attempt by its key, the cost and the seconds of each target; infinite where not reached."""
-        found = {}
-        for one in self.judged:
-            reference = self.references[one.set, one.problem]
-            start = self.starts[one.key[:3]]
-            errors = [reference * (start / reference) ** target for target in suite().targets]
-            found[one.key] = [one.reached(error) or (inf, inf) for error in errors]
-        return found
+        return {one.key: self._reached(one) for one in self.judged}
+
+    def _reached(self, one: Attempt) -> list[tuple[float, float]]:
+        reference, start = self.references[one.set, one.problem], self.starts[one.key[:3]]
+        errors = [reference * (start / reference) ** target for target in suite().targets]
+        return [one.reached(error) or (inf, inf) for error in errors]
 
     @cached_property
     def _by_row(self) -> dict[str, list[Attempt]]:
@@ -137,16 +144,23 @@ class Standing:
             for scene, own in scenes.items()
         }
 
+    @cached_property
+    def units(self) -> dict[str, float]:
+        """Of each set the median cost of a whole run of the reference row, or of any row where there is none."""
+        known = {one.row for one in self.judged} & {self.reference} or {one.row for one in self.judged}
+        found = grouped((one for one in self.judged if one.row in known), lambda one: one.set)
+        return {of_set: float(np.median([one.cost for one in own])) or 1.0 for of_set, own in found.items()}
+
     def profile(self, row: str, of_set: str | None = None) -> tuple[list[float], list[float]]:
-        """Costs in ascending order, to the largest of any attempt, and the share that a row has reached at each."""
+        """Costs in units of their sets, ascending, to the largest of any attempt, and the share reached at each."""
         own = self.of(row, of_set)
-        costs = [at[COST] for one in own for at in self.reached[one.key]]
+        costs = [at[COST] / self.units[one.set] for one in own for at in self.reached[one.key]]
         known = np.sort([cost for cost in costs if isfinite(cost)])
         if not len(known):
             return [], []
         steps = np.unique(known).tolist()
         shares = [float(np.searchsorted(known, cost, side="right")) / len(costs) for cost in steps]
-        return [steps[0], *steps, max(one.cost for one in own)], [0.0, *shares, shares[-1]]
+        return [steps[0], *steps, max(one.cost / self.units[one.set] for one in own)], [0.0, *shares, shares[-1]]
 
     def ratio(self, row: str, of: int = COST) -> Interval | None:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
@@ -156,13 +170,17 @@ class Standing:
         """
         if self.reference in (None, row):
             return None
-        others = {one.key[:3]: one for one in self.of(str(self.reference))}
+        known = [*self.clocks, *self.everything] if of == SECONDS else self.everything
+
+        def place(one: Attempt) -> tuple[Any, ...]:
+            return (*one.key[:3], one.machine if of == SECONDS else "")
+
+        others = {place(one): one for one in known if one.row == self.reference}
         scenes: dict[str, list[tuple[float, float]]] = {}
         for one in self.of(row):
-            other = others.get(one.key[:3])
-            if other is None or (of == SECONDS and one.machine != other.machine):
+            if (other := others.get(place(one))) is None:
                 continue
-            pairs = zip(self.reached[one.key], self.reached[other.key], strict=True)
+            pairs = zip(self.reached[one.key], self._reached(other), strict=True)
             both = [(a[of], b[of]) for a, b in pairs if isfinite(a[of]) and isfinite(b[of])]
             scenes.setdefault(one.scene, []).extend(both)
         groups = [np.array(pairs).T for pairs in scenes.values() if pairs]

@@ -12,6 +12,7 @@ from bench.pictures import style
 from bench.report.data.statistics import Interval
 
 GREY = "#777777"  # of lines that belong to no row
+NAMES = 14  # that have room beside a panel, one below the other
 Series = dict[str, Any]
 Panel = dict[str, Any]
 
@@ -90,6 +91,54 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     if legend:
         style.legend_below(figure, *axes.flat, columns=legend)
     return figure
+
+
+@style.styled
+def draw_lead(panels: Sequence[Panel], height: float) -> Figure:
+    """Draws the first panel large, with the names of its lines beside it, and the others small below, of equal axes.
+
+    The lines of a panel should end at the same position.
+    """
+    figure = Figure(figsize=(style.WIDTH, height), layout="constrained")
+    grid = figure.add_gridspec(2, max(len(panels) - 1, 1), height_ratios=(1.7, 1))
+    lead = figure.add_subplot(grid[0, :])
+    _panel(lead, panels[0], 1.0)
+    _name_ends(lead, _shown(panels[0]))
+    first = None
+    for number, panel in enumerate(panels[1:]):
+        first = first or figure.add_subplot(grid[1, 0])
+        axis = first if not number else figure.add_subplot(grid[1, number], sharex=first, sharey=first)
+        _panel(axis, panel | {"series": [each | {"symbol": ""} for each in panel["series"]]}, 1.0)
+        axis.label_outer()
+        axis.set_xlabel("")
+    if first and panels[0]["x"]["log"]:  # they are too narrow for more
+        low, high = first.get_xlim()
+        tens = [10.0**power for power in range(-6, 7) if low <= 10.0**power <= high]
+        first.minorticks_off()
+        first.set_xticks(tens, [f"{ten:g}" for ten in tens])
+    lead.set_xlabel("")
+    figure.supxlabel(panels[0]["x"]["title"], fontsize=lead.yaxis.label.get_size())
+    return figure
+
+
+def _name_ends(axis: Axes, lines: list[Series]) -> None:
+    """Writes the name of each line to the right of the axes, as near to its end as the other names leave room."""
+    ends = sorted((each for each in lines if each["x"]), key=lambda each: each["y"][-1])
+    axis.set_xlim(right=max((each["x"][-1] for each in ends), default=None))
+    low, high = axis.get_ylim()
+    gap, places = 1 / max(len(ends), NAMES), list[float]()
+    for place in ((each["y"][-1] - low) / (high - low) for each in ends):
+        places.append(max(place, places[-1] + gap) if places else place)
+    over = max(places[-1] - 1 + gap / 2, 0.0) if places else 0.0
+    for each, place in zip(ends, places, strict=True):
+        axis.annotate(
+            each["name"],
+            (each["x"][-1], each["y"][-1]),
+            (1.04, place - over),
+            **{"textcoords": "axes fraction", "va": "center", "color": each["colour"]},
+            arrowprops={"arrowstyle": "-", "color": each["colour"], "lw": 0.6, "relpos": (0, 0.5)}
+            | {"shrinkA": 0, "shrinkB": 0},
+        )
 
 
 def _shown(panel: Panel) -> list[Series]:
