@@ -15,14 +15,13 @@ from typing import Any
 
 import torch
 
-from bench.records.record import Record
+from bench.records.record import WAITED, Record
 from renderers.fields.mlp import multiplies_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
 GEMM_SIZE = 1024  # of the square matrices whose product is timed
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
-WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
 CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
 DENORMAL = 713_623  # the bits of 1e-39, a number too small for float32's full precision: as a number it may become 0
 PER_THREAD = 2**15  # numbers of an operation that PyTorch leaves to one thread

@@ -177,13 +177,15 @@ def _doubts(standing: Standing) -> list[str]:
     codes = {row: {one.code for one in standing.attempts if one.row == row} for row in standing.rows}
     mixed = [row for row, found in codes.items() if len(found) > 1]
     machines = len({one.machine for one in standing.attempts})
+    loaded = sum(not one.timed for one in standing.attempts)
     return [
         f"Of other settings than the suite's, so not to be compared: {', '.join(other)}." if other else "",
         f"Not shown: {alone} runs at problems that DIST has no run at: python -m bench.suite renderer=dist makes them."
         if alone
         else "",
         f"Runs of more than one version of the code: {', '.join(mixed)}." if mixed else "",
-        f"Runs of {machines} machines: seconds are compared on the same one alone." if machines > 1 else "",
+        f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone." if machines > 1 else "",
+        f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded." if loaded else "",
         f"Not judged, since there is no start that is worse than the reference: {'; '.join(standing.left_out)}."
         if standing.left_out
         else "",

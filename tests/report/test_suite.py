@@ -163,6 +163,8 @@ def test_seconds_are_compared_on_the_same_machine_alone():
     slow = [[cost, 4 * seconds, error] for cost, seconds, error in whole[0].curve]
     there = [replace(one, cpu="another", curve=slow) for one in whole if one.row == "Dist"]
     assert Standing(moved, there).ratio("Mine", SECONDS).value == pytest.approx(0.5)
+    loaded = [replace(one, waited=0.2) for one in there]
+    assert Standing(moved, loaded).ratio("Mine", SECONDS) is None
     assert Standing.of_all([*moved, *there]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
+from bench.records.record import WAITED, RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
@@ -103,6 +103,11 @@ class Attempt:
     def ok(self) -> bool:
         """Whether its errors count; those of a run that ended otherwise do not."""
         return self.status == "ok"
+
+    @property
+    def timed(self) -> bool:
+        """Whether its seconds count; those on a loaded machine do not."""
+        return self.waited is None or self.waited <= WAITED
 
     @property
     def machine(self) -> tuple[Any, ...]:

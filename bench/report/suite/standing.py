@@ -166,7 +166,7 @@ class Standing:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
 
         Args:
-            of: `COST`, or `SECONDS`, of attempts on the same machine alone.
+            of: `COST`, or `SECONDS`, of attempts on the same machine alone, while it was not loaded.
         """
         if self.reference in (None, row):
             return None
@@ -175,10 +175,11 @@ class Standing:
         def place(one: Attempt) -> tuple[Any, ...]:
             return (*one.key[:3], one.machine if of == SECONDS else "")
 
-        others = {place(one): one for one in known if one.row == self.reference}
+        counts = [one for one in known if of == COST or one.timed]
+        others = {place(one): one for one in counts if one.row == self.reference}
         scenes: dict[str, list[tuple[float, float]]] = {}
         for one in self.of(row):
-            if (other := others.get(place(one))) is None:
+            if (other := others.get(place(one))) is None or (of == SECONDS and not one.timed):
                 continue
             pairs = zip(self.reached[one.key], self._reached(other), strict=True)
             both = [(a[of], b[of]) for a, b in pairs if isfinite(a[of]) and isfinite(b[of])]
