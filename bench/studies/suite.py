@@ -1,19 +1,21 @@
 """The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
 
 import csv
+from dataclasses import replace
 from io import StringIO
 from math import isfinite
 from typing import Any
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, statistics, table
-from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, read_attempts, suite
+from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, place, read_attempts, suite
 from bench.report.suite.standing import SECONDS, Standing
 from bench.report.write import paper
 from bench.tables import choice, names
 
 PLACE = 1
 DIFFERING = tuple(given for given, _ in GIVEN.values())
+KEEPS = place
 READS = tuple(Selection(f"{EXPERIMENT}{name}", DIFFERING) for name in suite().errors)
 BESIDE = {  # of what the project ships: the table, the lines of it, the number, its heading here
     "outline": ("gradients", {"band": "silhouette"}, "image_cosine", "Outline gradient, cosine"),
@@ -41,7 +43,7 @@ def make(*several: Runs | None) -> Result:
     panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
     figure = chart.draw_lead(panels, 5.4)
     return Result(
-        runs,
+        replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
         "The suite.",
         "Share of problems and targets that a renderer has reached over its field values, divided by those of DIST's "
         "whole run in the set; a run ends at the set's budget.",
@@ -134,7 +136,9 @@ def _sample(standing: Standing) -> str:
     problems = {(one.set, one.problem) for one in standing.judged}
     seeds = {one.seed for one in standing.judged}
     parts = [_scenes(standing), format.plural(len(seeds), "seed")]
-    return f"{format.plural(len(problems), 'problem')} ({', '.join(parts)}) of {suite().id}, {len(standing.rows)} rows"
+    sample = f"{format.plural(len(problems), 'problem')} ({', '.join(parts)}) of {suite().id}"
+    failed = sum(standing.failures(row).total() for row in standing.rows)
+    return f"{sample}, {len(standing.rows)} rows; {failed or 'none'} of {len(standing.attempts)} runs did not end ok"
 
 
 def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
@@ -142,27 +146,27 @@ def _verdict(standing: Standing, lines: list[dict[str, Any]]) -> str:
     if not ranked or not isfinite(ranked[0]["share"].value):
         return ""
     best = ranked[0]
-    said = [f"{best['row']} reaches the most, *{table.percent(best['share'].value)}* of problems and targets."]
+    said = [f"{best['row']} reaches *{table.percent(best['share'].value)}* of problems and targets, the most."]
     alike = [line["row"] for line in ranked[1:] if line["rank"] == best["rank"]]
     if standing.resolution is not None:
-        told = f"{_scenes(standing)} tell shares apart that differ by *{table.percent(standing.resolution)}* or more"
+        told = f"{_scenes(standing)} tell differences of *{table.percent(standing.resolution)}*"
         said.append(f"{told}: {len(alike) or 'none'} of {len(ranked) - 1} others are not told from it.")
     known = [line for line in ranked if line["ratio"] is not None]
     differ = dict(zip((one["row"] for one in known), statistics.differ([one["ratio"] for one in known]), strict=True))
     fewer = [one for one in known if differ[one["row"]] and one["ratio"].value < 1]
     if fewer and (least := min(fewer, key=lambda line: line["ratio"].value)):
-        said.append(f"For few field values take {least['row']}: *{format.number(least['ratio'].value)}* of DIST's.")
+        said.append(f"Fewest field values: {least['row']}, *{format.number(least['ratio'].value)}* of DIST's.")
     elif any(differ.values()):
         alike = [row for row, found in differ.items() if not found]
-        said.append(f"For few field values take {' or '.join([*alike, str(standing.reference)])}.")
+        said.append(f"Fewest field values: {' or '.join([*alike, str(standing.reference)])}.")
     for key, text, better in (
-        ("outline", "For outlines that must move take {}: its gradient has a cosine of *{}*.", max),
-        ("hard", "Where the field is no distance take {}: mean rank *{}* on hard scenes.", min),
+        ("outline", "For outlines that must move: {} (cosine *{}*).", max),
+        ("hard", "Where the field is no distance: {} (mean rank *{}*).", min),
     ):
         if found := {line["row"]: line[key] for line in ranked if line[key] is not None}:
             row = better(found, key=lambda name: found[name])
             said.append(text.format(row, format.number(found[row])))
-    return " ".join([*said, "CPU, small networks and images: of others it says nothing."])
+    return " ".join([*said, "Of other than small networks and images on a CPU it says nothing."])
 
 
 def _scenes(standing: Standing) -> str:
@@ -174,8 +178,7 @@ def _doubts(standing: Standing) -> list[str]:
     stated = {(one.set, one.settings) for one in standing.attempts if one.row == standing.reference}
     other = sorted({one.row for one in standing.attempts if stated and (one.set, one.settings) not in stated})
     alone = len(standing.everything) - len(standing.attempts)
-    codes = {row: {one.code for one in standing.attempts if one.row == row} for row in standing.rows}
-    mixed = [row for row, found in codes.items() if len(found) > 1]
+    versions = len({one.code for one in standing.attempts})
     machines = len({one.machine for one in standing.attempts})
     loaded = sum(not one.timed for one in standing.attempts)
     return [
@@ -183,7 +186,7 @@ def _doubts(standing: Standing) -> list[str]:
         f"Not shown: {alone} runs at problems that DIST has no run at: python -m bench.suite renderer=dist makes them."
         if alone
         else "",
-        f"Runs of more than one version of the code: {', '.join(mixed)}." if mixed else "",
+        f"Runs of {versions} versions of the code." if versions > 1 else "",
         f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone." if machines > 1 else "",
         f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded." if loaded else "",
         f"Not judged, since there is no start that is worse than the reference: {'; '.join(standing.left_out)}."

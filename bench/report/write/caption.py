@@ -85,6 +85,8 @@ def _levels(runs: Runs) -> tuple[int, int, int]:
 
 def _setup(runs: Runs) -> str:
     """The parts of the setup that are known: scenes, the resolution, prior and loss that all runs have, the machine."""
+    if not runs.records:
+        return ""
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in runs.records))
     shown = [scene for scene in scenes if scene] or [runs.records[0]["dataset"]]
     sizes = {setting(record["config"], "view", "resolution") for record in runs.records}
@@ -107,6 +109,8 @@ def _setup(runs: Runs) -> str:
 def _outcome(runs: Runs) -> str:
     failed = [record for record in runs.named() if record["status"] != "ok"]
     total = len(runs.records)
+    if not total:  # a page of rows that are kept without their runs
+        return ""
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
     if len(failed) <= MOST_FAILURES:

@@ -43,19 +43,23 @@ class Study:
     """A file of `bench/studies`: the runs that it reads, and its pages, each made of them by a function.
 
     A file has `PLACE`, its place among all, `READS`, a `Selection` for each argument of its functions, and `PAGES`,
-    these functions by the names of their pages.
+    these functions by the names of their pages. It may have `KEEPS`, which gives the folder of rows that a results
+    folder keeps of it: with that, its pages are made without runs too.
     """
 
     place: int
     reads: tuple[Selection, ...]
     pages: dict[str, Callable[..., Result]]
     problem: str = ""  # of a file that cannot be read
+    keeps: Callable[[Path], Path] | None = None
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
-        """The result of each page; none where there is no run of it."""
+        """The result of each page; none where there is no run of it, and no row is kept."""
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
-            return {}
+            if self.keeps is None or not self.keeps(results_dir).is_dir():
+                return {}
+            chosen = [Runs(selection, results_dir, []) for selection in self.reads]
         return {name: make(*chosen) for name, make in self.pages.items()}
 
 
@@ -68,7 +72,7 @@ def studies() -> tuple[Study, ...]:
             read = import_module(f"bench.studies.{file.name}")
             if taken := {name for study in found for name in study.pages} & {*read.PAGES}:
                 raise ValueError(f"another study has a page {min(taken)}: give it another name")
-            found.append(Study(read.PLACE, read.READS, read.PAGES))
+            found.append(Study(read.PLACE, read.READS, read.PAGES, keeps=getattr(read, "KEEPS", None)))
         except (*BROKEN, ImportError, NameError, SyntaxError) as error:
             found.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
     return tuple(sorted(found, key=lambda study: study.place))
