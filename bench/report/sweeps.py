@@ -1,4 +1,4 @@
-"""The table of each sweep that no study shows, beside its plan: medians over shapes and seeds, failures and costs."""
+"""The table and chart of each sweep that no study shows: medians over shapes and seeds, failures and costs."""
 
 import math
 from collections import Counter
@@ -14,12 +14,15 @@ from bench.report.data import records
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
-from bench.report.write.caption import OVER
+from bench.report.write.caption import FEW, OVER
+from bench.report.write.chart import Panel, panel_data, series
 from bench.report.write.paper import BROKEN, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, counted, text
 
+ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # behind a heading: which direction is better
 MOST_VALUES = 6  # of a swept key that the caption lists
+MOST_DATASETS = 8  # with a column and a panel of their own
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
 FAILURE = (
     "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: an "
@@ -41,6 +44,15 @@ class Sweep:
         """The names of all metrics that some run has as a number, those that tables show first."""
         found = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
         return [*(name for name in SHOWN if name in found), *(name for name in found if name not in SHOWN)]
+
+    @property
+    def datasets(self) -> list[str]:
+        """The data sets that every row has runs of; none where these are one alone, or many."""
+        rows = [{*map(records.family, own)} for own in grouped(self.runs.records, lambda run: run["row"]).values()]
+        found = [
+            one for one in dict.fromkeys(map(records.family, self.runs.records)) if all(one in row for row in rows)
+        ]
+        return found if 1 < len(found) <= MOST_DATASETS else []
 
 
 def write_sweeps(known: list[Record], results_dir: Path, problems: list[str] | None = None) -> list[Path]:
@@ -90,12 +102,22 @@ def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
     """A line per row: its counts, its costs, the interval of each metric's median, and the ratio of the first metric.
 
-    The ratio is to the first row, paired by shape; None where there is none.
+    The ratio is to the first row, paired by shape; None where there is none. Of the first metric, the median on each
+    data set that all rows have stands under its name with that of the data set.
     """
     rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
     first = next(iter(rows.values()))
     lead = names[0] if names and better(names[0]) == LOWER else ""
-    return [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
+    found = [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
+    for dataset in sweep.datasets if names else ():
+        for line, runs in zip(found, rows.values(), strict=True):
+            own = [run for run in runs if records.family(run) == dataset]
+            line[_on(names[0], dataset)] = median_of(own, names[0])
+    return found
+
+
+def _on(metric: str, dataset: str) -> str:
+    return f"{metric}, {dataset}"
 
 
 def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
@@ -105,7 +127,8 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
     reasons = Counter(f"{run['status']}: {run['reason']}".rstrip(": ") for run in runs if run["status"] != "ok")
     rate = share([sum(failed) for failed in failures], [len(failed) for failed in failures])
     return {
-        **{"row": row, "runs": len(runs), "failed": len(runs) - len(ended), "rate": rate},
+        **{"row": row, "preset": records.row_of(runs[0]).preset, "rate": rate},
+        **{"runs": len(runs), "failed": len(runs) - len(ended)},
         "reasons": "; ".join(f"{said} ({count} runs)" if count > 1 else said for said, count in reasons.items()),
         "loop_seconds": records.median_of_known(map(records.loop_seconds, ended)),
         "value_evaluations": records.median_of_known(map(records.value_evaluations, ended)),
@@ -150,33 +173,76 @@ def table_of(sweep: Sweep) -> Result:
     headings = headings or {name: Metric(name) for name in names[:MOST_METRICS]}
     stress = any(record["config"].get("stress") for record in sweep.runs.records)
     more = [name for name in names if name not in headings]
+    known = [line[name].known for line in found for name in headings if line[name] is not None]
+    kinds = ["95 % bootstrap intervals over shapes" if any(known) else "", "" if all(known) else f"{FEW}: no interval"]
+    lead = names[0] if names and names[0] in headings and better(names[0]) else ""
+    panels = [_panel(found, key, title, headings[lead]) for key, title in _shown(sweep, lead).items()] if lead else []
     return Result(
         sweep.runs,
         f"Sweep {sweep.name}.",
         f"Medians over {OVER}; swept over {_listed(sweep)}.",
+        **_answer(sweep, found, lead, headings),
         n=f"{len(sweep.runs.records)} runs" if stress else "",
-        interval="95 % bootstrap intervals over shapes" if headings else "",
-        estimates=[line[name] for line in found for name in headings if line[name] is not None],
+        interval="; ".join(filter(None, kinds)) if headings else "",
+        chart={"panels": panels} if panels else None,
         remarks=(
             FAILURE,
             UNDIRECTED if any(not better(name) for name in headings) else "",
             f"The CSV also has {', '.join(more)}." if more else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
         ),
-        columns=_columns(names, headings, several=any(line["ratio"] is not None for line in found)),
+        columns=_columns(sweep, headings, several=any(line["ratio"] is not None for line in found)),
         lines=found,
     )
 
 
-def _columns(names: list[str], headings: dict[str, Metric], *, several: bool) -> list[Column]:
-    first = next(iter(headings.values()), Metric("")).label.split(" (")[0]
-    ratio = Metric(f"{first} over the first row's" if several else "")
+def _shown(sweep: Sweep, metric: str) -> dict[str, str]:
+    """Where lines have a metric, with the title of its panel: on each data set, or on the one that there is."""
+    return {_on(metric, dataset): dataset for dataset in sweep.datasets} or {metric: ""}
+
+
+def _panel(found: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
+    """A row of the table per line of the panel, with its median and interval along x."""
+    drawn = []
+    for place, line in enumerate(found):
+        if line[key] is not None:
+            one = series(line["row"], line["preset"], [place], [line[key].times(shown.factor)])
+            drawn.append(one | {"x": one["y"], "y": one["x"]})
+    return panel_data(title, shown.label, "", drawn, rows=[line["row"] for line in found])
+
+
+def _answer(sweep: Sweep, found: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:
+    """The question and the verdict on the first metric; empty where there is nothing to choose from."""
+    known = {line["row"]: line[lead] for line in found if lead and line[lead] is not None}
+    if len(known) < 2:
+        return {}
+    shown, most = headings[lead], better(lead) == HIGHER
+    values = {row: shown.factor * one.value for row, one in known.items()}
+    shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
+    verdict = [format.ends(f"Median {shown.label}", values, shapes, most=most)]
+    first = dict[str, str]()
+    for dataset in sweep.datasets:
+        own = {line["row"]: one.value for line in found if (one := line[_on(lead, dataset)]) is not None}
+        first |= {dataset: (max if most else min)(own, key=lambda row, own=own: own[row])} if own else {}
+    if len({*first.values()}) > 1:
+        verdict.append(f"Best by data set: {', '.join(f'{dataset} {row}' for dataset, row in first.items())}.")
+    return {
+        "question": f"Which has the {'highest' if most else 'lowest'} {shown.label.split(' (')[0]}?",
+        "verdict": " ".join(filter(None, verdict)),
+    }
+
+
+def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> list[Column]:
+    names, first = sweep.metrics, next(iter(headings.values()), Metric(""))
+    ratio = Metric(f"{first.label.split(' (')[0]} over the first row's" if several else "")
+    shown = {_on(names[0], one): first._replace(label=f"{one}: {first.label}") for one in sweep.datasets if names}
     return [
         text("row", "Run"),
+        *(column for name, metric in shown.items() for column in _estimate(name, metric)),
         *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
         *_estimate("ratio", ratio),
         Column("runs"),
-        Column("failed", "Failed", words=lambda line: counted(line["failed"], line["runs"], line["rate"])),
+        Column("failed", "Failed", words=lambda line: _alone(counted(line["failed"], line["runs"], line["rate"]))),
         *_ends("failed", "rate"),
         text("reasons"),
         Column("loop_seconds", "Loop", show=format.seconds),
@@ -188,9 +254,15 @@ def _estimate(key: str, shown: Metric) -> list[Column]:
     """The columns of an estimate that a line may lack, and of the ends of its interval: in scene units for the CSV."""
 
     def words(line: dict[str, Any]) -> str:
-        return format.MISSING if line[key] is None else str(line[key].times(shown.factor))
+        return format.MISSING if line[key] is None else _alone(str(line[key].times(shown.factor)))
 
-    return [Column(key, shown.label, lambda line: getattr(line[key], "value", None), words=words), *_ends(key, key)]
+    heading, value = f"{shown.label}{ARROWS[shown.better]}", lambda line: getattr(line[key], "value", None)
+    return [Column(key, heading, value, words=words, better=shown.better), *_ends(key, key)]
+
+
+def _alone(words: str) -> str:
+    """An estimate without the number of its shapes, which the caption has once."""
+    return words.partition(" (n = ")[0]
 
 
 def _ends(key: str, of: str) -> list[Column]:

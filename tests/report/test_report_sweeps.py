@@ -58,6 +58,46 @@ def test_rows_are_what_varies_beside_shapes_and_seeds(tmp_path):
     assert found["chamfer_l2_low"].isna().all()  # two shapes give no interval
 
 
+def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once(tmp_path):
+    errors = {
+        ("dist", "sofa"): 1.0,
+        ("dist", "plane"): 4.0,
+        ("dvr", "sofa"): 3.0,
+        ("dvr", "plane"): 2.0,
+        ("dvr", "car"): 9.0,
+    }
+    cells = [cell(renderer, dataset=dataset) for renderer, dataset in errors]
+    swept(tmp_path, cells)
+    for one, error in zip(cells, errors.values(), strict=True):
+        ran(tmp_path, one, error / 1000)
+    table(tmp_path)
+    (found,) = find_sweeps(tmp_path)
+    shown = found.shown
+    assert shown.columns[1:4] == ["sofa: Chamfer (x1000) ↓", "plane: Chamfer (x1000) ↓", "Chamfer (x1000) ↓"]
+    assert [row[:4] for row in shown.rows] == [["DIST", "1.00", "4.00", "2.50"], ["DVR", "3.00", "2.00", "3.00"]]
+    assert [at for at in shown.best if at[1] < 4] == [[0, 1], [1, 2], [0, 3]]
+    assert shown.question == "Which has the lowest Chamfer?"
+    assert shown.verdict == (
+        "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR."
+    )
+    assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
+    panels = shown.chart["panels"]
+    assert [panel["title"] for panel in panels] == ["sofa", "plane"] and panels[0]["rows"] == ["DIST", "DVR"]
+    assert [(one["x"], one["y"]) for one in panels[1]["series"]] == [([4.0], [0.0]), ([2.0], [1.0])]
+    text, tex = ((found.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
+    assert "| DIST | **1.00** | 4.00 |" in text and r"DIST & \textbf{1.00} & 4.00 &" in tex and "(n = " not in text
+
+
+def test_a_data_set_on_which_a_row_only_failed_has_a_column_all_the_same(tmp_path):
+    cells = [cell(renderer, dataset=dataset) for renderer in ("dist", "dvr") for dataset in ("sofa", "plane")]
+    swept(tmp_path, cells)
+    for one, chamfer in zip(cells, (0.001, 0.002, 0.003, None), strict=True):
+        ran(tmp_path, one, chamfer)
+    assert table(tmp_path)["chamfer_l2, plane"].isna().tolist() == [False, True]
+    verdict = find_sweeps(tmp_path)[0].shown.verdict
+    assert verdict.startswith("Median Chamfer (x1000): *1.50* (DIST) to ∞ (DVR)") and "Best by" not in verdict
+
+
 def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
     cells = [cell(r, seed=s) for r in ("dist", "dvr") for s in (0, 1)]
     swept(tmp_path, [cell("dist", seed=9)], "completion-0")
@@ -143,7 +183,7 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert not (tmp_path / "paper").exists()
     (found,) = find_sweeps(tmp_path)
     assert (found.name, found.shown.title) == ("completion-1", "Sweep completion-1.")
-    assert found.shown.columns[:2] == ["Run", "Chamfer (x1000)"] and found.shown.rows[0][:2] == ["DIST", "1.00 (n = 1)"]
+    assert found.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
     assert found.files == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
     within = re.search(r"WITHIN = /(.*)/;", (ASSETS / "base" / "dom.js").read_text())
     assert within and all(re.fullmatch(within[1], link) for link in found.files.values())  # the page links to them

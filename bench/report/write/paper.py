@@ -24,6 +24,7 @@ SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
 SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
 STUDIES = ROOT / "bench" / "studies"
+JOINED = "suite"  # the page whose own rows are among the shipped ones already
 BESIDE = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
 
 HEAD = """# Results
@@ -164,18 +165,20 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
         key = key_of(found.name)
         shown = found.shown
         texts = {"question": shown.question, "verdict": shown.verdict, "shipped": found.shipped}
+        texts["sweep"] = found.base.name == TABLE and found.base.parents[1].name == SWEEPS
         entries.append({"name": found.name, "key": key, "title": (shown.title or found.name).rstrip("."), **texts})
         wholes[key] = {
             **{"caption": shown.caption, "notes": shown.notes, "header": shown.columns},
             **{"rows": shown.rows + _beside(found, results_dir), "files": found.files, "picture": found.picture},
-            **{"chart": shown.chart, "atlas": shown.atlas},
+            **{"chart": shown.chart, "atlas": shown.atlas, "best": shown.best},
         }
     return entries, wholes
 
 
 def _beside(found: Found, results_dir: Path) -> list[list[str]]:
-    """The shipped rows of a table of the user's, marked; none where its columns are others, or it is shipped itself."""
-    if found.shipped or found.base.parents[1] != results_dir or results_dir.resolve() == SHIPPED:
+    """The shipped rows of a table of the user's, marked; none where it has them, has other columns, or is shipped."""
+    own = not found.shipped and found.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
+    if found.name == JOINED or not own:
         return []
     shipped = found_at(SHIPPED / FOLDER / found.name, SHIPPED).shown
     same = shipped.columns and shipped.columns == found.shown.columns

@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from bench.records.record import plain
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
-from bench.report.write.table import Column, to_data, to_table
+from bench.report.write.table import Column, best, to_data, to_table
 
 # Special characters of LaTeX, and characters that its standard fonts lack; a row that starts with a bracket would be
 # read as the argument of the line break before it.
@@ -41,6 +41,8 @@ _LATEX = {
     "±": r"$\pm$",
     "²": "$^2$",
     "→": r"$\rightarrow$",
+    "↓": r"$\downarrow$",
+    "↑": r"$\uparrow$",
     "°": r"$^\circ$",
     "ρ": r"$\rho$",
     "≥": r"$\geq$",
@@ -124,6 +126,7 @@ class Result:
             caption=self.caption,
             columns=list(map(str, table.columns)),
             rows=table.to_numpy().tolist(),
+            best=best(self.columns, self.lines),
             notes=self.notes,
             drawn=self.figure is not None,
             chart=self.chart,
@@ -143,6 +146,7 @@ class Shown:
     caption: str = ""
     columns: list[str] = field(default_factory=list)
     rows: list[list[str]] = field(default_factory=list)
+    best: list[list[int]] = field(default_factory=list)  # the row and the column of what is set bold
     notes: list[str] = field(default_factory=list)
     drawn: bool = False
     chart: dict[str, Any] | None = None
@@ -176,6 +180,8 @@ def _is_sound(name: str, value: Any) -> bool:
         return isinstance(value, dict)
     if name == "rows":
         return isinstance(value, list) and all(_is_sound("columns", row) for row in value)
+    if name == "best":
+        return isinstance(value, list) and all(isinstance(at, list) and [*map(type, at)] == [int, int] for at in value)
     if name in ("columns", "notes", "experiments"):
         return isinstance(value, list) and all(isinstance(one, str) for one in value)
     return isinstance(value, {"place": int, "drawn": bool}.get(name, str))
@@ -205,7 +211,7 @@ def markdown(shown: Shown, name: str) -> str:
     asked = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
     parts = [*asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
-        head, *rows = ([as_markdown(cell) for cell in row] for row in (shown.columns, *shown.rows))
+        head, rows = map(as_markdown, shown.columns), _emphasised(shown, as_markdown, "**{}**")
         rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if shown.drawn:
@@ -218,7 +224,8 @@ def markdown(shown: Shown, name: str) -> str:
 def latex(shown: Shown, name: str) -> str:
     """A LaTeX table environment, without the notes, no wider than the text; it needs booktabs and graphicx."""
     aligned = "".join("l" if of_words else "r" for of_words in _of_words(shown))
-    head, *rows = (rf"{' & '.join(map(_tex, row))} \\" for row in (shown.columns, *shown.rows))
+    cells = [map(_tex, shown.columns), *_emphasised(shown, _tex, r"\textbf{{{}}}")]
+    head, *rows = (rf"{' & '.join(row)} \\" for row in cells)
     lines = [
         r"\begin{table*}",
         r"\centering",
@@ -231,6 +238,14 @@ def latex(shown: Shown, name: str) -> str:
         r"\end{table*}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _emphasised(shown: Shown, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
+    """The cells of all rows as Markdown or LaTeX, the best ones in bold."""
+    return [
+        [bold.format(escaped(cell)) if [line, place] in shown.best else escaped(cell) for place, cell in enumerate(row)]
+        for line, row in enumerate(shown.rows)
+    ]
 
 
 def _of_words(shown: Shown) -> list[bool]:

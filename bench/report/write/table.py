@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from bench.records import format
+from bench.records.metrics import LOWER
 from bench.report.data import records
 from bench.report.data.records import SCALE, measured, row_of, setting
 from bench.report.data.statistics import Interval
@@ -46,6 +47,7 @@ class Column:
         value: gives the raw value of a line; by default `line.get(key)`.
         show: converts the value to text for readers.
         words: gives the text of a line for readers, where it depends on more than the value.
+        better: lower or higher, of a column whose best value is set bold; empty for none.
     """
 
     key: str
@@ -53,6 +55,7 @@ class Column:
     value: Callable[[Any], Any] | None = None
     show: Callable[[Any], str] = format.number
     words: Callable[[Any], str] | None = None
+    better: str = ""
 
     def of(self, line: Any) -> Any:
         """The raw value of a line."""
@@ -76,6 +79,18 @@ def to_table(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
     """The values of all lines as text, for readers."""
     kept = [column for column in columns if column.heading]
     return pd.DataFrame([[c.text(line) for c in kept] for line in lines], columns=[c.heading for c in kept])
+
+
+def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
+    """The row and the column, in the readable table, of each value that is the best of a column with several values."""
+    found = []
+    for place, column in enumerate([column for column in columns if column.heading]):
+        values = [column.of(line) for line in lines] if column.better else []
+        known = [value for value in values if value is not None and math.isfinite(value)]
+        if len({*values}) > 1 and known:
+            top = min(known) if column.better == LOWER else max(known)
+            found += [[line, place] for line, value in enumerate(values) if value == top]
+    return found
 
 
 def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:

@@ -17,9 +17,10 @@
   /* Plotly reads some markup in its texts; a name from a record has none. */
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 
-  /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, series}]}. A series is {name, colour, symbol, dash,
-     x, y, text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name are
-     shown and hidden together. A point with a link opens it. `focus` is the name of the series to bring out. */
+  /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, rows, series}]}. A series is {name, colour, symbol,
+     dash, x, y, text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name
+     are shown and hidden together. A point with a link opens it. `focus` is the name of the series to bring out. With
+     `rows`, their names stand down the y axis in place of a legend, and `low` and `high` are of x. */
   function chart(spec, {label, focus} = {}) {
     const shown = later(bench.store.plotly(), (plotly) => drawn(plotly, spec, focus));
     return element("div.chart", {role: "group", "aria-label": label || "Chart"}, shown);
@@ -34,18 +35,19 @@
     const redraw = () => places.forEach((place, n) => drawPanel(plotly, place, spec.panels[n], off, focus));
     const many = spec.panels.length > MANY;
     const entries = names.map((name) => entry(looks.get(name), off, redraw));
-    const legend = names.length > 1 && element(`div.legend${many ? ".above" : ""}`, null, entries);
+    const legend = names.length > 1 && !spec.panels.some(({rows}) => rows) && element(`div.legend${many ? ".above" : ""}`, null, entries);
     const panels = element(`div.panels${many ? ".many" : ""}`, null, places);
     requestAnimationFrame(redraw);
     bench.onTheme(panels, redraw);
     return [many && legend, panels, !many && legend, spec.note && element("p.soft", null, spec.note)];
   }
 
-  /* A button of the legend, which shows and hides a series. */
-  function entry({name, symbol, colour}, off, redraw) {
-    const [, glyph] = SYMBOLS.get(symbol) || [];
-    const swatch = element(glyph ? "span.glyph" : "span.swatch", {"aria-hidden": "true"}, glyph);
-    swatch.style[glyph ? "color" : "background"] = bench.colour(colour);
+  /* A button of the legend, which shows and hides a series: its marker, or its line where it has steps and no markers. */
+  function entry({name, symbol, colour, dash, step}, off, redraw) {
+    const [, glyph] = (!step && SYMBOLS.get(symbol)) || [];
+    const swatch = element(glyph ? "span.glyph" : step ? "span.stroke" : "span.swatch", {"aria-hidden": "true"}, glyph);
+    swatch.style[glyph ? "color" : step ? "borderColor" : "background"] = bench.colour(colour);
+    if (step) swatch.style.borderTopStyle = {solid: "solid", dot: "dotted"}[DASHES.get(dash)] || "dashed";
     const click = ({currentTarget}) => {
       off.has(name) ? off.delete(name) : off.add(name);
       currentTarget.setAttribute("aria-pressed", String(!off.has(name)));
@@ -58,7 +60,7 @@
     if (!place.isConnected) return;
     const front = ({name}) => Number(name === focus); // drawn last, over the others
     const shown = panel.series.filter(({name}) => !off.has(name)).sort((a, b) => front(a) - front(b));
-    const traces = shown.map((series) => trace(series, focus));
+    const traces = shown.map((series) => trace(series, focus, panel.rows ? "x" : "y"));
     plotly.react(place, traces, layout(panel, place), {displayModeBar: false, responsive: true});
     place.removeAllListeners("plotly_click");
     place.on("plotly_click", ({points: [point]}) => {
@@ -68,7 +70,7 @@
     });
   }
 
-  function trace(series, focus) {
+  function trace(series, focus, letter) {
     const color = bench.colour(series.colour);
     const lines = series.dash !== undefined;
     const dash = DASHES.get(series.dash) || "solid";
@@ -79,7 +81,7 @@
       name: plain(series.name),
       x: series.x.map(decoded),
       y: series.y.map(decoded),
-      mode: lines ? (series.symbol ? "lines+markers" : "lines") : "markers",
+      mode: lines ? (series.symbol && !series.step ? "lines+markers" : "lines") : "markers",
       opacity: focus && series.name !== focus ? 0.35 : 1,
       line: {color, width, dash, shape: series.step ? "hv" : "linear"},
       marker: {color, symbol: symbol + (series.hollow ? "-open" : ""), size: series.size || 7, line: {color, width: 1.5}},
@@ -87,8 +89,8 @@
       text: hover(series),
     };
     if (series.low) {
-      const [array, arrayminus] = [series.high, series.low].map((ends) => ends.map((end, n) => Math.abs(end - series.y[n])));
-      made.error_y = {type: "data", symmetric: false, array, arrayminus, color, thickness: 1, width: 2};
+      const [array, arrayminus] = [series.high, series.low].map((ends) => ends.map((end, n) => Math.abs(end - series[letter][n])));
+      made[`error_${letter}`] = {type: "data", symmetric: false, array, arrayminus, color, thickness: 1, width: 2};
     }
     return made;
   }
@@ -114,17 +116,22 @@
     });
     return {
       title: {text: plain(panel.title || ""), font: {size: 14}, x: 0.02, xanchor: "left"},
-      height: panel.height || 360,
+      height: panel.height || (panel.rows ? 110 + 24 * panel.rows.length : 360),
       showlegend: false,
       margin: {l: 56, r: 12, t: panel.title ? 38 : 12, b: 46},
       hovermode: "closest",
       xaxis: axis(panel.x, "x"),
-      yaxis: axis(panel.y, "y"),
+      yaxis: {...axis(panel.y, "y"), ...(panel.rows ? namedAxis(panel.rows) : {})},
       ...{paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)"},
       font: {color: own("--soft"), size: 12, family: own("--font")},
       hoverlabel: {bgcolor: own("--card"), bordercolor: line, align: "left", font: {color: own("--text")}},
     };
   }
+
+  const namedAxis = (names) => {
+    const tickvals = names.map((_, place) => place);
+    return {tickvals, ticktext: names.map(plain), range: [names.length - 0.5, -0.5], autorange: false};
+  };
 
   /* Plain numbers as ticks of a logarithmic axis: powers of ten, and numbers between them where there are few. */
   function ticks(values, narrow) {

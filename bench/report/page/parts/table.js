@@ -93,8 +93,11 @@
     return values.map(({item}) => item);
   }
 
-  /* The table of a page that was written as text: numbers to the right, and sorted by the first number of a cell. */
-  function written(header, rows) {
+  /* The table of a page that was written as text: numbers to the right, and sorted by the first number of a cell.
+     `best` are rows and columns of cells that are set bold. The column `named` has a row's name, and its `link`. */
+  function written(header, rows, {best = [], named, link} = {}) {
+    const bold = new Set(best.map(String));
+    const heads = Math.max(0, header.indexOf(named));
     const columns = header.map((label, place) => {
       const cells = rows.map((row) => row[place] || "");
       const filled = cells.filter((text) => text && text !== "–" && text !== "∞");
@@ -102,7 +105,9 @@
       const line = Math.max(0, ...cells.map((text) => text.length)) <= LONGEST_LINE;
       const kind = numeric ? "number" : line ? "words.line" : "words";
       const get = (row) => (numeric ? leading(row[place]) : (row[place] || "").toLowerCase());
-      return {key: String(place), label, kind, get, head: place === 0, cell: (row) => row[place]};
+      const text = (row) => (bold.has(`${rows.indexOf(row)},${place}`) ? element("strong", null, row[place]) : row[place]);
+      const cell = link && place === heads ? (row) => element("a", {href: link(row[place])}, row[place]) : text;
+      return {key: String(place), label, kind, get, head: place === heads, cell};
     });
     return table(columns, rows);
   }
