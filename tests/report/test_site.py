@@ -14,7 +14,7 @@ from bench.records.names import differences
 from bench.records.read import RESULTS, Plan, PlannedCell, not_run, read_records
 from bench.records.record import NOT_RUN, RunStatus, file_lock
 from bench.report.data.records import definition
-from bench.report.site.columns import names
+from bench.report.site.columns import columns, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplified
@@ -47,8 +47,18 @@ def test_runs_are_named_by_what_differs():
 
 
 def test_a_setting_that_follows_from_another_is_not_named():
-    configs = [{"scale": {"name": name}, "view": {"resolution": size}} for name, size in (("smoke", 32), ("desk", 64))]
-    assert names([record("x", config=config) for config in configs]) == ["dist, scale smoke", "dist, scale desk"]
+    sizes = (("small", 32), ("large", 64))
+    configs = [{"field": {"name": name}, "view": {"resolution": size}} for name, size in sizes]
+    assert names([record("x", config=config) for config in configs]) == ["dist, field small", "dist, field large"]
+
+
+def test_scale_has_a_column_and_neither_it_nor_what_follows_from_it_is_in_names():
+    sizes = (("smoke", 32), ("desk", 64))
+    made = [record("x", folder="x", config={"scale": {"name": n}, "view": {"resolution": r}, "task": {"points": p}})
+            for n, r in sizes for p in (20, 100)]  # fmt: skip
+    assert names(made) == ["dist, points 20", "dist, points 100"] * 2
+    found = columns(made, [Folder(Path("none"), f"run{number}") for number in range(4)])["texts"]["scale"]
+    assert [found["values"][code] for code in found["codes"]] == ["smoke", "smoke", "desk", "desk"]
 
 
 def test_own_renderers_are_named_by_their_class():

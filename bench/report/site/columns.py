@@ -28,9 +28,11 @@ METRICS = SHOWN | MEASURED
 CUSTOM = "custom"  # the choice of renderer that stands for a user's class
 MOST_TOLD = 3  # settings in a name
 # Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
-IN_COLUMNS = NEUTRAL_KEYS | {"dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw"}
+IN_COLUMNS = NEUTRAL_KEYS | {
+    *("dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw", "scale"),
+}
 # What is named first where several settings tell runs apart.
-TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "scale", "view")
+TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "view")
 
 
 def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
@@ -55,17 +57,21 @@ def names(records: list[Record]) -> list[str]:
     """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
 
     What differs is written as for the rows of a sweep, so that a setting reads the same in both; what stands in columns
-    of its own, such as shape and seed, is left out. Settings are added as long as one tells apart runs of one task and
-    row that those before it do not, so that what follows from another setting is not repeated; at most `MOST_TOLD`.
+    of its own, such as shape, seed and scale, is left out. Settings are added as long as one tells apart runs of one
+    task, row and scale that those before it do not, so that what follows from another setting is not repeated; at most
+    `MOST_TOLD`.
     """
     found = [_base_name(record) for record in records]
     known: dict[Hashable, dict[str, str]] = {}
     settings = [_settings(record["config"], known) for record in records]
     for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
-        alike = list(grouped(places, lambda place: str(settings[place])).values())  # most runs of a list have the same
-        different = [settings[same[0]] for same in alike]
+        alike = list(grouped(places, lambda place: (_scale(records[place]), str(settings[place]))).values())
+        different = [settings[same[0]] for same in alike]  # most runs of a list have the same
+        scales = [_scale(records[same[0]]) for same in alike]
         rows = [found[places[0]]] * len(alike)
-        told = told_apart(in_order(different, TOLD_FIRST), classes=[0] * len(alike), names=rows, most=MOST_TOLD)
+        told = told_apart(
+            in_order(different, TOLD_FIRST), classes=[*map(scales.index, scales)], names=rows, most=MOST_TOLD
+        )
         for same, name in zip(alike, told, strict=True):
             for place in same:
                 found[place] = name
@@ -91,6 +97,10 @@ def _base_name(record: Record) -> str:
     return name
 
 
+def _scale(record: Record) -> str:
+    return str(setting(record["config"], "scale", "name") or "")
+
+
 def machine(record: Record) -> str:
     """The machine that the run's times depend on, with its threads; empty where the run ended before it knew."""
     environment = record["environment"]
@@ -114,6 +124,7 @@ TEXTS = {
     "family": lambda record: _safely(family, record, record["dataset"]),
     "scene": lambda record: record.get("scene") or record["dataset"],
     "renderer": lambda record: record["renderer"],
+    "scale": _scale,
     "status": lambda record: record["status"],
     "machine": machine,
     "experiment": lambda record: str(record["config"].get("experiment") or ""),

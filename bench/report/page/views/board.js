@@ -1,14 +1,19 @@
-/* Leaderboards: the methods of a task or its runs, filtered, searched and sorted; all of it stands in the address. */
+/* Leaderboards: the methods of a task, a table for each group that compares, or its runs, filtered, searched and sorted;
+   all of it stands in the address. */
 (function (bench) {
   "use strict";
 
   const {element, fill, soft, choice} = bench.dom;
   const {number, count, seconds, date, plural, label, MISSING} = bench.format;
-  const {FILTERS, LINKED} = bench.choose;
+  const {FILTERS, LINKED, SILENT} = bench.choose;
   const MOST_METRICS = 6;
 
   /* Fills a section with the board that the query asks for, and keeps it in step with its controls. */
   function board(home, query) {
+    if (!bench.runs.count) {
+      const example = element("code", null, "python -m bench task=completion renderer=dist");
+      return fill(home, element("h2", {id: "board"}, "Runs"), element("p", null, "No run was read. Make one: ", example));
+    }
     const state = {task: bench.runs.tasks[0].task, ...query, view: query.view === "runs" ? "runs" : "methods"};
     if (query.task === "all") state.task = "";
     const keep = () => bench.address.keep(["runs"], asked(state));
@@ -80,29 +85,35 @@
   /* How many runs there are, whose machines their times are of, and the table. */
   function rows(state, places, changed) {
     const {runs} = bench;
-    const failed = places.filter((place) => runs.text(place, "status") !== "ok").length;
+    const statuses = places.map((place) => runs.text(place, "status"));
+    const silent = statuses.filter((one) => SILENT.has(one)).length;
+    const failed = statuses.filter((one) => one !== "ok").length - silent;
+    const ended = failed ? `${failed.toLocaleString("en")} did not end ok` : silent ? "none failed" : "all ended ok";
+    const unmade = silent ? `, ${silent.toLocaleString("en")} not run, killed or refused` : "";
     const of = places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : "";
-    const said = `${plural(places.length, "run")}${of}, ${failed ? `${failed.toLocaleString("en")} did not end ok` : "all ended ok"}`;
+    const said = `${plural(places.length, "run")}${of}, ${ended}${unmade}.`;
     const task = runs.tasks.find((each) => each.task === state.task);
     const known = (key) => places.some((place) => runs.metrics[key].after[place] !== null);
     const metrics = (task ? task.metrics : []).filter(known).slice(0, MOST_METRICS);
-    const shown = state.view === "methods" ? ofMethods(state, places, metrics) : ofRuns(state, places, metrics);
-    const table = bench.table(shown.columns, shown.items, {...shown, caption: said, state, changed, cards: true});
-    table.id = "board-list";
-    return [element("p.count", {"aria-live": "polite"}, said, shown.said || "."), machines(places), table];
+    const boards = state.view === "methods" ? ofMethods(state, places, metrics) : [ofRuns(state, places, metrics)];
+    const tables = boards.map(({title, columns, items, ...how}) =>
+      [title && element("h3", null, title), bench.table(columns, items, {...how, caption: title || said, state, changed, cards: true})]);
+    return [element("p.count", {"aria-live": "polite"}, said), machines(places), element("div", {id: "board-list"}, tables)];
   }
 
+  /* A table for each group of runs that compare. */
   function ofMethods(state, places, metrics) {
-    const {rows: items, cells} = bench.choose.methods(bench.runs, places, metrics);
-    const part = items.filter((row) => !row.complete).length;
-    const covers = cells > 1 ? `; ${plural(cells, "scene")} (shape, view, seed and what is given)` : "";
-    const unlike = part && items.length > 1
-      ? `. Medians of ${plural(part, "method")} are over other scenes: only methods with all ${cells.toLocaleString("en")} have a rank`
-      : "";
-    const ranked = metrics.length > 0 && bench.runs.metrics[metrics[0]].better !== "";
-    const first = ranked ? metrics[0] : metrics.length ? "name" : "loop";
-    const ordered = (all) => all.filter((row) => row.complete).forEach((row, n) => (row.rank = ranked ? n + 1 : null));
-    return {columns: methodColumns(state, metrics), items, first, ordered, said: `${covers}${unlike}.`};
+    const ranks = metrics.length > 0 && bench.runs.metrics[metrics[0]].better !== "";
+    const first = ranks ? metrics[0] : metrics.length ? "name" : "loop";
+    return bench.choose.groups(bench.runs, places).map(({scale, cells, places: own}) => {
+      const items = bench.choose.methods(bench.runs, own, metrics);
+      const ordered = (all) => all.forEach((row, n) => (row.rank = ranks && cells ? n + 1 : null));
+      const on = cells
+        ? ` on the ${plural(cells, "scene")} (shape, view, seed, what is given) that all have`
+        : items.length > 1 ? " without a scene in common: no ranks" : " alone";
+      const title = `${scale ? `scale=${scale}: ` : ""}${plural(items.length, "method")}${on}`;
+      return {columns: methodColumns(state, metrics), items, first, ordered, title};
+    });
   }
 
   /* A column of numbers that sorts. */
@@ -168,7 +179,8 @@
     const {runs} = bench;
     const seed = `seed ${runs.number(place, "seed") ?? MISSING}`;
     const [task, scene, experiment] = ["task", "scene", "experiment"].map((key) => runs.text(place, key));
-    const about = [state.task ? "" : task, scene, seed, experiment];
+    const scale = runs.values("scale").length > 1 && runs.text(place, "scale");
+    const about = [state.task ? "" : task, scene, seed, experiment, scale && `scale=${scale}`];
     const reason = runs.reason(place);
     return [
       element("a", {href: runs.link(place)}, runs.text(place, "name")),
@@ -190,5 +202,12 @@
       `Choose one under Machine to compare seconds. ${sorted.map(([machine, n]) => `${machine}: ${plural(n, "run")}`).join("; ")}.`);
   }
 
-  bench.board = board;
+  /* The leaderboards by themselves. */
+  function leaderboards(home, query) {
+    const boards = element("section", {"aria-labelledby": "board"});
+    fill(home, element("h1.unseen", null, "Leaderboards"), boards);
+    board(boards, query);
+  }
+
+  Object.assign(bench, {board, leaderboards});
 })((window.implicitBench = window.implicitBench || {}));
