@@ -2,20 +2,27 @@
 
 import io
 import json
+from dataclasses import replace
 
 import pytest
 import trimesh
 from PIL import Image
 
 from bench.records import format
+from bench.report.__main__ import main
+from bench.report.suite.attempts import write_attempts
+from bench.report.suite.standing import Standing
 from bench.report.write import paper
 from bench.report.write.html import write_index
 from tests.browser import made
 from tests.report.test_report import crashed
+from tests.report.test_report_sweeps import cell, ran, swept
+from tests.report.test_suite import attempt, write_completion
 
 pytestmark = pytest.mark.browser
 
 RUNS = 7
+SOLVED = [attempt("Dist", f"car test {n}", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist") for n in (0, 1)]
 NUMBERS = (0.0123456, 0.5, 9.996, 99.96, 1234.5, -12.34, 1.234e-5, 1.5e9, 0, 999.6, 1_430_000, 3e12, 7201, 0.0123, None)
 
 
@@ -70,14 +77,62 @@ def names_of(page):
     return page.locator("#board-list tbody th a").all_inner_texts()
 
 
-def test_the_first_screen_has_questions_verdicts_and_leaderboards(results, tab):
-    page = tab(results).open()
-    assert page.locator(".verdict .question").all_inner_texts() == ["What does accuracy cost?", "Where?"]
-    assert page.locator(".verdict strong").first.inner_text() == "0.5"
-    assert page.locator("#counts").inner_text().startswith(f"{RUNS + 1} runs")
-    assert set(names_of(page)) == {"DIST", "DVR", "IDR", "NEWTON", "NAIVE"}
-    page.locator(".verdict").first.click()
-    assert page.locator("h1").inner_text() == "Error over time"
+def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path, tab):
+    write_tables(tmp_path)
+    for number in range(2):
+        made.write(tmp_path, number)
+    standing = Standing([*SOLVED, *(replace(one, row="Other", status="nan", reason="lost") for one in SOLVED)])
+    write_attempts(standing.attempts, tmp_path)
+    assert main([f"results_dir={tmp_path}"]) == 0
+    page = tab(tmp_path).open()
+    assert page.locator("h1").inner_text() == "Which renderer gets how much done, and at what cost?"
+    assert "Dist reaches 100 % of problems and targets" in page.locator(".answer").inner_text()
+    page.locator(".scatterlayer .trace").first.wait_for()
+    assert page.locator(".panel").count() == 1
+    page.get_by_role("group", name="Set of problems").get_by_role("button", name="complete").click()
+    page.get_by_role("group", name="complete", exact=True).wait_for()
+    assert "accuracy" not in page.locator("main").inner_text()  # what the other tables answer
+    assert set(names_of(page)) == {"DIST", "DVR"}
+    page.get_by_role("link", name="Tables").click()
+    page.get_by_role("link", name="What does accuracy cost?").wait_for()
+    assert page.locator(".answers strong").all_inner_texts()[:2] == ["0.5", "0.1"]
+    page.get_by_role("link", name="What does accuracy cost?").click()
+    assert page.locator("h1").inner_text() == "What does accuracy cost?"
+    page.get_by_role("link", name="Suite").click()
+    page.get_by_role("link", name="Other", exact=True).click()
+    page.get_by_text("It fails at 2 of 2 problems.").wait_for()
+    text = page.locator("main").inner_text()
+    assert "complete: car test 0, 20 points, seed 0: lost." in text and "python -m bench.suite" in text
+    assert page.locator("table.list tbody tr").count() == 2 and "2 nan" in text
+    page.get_by_role("link", name="Suite").first.click()
+    page.get_by_role("link", name="Dist", exact=True).click()
+    page.get_by_text("It reaches every target.").wait_for()
+
+
+def test_a_renderer_of_a_run_has_the_picture_of_its_first_failure(tmp_path, tab):
+    folder = write_completion(tmp_path, [0.8, 0.4, 0.05], status="diverged", reason="the loss rose")
+    Image.new("RGB", (40, 30)).save(folder / "failure.png")
+    write_attempts(SOLVED, tmp_path)
+    assert main([f"results_dir={tmp_path}"]) == 0
+    page = tab(tmp_path).open("#/renderer/Mine")
+    page.get_by_text("It fails at 1 of 1 problem.").wait_for()
+    assert page.locator("main img").get_attribute("src").endswith("/failure.png")
+    assert "car test 0, 20 points, seed 0: the loss rose." in page.locator("main").inner_text()
+
+
+def test_a_sweep_stands_on_the_first_screen_with_its_verdict_and_its_chart(tmp_path, tab):
+    cells = [cell(renderer, dataset=dataset) for renderer in ("dist", "dvr") for dataset in ("sofa", "plane")]
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 * (1 + number))
+    assert main([f"results_dir={tmp_path}"]) == 0
+    page = tab(tmp_path).open()
+    assert "Median Chamfer (x1000): 1.50 (DIST) to 3.50 (DVR)" in page.locator(".answers").inner_text()
+    page.get_by_role("link", name="Which has the lowest Chamfer?").click()
+    page.locator(".scatterlayer .point").first.wait_for()
+    assert page.locator(".panel").count() == 2 and page.locator(".legend").count() == 0
+    assert page.locator(".ytick").all_text_contents()[:2] == ["DIST", "DVR"]
+    assert page.locator("table.list td strong").first.inner_text() == "1.00"
 
 
 def test_a_table_that_is_shipped_is_marked(tmp_path, tab, monkeypatch):
@@ -88,9 +143,9 @@ def test_a_table_that_is_shipped_is_marked(tmp_path, tab, monkeypatch):
     monkeypatch.setattr(paper, "SHIPPED", shipped)
     made.write(tmp_path, 0)
     write_index(tmp_path)
-    page = tab(tmp_path).open()
-    assert page.locator(".verdict .from").inner_text() == "Ours · shipped"
-    page.locator(".verdict").click()
+    page = tab(tmp_path).open("#/tables")
+    assert page.locator(".answers small").inner_text() == "Ours · shipped"
+    page.get_by_role("link", name="Whose?").click()
     assert "not of the runs on this page" in page.locator("main").inner_text()
 
 
@@ -99,8 +154,35 @@ def test_methods_count_failures_as_worst_and_are_ranked_on_the_same_scenes_alone
     row = rows_of(page).first
     assert "1 of 3" in row.inner_text()  # completion-0000, -0005, and broken
     page = tab(results).open("#/runs")
-    assert "only methods with all" in page.locator(".count").inner_text()
-    assert set(page.locator("#board-list .rank").all_inner_texts()[1:]) == {"–"}
+    assert "5 methods without a scene in common: no ranks" in page.locator("#board-list").inner_text()
+    assert set(page.locator("#board-list td.rank").all_inner_texts()) == {"–"}
+
+
+def test_methods_are_ranked_within_a_scale_on_the_scenes_that_all_have(tmp_path, tab):
+    """Two methods at two scales, the better one on one scene more; a third one elsewhere, and a run that was killed."""
+    planned = [("dist", 0), ("dist", 1), ("dvr", 0), ("idr", 2)]
+    for scale in ("smoke", "desk"):
+        for number, (renderer, index) in enumerate(planned):
+            config = {"renderer": {"_label_": renderer.upper()}, "index": index, "scale": {"name": scale}}
+            changed = {"renderer": renderer, "config": config, "dataset": "sofa", "seed": 0}
+            metrics = {"chamfer_l2": 0.9 if (renderer, index) == ("dist", 1) else 0.001 * (1 + number)}
+            made.write(tmp_path, number, folder=f"{scale}-{renderer}-{index}", metrics=metrics, **changed)
+    made.write(tmp_path, 0, folder="late", status="killed", renderer="dvr", dataset="sofa", seed=0, metrics={},
+               config={"renderer": {"_label_": "DVR"}, "index": 0, "scale": {"name": "desk"}})  # fmt: skip
+    write_index(tmp_path)
+    page = tab(tmp_path).open("#/runs")
+    assert page.locator(".count").inner_text() == "9 runs, none failed, 1 not run, killed or refused."
+    titles = page.locator("#board-list h3").all_inner_texts()
+    assert sorted(titles) == sorted(
+        f"scale={scale}: {words}"
+        for scale in ("smoke", "desk")
+        for words in ("2 methods on the 1 scene (shape, view, seed, what is given) that all have", "1 method alone")
+    )
+    assert page.locator("#board-list td.rank").all_inner_texts() == ["1", "2", "–"] * 2
+    assert names_of(page)[:2] == ["DIST", "DVR"]
+    assert "0 of 1" in rows_of(page).nth(1).inner_text() and "1.00" in rows_of(page).first.inner_text()
+    page.get_by_label("Scale", exact=True).select_option("smoke")
+    assert page.locator("#board-list h3").count() == 2
 
 
 def test_filters_sorting_and_search_stand_in_the_address_and_come_back(results, tab):
@@ -142,7 +224,7 @@ def test_metrics_without_a_better_direction_rank_nothing(tmp_path, tab):
     write_index(tmp_path)
     page = tab(tmp_path).open()
     assert rows_of(page).count() == 4 and names_of(page) == sorted(names_of(page))
-    assert set(page.locator("#board-list .rank").all_inner_texts()[1:]) == {"–"}
+    assert set(page.locator("#board-list td.rank").all_inner_texts()) == {"–"}
     page.get_by_label("Renderer", exact=True).select_option("dvr")
     assert names_of(page) == ["DVR"]
 
@@ -316,7 +398,8 @@ def test_the_colours_are_chosen_and_kept(results, tab):
 
 def test_every_link_leads_somewhere_and_a_phone_scrolls_down_alone(results, tab):
     one, phone = tab(results), tab(results, width=420, height=800)
-    for address in ("", "#/runs?view=runs", "#/run/completion-0001", "#/table/speed_front", "#/table/stability"):
+    tables = ("#/tables", "#/table/speed_front", "#/table/stability")
+    for address in ("", "#/runs", "#/runs?view=runs", "#/run/completion-0001", *tables):
         page, small = one.open(address), phone.open(address)
         page.wait_for_timeout(800)
         links = page.locator("a[href]").evaluate_all("all => all.map((each) => each.getAttribute('href'))")

@@ -4,27 +4,35 @@ import base64
 import json
 import shlex
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from bench.merge import merge
 from bench.records.names import differences
 from bench.records.read import RESULTS, Plan, PlannedCell, not_run, read_records
 from bench.records.record import NOT_RUN, RunStatus, file_lock
+from bench.report.__main__ import main
 from bench.report.data.records import definition
 from bench.report.site.columns import columns, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplified
+from bench.report.site.renderers import _node, _source
 from bench.report.site.words import STATUSES, TASKS, asked, command
+from bench.report.suite.attempts import write_attempts
 from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
+from bench.tables import choice
+from bench.tables import names as choices
 from tests.browser import made
 from tests.looped import each
 from tests.report.page_data import Page
 from tests.report.test_report import record, write_run
+from tests.report.test_suite import attempt
 
 ROOT = Path(__file__).parents[2]
 BODY = 177  # where the numbers of the mesh begin
@@ -309,6 +317,48 @@ def test_who_waits_for_another_page_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(html, "print", tell, raising=False)
     write_index(tmp_path)
     assert said == [f"waiting for another process that writes the page of {tmp_path}"]
+
+
+def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
+    solved = attempt("Dist", "car test 0", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist")
+    mine = replace(solved, row="Mine", preset="custom", status="nan", reason="lost", overrides=[
+        *solved.overrides, "renderer=custom", "+renderer.steps=7", "label=My own"])  # fmt: skip
+    for name, one in (("a", solved), ("b", mine)):
+        write_attempts([one], tmp_path / name)
+    merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
+    assert main([f"results_dir={tmp_path / 'both'}"]) == 0
+    page = Page(tmp_path / "both")
+    shown = page.paper("suite")
+    assert [row[1] for row in shown["rows"]] == ["Dist", "Mine"] and shown["chart"]["panels"]
+    assert "n = 1 problem" in shown["caption"] and "The run ended" not in shown["caption"]
+    found = page.read("list", "renderers")
+    assert found["problems"] == [["complete", "car test 0, 20 points", 0]] and found["targets"] == 5
+    dist, own = found["rows"]
+    assert (dist["reached"], dist["failed"], dist["runs"]) == ([5], [], [None])
+    assert (own["reached"], own["failed"]) == ([0], [[0, "nan", "lost"]])
+    assert own["command"] == "python -m bench.suite renderer=custom +renderer.steps=7 'label=My own'"
+    assert ["steps", "7"] in own["settings"] and ["alpha", "1.5"] in dist["settings"]
+    assert dist["file"] == "renderers/dist.py" and "Deviates from the paper:" in dist["source"]
+
+
+def test_a_variant_has_the_settings_of_what_it_builds_on():
+    built, own = (dict(found) for found in (_node("neus"), _node("neus_budget")))
+    assert own["samples"] == 24 and {*built} <= {*own} and _node("no_such") == {}
+    assert _source("mypkg.Mine") == ("mypkg.Mine", "")
+    for name in suite_rows():
+        file, said = _source(_node(name)["_target_"])
+        assert (ROOT / file).is_file() and "Source:" in said, name
+
+
+def suite_rows() -> list[str]:
+    return [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
+
+
+def test_an_odd_run_of_the_suite_costs_no_page(tmp_path):
+    odd = record("odd", config={"experiment": "core_complete", "dataset": 3}, environment={"cpu": [1]}, seed=0)
+    write_run(tmp_path, odd | {"metrics_start": {"chamfer_l1": 1}, "method": ["x"]}, "odd")
+    write_index(tmp_path)
+    assert Page(tmp_path).folders == ["odd"] or Page(tmp_path).about["problems"]
 
 
 def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):

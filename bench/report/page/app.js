@@ -6,7 +6,9 @@
   const {plural} = bench.format;
   const VIEWS = new Map([
     ["", (home, {query}) => bench.overview(home, query)],
-    ["runs", (home, {query}) => bench.overview(home, query, {alone: true})],
+    ["tables", (home) => bench.tables(home)],
+    ["renderer", (home, {path}) => bench.renderer(home, path[1] || "")],
+    ["runs", (home, {query}) => bench.leaderboards(home, query)],
     ["run", (home, {path}) => bench.run(home, path[1] || "")],
     ["compare", (home, {path}) => bench.compare(home, path.slice(1))],
     ["table", (home, {path}) => bench.paper(home, path[1] || "")],

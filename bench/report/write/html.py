@@ -18,6 +18,7 @@ from bench.report.data.records import grouped
 from bench.report.site.columns import columns
 from bench.report.site.detail import bundle, detail
 from bench.report.site.files import Folder
+from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
@@ -28,7 +29,7 @@ STYLES = ("style.css",)
 SCRIPTS = (  # in the order in which they need each other
     *("base/dom.js", "base/format.js", "base/store.js", "base/address.js", "base/runs.js"),
     *("parts/theme.js", "parts/choose.js", "parts/table.js", "parts/chart.js", "parts/curve.js", "parts/mesh.js"),
-    *("views/papers.js", "views/board.js", "views/atlas.js", "views/run.js", "views/compare.js"),
+    *("views/papers.js", "views/renderer.js", "views/board.js", "views/atlas.js", "views/run.js", "views/compare.js"),
 )
 START = "app.js"  # after the data
 LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
@@ -97,6 +98,7 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
         "about": {"problems": problems, "meshes": meshes},
         "papers": entries,
         "runs": columns(records, folders),
+        "renderers": renderers(records, results_dir),
     }
     for name, content in lists.items():
         write_script(data, "list", name, content)

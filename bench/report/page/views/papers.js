@@ -1,49 +1,71 @@
-/* The first screen: each question with its verdict, then the leaderboards; and the page of a table or figure. */
+/* The first screen: the suite's verdict, chart and table, sweeps and leaderboards; all tables; and the page of a table. */
 (function (bench) {
   "use strict";
 
-  const {element, fill, details, list, later, emphasised} = bench.dom;
+  const {element, fill, section, details, list, later, choice, emphasised} = bench.dom;
+  const SUITE = "suite";
   const link = ({name}) => bench.address.to(["table", name]);
   const all = () => bench.store.have("list", "papers") || [];
+  const find = (name) => all().find((each) => each.name === name);
 
-  /* Alone, the leaderboards are all that is shown. */
-  function overview(home, query, {alone} = {}) {
-    const papers = alone ? [] : all();
-    const [answered, others] = [papers.filter(({verdict}) => verdict), papers.filter(({verdict}) => !verdict)];
+  function overview(home, query) {
+    const [suite, sweeps] = [find(SUITE), all().filter(({sweep}) => sweep)];
     const boards = element("section", {"aria-labelledby": "board"});
-    const group = (id, title, content) =>
-      element("section", {"aria-labelledby": id}, element("h2", {id}, title), content);
-    const more = answered.length ? "More tables and figures" : "Tables and figures";
-    const listed = others.map((paper) => element("li", null, element("a", {href: link(paper)}, paper.title)));
     fill(home,
-      element("h1.unseen", null, alone ? "Leaderboards" : "All results"),
-      answered.length > 0 && group("answers", "What the tables answer", element("div.verdicts", null, answered.map(card))),
-      others.length > 0 && group("others", more, element("ul.links", null, listed)),
+      suite
+        ? [heading(suite), later(bench.store.load("paper", suite.key), answer)]
+        : element("h1.unseen", null, "All results"),
+      sweeps.length > 0 && section("Sweeps", answers(sweeps)),
       boards);
-    if (bench.runs.count) bench.board(boards, query);
-    else {
-      const example = element("code", null, "python -m bench task=completion renderer=dist");
-      fill(boards, element("h2", {id: "board"}, "Runs"), element("p", null, "No run was read. Make one: ", example));
-    }
+    bench.board(boards, query);
   }
 
-  const card = (paper) =>
-    element("a.verdict", {href: link(paper)},
-      element("span.question", null, paper.question),
-      element("span.answer", null, emphasised(paper.verdict)),
-      element("span.from", null, paper.title, paper.shipped ? " · shipped" : ""));
+  /* The chart of the suite, of the set that is chosen, and its table, whose rows lead to the renderers. */
+  function answer(data) {
+    const {panels = []} = data.chart || {};
+    const drawn = element("div");
+    const show = (place) => fill(drawn, bench.chart({panels: [{...panels[place], title: ""}]}, {label: panels[place].title}));
+    if (panels.length) show(0);
+    const titles = Object.fromEntries(panels.map(({title}, place) => [place, title]));
+    return [
+      panels.length > 1 && choice("Set of problems", titles, "0", show),
+      drawn,
+      bench.written(data.header, data.rows, {named: "Renderer", link: (row) => bench.address.to(["renderer", row])}),
+      element("p.caption", null, data.caption, " ", element("a", {href: link({name: SUITE})}, "All charts, notes and files")),
+    ];
+  }
+
+  /* Questions with their verdicts, a line each. */
+  function answers(papers) {
+    const name = (paper) => [
+      element("a", {href: link(paper)}, paper.question || paper.title),
+      element("small", null, [paper.question && paper.title, paper.shipped && "shipped"].filter(Boolean).join(" · ")),
+    ];
+    const columns = [
+      {label: "Question", head: true, cell: name},
+      {label: "Answer", cell: ({verdict}) => (verdict ? emphasised(verdict) : "A table or figures.")},
+    ];
+    return element("div.answers", null, bench.table(columns, papers, {caption: "Answers"}));
+  }
+
+  function tables(home) {
+    fill(home, element("h1", null, "Tables"), all().length ? answers(all()) : element("p", null, "There is no table yet."));
+  }
+
+  function heading(known) {
+    const shipped = known.shipped && "Shipped with the program: not of the runs on this page.";
+    return [
+      element("h1", null, known.question || known.title),
+      element("p.soft", null, [known.question && `${known.title}.`, shipped].filter(Boolean).join(" ")),
+      known.verdict && element("p.answer", null, emphasised(known.verdict)),
+    ];
+  }
 
   function paper(home, name) {
-    const known = all().find((each) => each.name === name);
-    const back = element("p.crumbs", null, element("a", {href: "#/"}, "All results"));
+    const known = find(name);
+    const back = element("p.crumbs", null, element("a", {href: "#/tables"}, "All tables"));
     if (!known) return fill(home, back, element("h1", null, "There is no such table"));
-    return fill(home,
-      back,
-      element("h1", null, known.title || known.name),
-      known.question && element("p.question", null, known.question),
-      known.verdict && element("p.answer.large", null, emphasised(known.verdict)),
-      known.shipped && element("p.note", null, "Shipped with the program: not of the runs on this page."),
-      later(bench.store.load("paper", known.key), (data) => parts(known, data)));
+    return fill(home, back, heading(known), later(bench.store.load("paper", known.key), (data) => parts(known, data)));
   }
 
   /* What answers the mouse, the picture, the table, caption and files; what shows the same twice is folded. */
@@ -51,7 +73,7 @@
     const image = () => element("img.figure", {src: data.picture, alt: data.caption || known.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
-    const table = data.rows.length > 0 && bench.written(data.header, data.rows);
+    const table = data.rows.length > 0 && bench.written(data.header, data.rows, {best: data.best});
     return [
       data.atlas && bench.atlas(data.atlas),
       data.chart && bench.chart(data.chart, {label: known.title}),
@@ -63,5 +85,5 @@
     ];
   }
 
-  Object.assign(bench, {overview, paper});
+  Object.assign(bench, {overview, tables, paper});
 })((window.implicitBench = window.implicitBench || {}));

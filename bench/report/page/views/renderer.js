@@ -1,0 +1,76 @@
+/* A renderer's own page: its standing in each set, where it fails and what it does not reach, its settings and source. */
+(function (bench) {
+  "use strict";
+
+  const {element, fill, section, details, facts, later, code, copied} = bench.dom;
+  const {plural, MISSING} = bench.format;
+
+  function renderer(home, row) {
+    const suite = (bench.store.have("list", "papers") || []).find(({name}) => name === "suite");
+    const loaded = Promise.all([bench.store.load("list", "renderers"), suite && bench.store.load("paper", suite.key)]);
+    fill(home,
+      element("p.crumbs", null, element("a", {href: "#/"}, "The suite")),
+      element("h1", null, row),
+      later(loaded, ([data, table]) => {
+        const own = data.rows.find((each) => each.row === row);
+        return own && table ? parts(own, data, table) : element("p", null, "The suite has no such renderer.");
+      }));
+  }
+
+  function parts(own, data, table) {
+    const cells = table.rows.find((each) => each.includes(own.row)) || [];
+    const standing = table.header.map((name, n) => [name, cells[n]]).filter(([, text]) => text && text !== own.row);
+    return [
+      element("div.two", null, facts(standing), failure(own, data)),
+      table.chart && bench.chart(table.chart, {label: `${own.row} in each set`, focus: own.row}),
+      section("What it does not reach", missed(own, data)),
+      section("Run it", copied(own.command, "Copy the command")),
+      section("Source", element("p", null, code(own.file || MISSING)), own.source && element("pre.source", null, own.source)),
+      own.settings.length > 0 && details(`Its ${plural(own.settings.length, "setting")}`, facts(own.settings)),
+    ];
+  }
+
+  const named = ([of, problem, seed]) => `${of}: ${problem}, seed ${seed}`;
+
+  /* How often it fails; the first failure, with its picture where its run is among these results. */
+  function failure({failed, reached, runs}, {problems}) {
+    const tried = reached.filter((each) => each !== null).length;
+    if (!failed.length) return element("p", null, `It fails at none of ${plural(tried, "problem")}.`);
+    const [place, status, reason] = failed[0];
+    const run = bench.runs.place(runs[place]);
+    return element("div", null,
+      element("p", null, `It fails at ${failed.length} of ${plural(tried, "problem")}. The first:`),
+      element("p", null, bench.badge(status), ` ${named(problems[place])}: ${reason}.`),
+      run !== undefined && later(bench.runs.detail(run), ({pictures}) => {
+        const found = pictures.find(([name]) => name === "failure.png") || pictures[0];
+        return found && bench.picture(found);
+      }));
+  }
+
+  /* The problems of which it misses a target, beside what the best renderer reaches: the largest gap first. */
+  function missed(own, {problems, rows, targets}) {
+    const most = problems.map((_, place) => Math.max(...rows.map(({reached}) => reached[place] ?? 0)));
+    const failed = new Map(own.failed.map(([place, said]) => [place, said]));
+    const status = (place) => bench.badge(failed.get(place) || (own.reached[place] === null ? "not_run" : "ok"));
+    const gap = (place) => most[place] - (own.reached[place] ?? 0);
+    const places = problems.map((_, place) => place).filter((place) => (own.reached[place] ?? 0) < targets);
+    places.sort((a, b) => gap(b) - gap(a));
+    const count = (key, label, get) =>
+      ({key, label, kind: "number", unit: `of ${targets} targets`, get, cell: (place) => String(get(place) ?? MISSING)});
+    const columns = [
+      {key: "problem", label: "Problem", head: true, get: (place) => named(problems[place]), cell: (place) => named(problems[place])},
+      count("reached", "Reached", (place) => own.reached[place]),
+      count("most", "By the best", (place) => most[place]),
+      {label: "Run", cell: (place) => [status(place), " ", run(own.runs[place])]},
+    ];
+    if (!places.length) return element("p", null, "It reaches every target.");
+    return bench.table(columns, places, {caption: "What it does not reach"});
+  }
+
+  function run(folder) {
+    const place = bench.runs.place(folder);
+    return place !== undefined && element("a", {href: bench.runs.link(place)}, "open");
+  }
+
+  bench.renderer = renderer;
+})((window.implicitBench = window.implicitBench || {}));

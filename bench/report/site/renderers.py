@@ -1,0 +1,93 @@
+"""What the page shows of each renderer of the suite: the targets that it reaches, its failures, settings and source."""
+
+import inspect
+import re
+import shlex
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from bench.report.data.records import OURS, Record
+from bench.report.suite.attempts import Attempt, attempts_of, read_attempts, suite
+from bench.report.suite.standing import COST, Standing
+from bench.report.write import paper
+from bench.tables import choice
+
+SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")  # overrides that say which problem
+
+
+def renderers(records: list[Record], results_dir: Path) -> dict[str, Any]:
+    """The problems of the suite, and for each of its rows what it reaches of each, shipped rows beside one's own.
+
+    Without rows where a record is odd or foreign: then the suite has no page either, and the report says why.
+    """
+    try:
+        return _found(records, results_dir)
+    except paper.BROKEN:
+        return {"targets": 0, "problems": [], "rows": []}
+
+
+def _found(records: list[Record], results_dir: Path) -> dict[str, Any]:
+    own = [(one, record["folder"]) for record in records for one in attempts_of([record], results_dir)]
+    kept = [read_attempts(folder)[0] for folder in (paper.SHIPPED, results_dir)]
+    standing = Standing.of_all([*chain(*kept), *(one for one, _ in own)])
+    order = [*suite().errors]
+    problems = sorted({one.key[:3] for one in standing.judged}, key=lambda key: (order.index(key[0]), *key[1:]))
+    folders = {(*one.key, one.started): folder for one, folder in own}
+    rows = [_row(standing, row, problems, folders) for row in standing.rows]
+    return {"targets": len(suite().targets), "problems": problems, "rows": rows}
+
+
+def _row(standing: Standing, row: str, problems: list[Any], folders: dict[Any, str]) -> dict[str, Any]:
+    """A row: how many targets of each problem it reaches, None where it has no attempt; its failures, and the rest."""
+    attempts = {one.key[:3]: one for one in standing.attempts if one.row == row}
+    found = [attempts.get(problem) for problem in problems]
+    first = next(iter(attempts.values()))
+    settings = _node(first.preset) | _asked(first)
+    file, source = _source(str(settings.get("_target_", "")))
+    return {
+        "row": row,
+        "reached": [one and sum(at[COST] < float("inf") for at in standing.reached[one.key]) for one in found],
+        "failed": [[place, one.status, one.reason] for place, one in enumerate(found) if one and not one.ok],
+        "runs": [folders.get((*one.key, one.started)) if one else None for one in found],
+        "settings": [
+            [key, str(value)] for key, value in settings.items() if not key.startswith("_") and key != "defaults"
+        ],
+        "file": file,
+        "source": source,
+        "command": shlex.join(["python", "-m", "bench.suite", *_own(first)]),
+    }
+
+
+def _own(attempt: Attempt) -> list[str]:
+    """The overrides that say which renderer it is."""
+    return [text for text in attempt.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]
+
+
+def _asked(attempt: Attempt) -> dict[str, Any]:
+    """The settings of the renderer that the command line gave."""
+    pairs = [text.lstrip("+").partition("=") for text in _own(attempt)]
+    return {key.removeprefix("renderer."): value for key, _, value in pairs if key.startswith("renderer.")}
+
+
+def _node(preset: str) -> dict[str, Any]:
+    """What the file or the row of a renderer holds, over what it builds on; nothing for another preset."""
+    try:
+        own = choice("renderer", preset)
+    except KeyError:
+        return {}
+    bases = [base for base in own.get("defaults", ()) if isinstance(base, str) and base != "_self_"]
+    return {key: value for base in bases for key, value in _node(base).items()} | own
+
+
+@cache
+def _source(target: str) -> tuple[str, str]:
+    """The file of a class of ours, with what its docstring says; of another class its name."""
+    name = target.rpartition(".")[2]
+    for path in sorted((paper.ROOT / OURS.rstrip(".")).rglob("*.py")) if target.startswith(OURS) else ():
+        if said := re.search(
+            rf'^class {name}\b[^\n]*:\n    """(.*?)"""', path.read_text("utf-8"), re.DOTALL | re.MULTILINE
+        ):
+            return path.relative_to(paper.ROOT).as_posix(), inspect.cleandoc(said[1]).partition("\n\nArgs:")[0]
+    return target, ""
