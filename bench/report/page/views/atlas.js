@@ -6,8 +6,7 @@
   const SHADES = ["#8c2d04", "#cc6a1a", "#f0b46a", "#f3ead8", "#a9cfe3", "#4a90c2", "#0b4f8a"]; // from at once to never
 
   function atlas(data) {
-    const hint = element("p.soft", null, "Choose a cell: its curve and its first failure open here.");
-    const opened = element("div.opened", {"aria-live": "polite"}, hint);
+    const opened = element("div.opened", {"aria-live": "polite"});
     const names = data.rows.map((row) => element("th.turned", {scope: "col"}, element("span", null, row)));
     const lines = data.axes.flatMap((axis, line) => {
       const first = line === 0 || data.axes[line - 1].group !== axis.group;
@@ -17,7 +16,7 @@
     });
     const swatches = SHADES.map((colour) => painted(element("span", {"aria-hidden": "true"}), colour));
     return element("div.atlas", null,
-      element("div.key", null, "breaks at the mildest severity", element("span", null, swatches), "does not break at the severest"),
+      element("div.key", null, "breaks at the mildest severity", element("span", null, swatches), "does not break at the severest. Choose a cell: its curve and its first failure open."),
       element("div.wide", {tabindex: 0, role: "region", "aria-label": "Breakdowns by axis and renderer"},
         element("table.heat", null,
           element("thead", null, element("tr", null, element("th.words", {scope: "col"}, "Axis"), names)),
@@ -43,6 +42,7 @@
       for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
       currentTarget.setAttribute("aria-pressed", "true");
       open(data.axes[line], data.rows[place], found, opened);
+      currentTarget.scrollIntoView({block: "nearest", inline: "nearest"}); // of a table that has become narrower
     };
     const label = `${data.axes[line].title}, ${data.rows[place]}: ${words(found)}`;
     const button = element("button.cell", {type: "button", "aria-label": label, click}, found.short);

@@ -24,6 +24,9 @@
 
   const mark = (n) => element(`b.${"ab"[n]}`, null, SIDES[n]);
 
+  /* Both sides, each with its letter: on a phone they stand below each other. */
+  const paired = (made) => element("div.two", null, made.map((each, n) => element("div", null, element("p", null, mark(n)), each)));
+
   function heading(place, n) {
     const {runs} = bench;
     const about = runs.reason(place) || `seed ${runs.number(place, "seed") ?? MISSING}`;
@@ -41,15 +44,15 @@
       section("Costs", costs(places, details)),
       section("Curves", bench.curves(named)),
       details.every(({files}) => files["mesh.ply"]) &&
-        section("Meshes", element("div.two", null, places.map((place) => bench.mesh(place, turning)))),
+        section("Meshes", paired(places.map((place) => bench.mesh(place, turning)))),
       section("Pictures", pictures(details)),
     ];
   }
 
   /* A table with a column per side, and others. */
   function table(caption, rows, name, cell, kind, ...others) {
-    const sides = SIDES.map((side, n) => ({label: side, kind, cell: (row) => cell(row, n)}));
-    return bench.table([{label: caption, head: true, cell: name}, ...sides, ...others], rows, {caption});
+    const values = SIDES.map((side, n) => ({label: side, kind, cell: (row) => cell(row, n)}));
+    return bench.table([{label: caption, head: true, cell: name}, ...values, ...others], rows, {caption});
   }
 
   const ratio = (get) => ({label: "B over A", kind: "number", cell: (row) => {
@@ -105,7 +108,7 @@
   function pictures(details) {
     const names = [...new Set(details.flatMap((detail) => detail.pictures.map(([name]) => name)))];
     if (!names.length) return element("p.soft", null, "Neither has pictures.");
-    return names.map((name) => element("div.two", null, details.map((detail) => {
+    return names.map((name) => paired(details.map((detail) => {
       const found = detail.pictures.find(([own]) => own === name);
       return found ? bench.picture(found) : element("p.soft", null, `No ${name}.`);
     })));
