@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from bench.records.record import WAITED, Record
+from bench.records.record import BESIDE, WAITED, Record
 from renderers.fields.mlp import multiplies_faster
 from renderers.kernels.library import kernels
 
@@ -53,6 +53,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
+        "runs_at_once": int(os.environ.get(BESIDE, "1")),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
         "kernels": kernels().said_of(device.type, torch.get_num_threads()),
@@ -239,6 +240,8 @@ def doubts(record: Record) -> list[str]:
         lines.append(f"loaded machine: threads waited {share:.0%} of their time for a processor; times are too long")
     elif share is None and load is not None and load > (os.cpu_count() or 1):
         lines.append(f"loaded machine: load {load:.1f} at the start; times may be too long")
+    if (beside := record.environment.get("runs_at_once", 1)) > 1 and record.environment.get("device") != "cpu":
+        lines.append(f"shared device: {beside} runs at a time on it; times are too long")
     if record.gemm_fraction is not None and record.gemm_fraction > IMPOSSIBLE:
         lines.append(
             f"missing synchronisation: {record.gemm_fraction:.1f} times the machine's matrix product rate is more "

@@ -25,6 +25,7 @@ NEUTRAL_KEYS = frozenset(
         *("tracker", "plan"),
     )
 )
+BESIDE = "IMPLICIT_BENCH_BESIDE"  # variable of the environment: how many runs a job of a cluster has at a time
 WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
 NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.

@@ -22,6 +22,7 @@ HAS_COUNTS = environment.scheduled() is not None
 def record(**changed) -> Record:
     made = Record("id", "task", "renderer", "dataset", 0, {})
     made.environment = {"waited_share": changed.pop("share", 0.0), "load_at_start": changed.pop("load", 0.0)}
+    made.environment |= {"device": changed.pop("device", "cpu"), "runs_at_once": changed.pop("beside", 1)}
     for name, value in changed.items():
         setattr(made, name, value)
     return made
@@ -35,6 +36,9 @@ def record(**changed) -> Record:
         ({"share": 0.3}, ["loaded machine: threads waited 30% of their time"]),
         ({"share": None, "load": 99.0}, ["loaded machine: load 99.0 at the start"]),
         ({"share": None, "load": 0.1}, []),
+        ({"beside": 4}, []),  # each has processors of its own
+        ({"device": "a GPU"}, []),
+        ({"beside": 4, "device": "a GPU"}, ["shared device: 4 runs at a time on it"]),
         ({"gemm_fraction": 3.0}, ["missing synchronisation: 3.0 times the machine's matrix product rate"]),
         ({"share": 0.5, "gemm_fraction": 3.0}, ["loaded machine", "missing synchronisation"]),
     ],

@@ -141,8 +141,8 @@ def _compared(runs: Runs) -> str:
 
 
 def _loaded(runs: Runs) -> str:
-    """A warning where other work on the machine, or a missing synchronisation, makes times doubtful."""
-    doubtful = ("loaded machine", "missing synchronisation")
+    """A warning where other work on the machine or device, or a missing synchronisation, makes times doubtful."""
+    doubtful = ("loaded machine", "shared device", "missing synchronisation")
     names = [r["name"] for r in runs.named() if any(note.startswith(doubtful) for note in r["notes"])]
     few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
