@@ -28,7 +28,7 @@ PASSIVE = (
         "bench/progress.py",
     ),
     *(f"bench/{name}.py" for name in ("merge", "suite", "tune", "train", "photos", "turntable")),
-    *(f"bench/run/{name}.py" for name in ("compose", "library", "plan", "summary", "sweep")),
+    *(f"bench/run/{name}.py" for name in ("compose", "library", "pack", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )

@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, register, type_of, wrong_type
 from bench.records.folder import Identity, identify
+from bench.run.pack import register_slurm
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
@@ -80,6 +81,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     try:
         sys.argv[1:] = options_first(sys.argv[1:])
         register(*own_folders(sys.argv[1:]))
+        register_slurm()
         with mode_of_options(sys.argv[1:]):
             _call(program)
         if raised:

@@ -20,6 +20,7 @@ from bench.records.metrics import SHOWN, Metric
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import row_name
 from bench.run.compose import identity_of, make_plan, swept_over
+from bench.run.pack import check_jobs, in_words, packed, packs
 from bench.run.plan import Shown, check_plan, show_plan
 from bench.run.process import warm_up
 
@@ -42,6 +43,7 @@ class Sweep:
     """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs."""
 
     plan: Plan | None = None
+    reused = frozenset[str]()  # ids of its cells whose finished run was there already
     runs = True  # whether its cells are runs: those of `bench.train` and `bench.prior` are not
     shown = ExitStack()
 
@@ -49,7 +51,7 @@ class Sweep:
     def start(cls, plan: Plan, reused: set[str]) -> None:
         """Writes and keeps the plan, and shows the sweep's progress from now on."""
         plan.write()
-        cls.plan = plan
+        cls.plan, cls.reused = plan, frozenset(reused)
         cls.shown.enter_context(followed(plan, reused))
 
     @classmethod
@@ -71,17 +73,22 @@ class Planner(Callback):
             return
         try:
             swept, workers = swept_over(config), workers_of(config)
-            launcher = config.hydra.runtime.choices["hydra/launcher"]
+            launcher, settings = config.hydra.runtime.choices["hydra/launcher"], config.hydra.launcher
             if not config.plan:
-                runs = f"{plural(len(swept), 'run')}, {workers} at a time (hydra/launcher={launcher})"
+                how = "many to a job" if packs(settings) else f"{workers} at a time"
+                runs = f"{plural(len(swept), 'run')}, {how} (hydra/launcher={launcher})"
                 notice(f"sweep: {runs}; a line follows as each ends")
             if config.isolation == Isolation.process:
                 warm_up()
             plan = make_plan(config, swept)
             reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
+            check_jobs([cell for cell in plan.cells if cell.id not in reused], settings)
             check_plan(plan, launcher, reused)
             if config.plan:
-                show_plan(plan, reused, workers)
+                jobs = packed(plan, settings, reused) if packs(settings) else []
+                show_plan(plan, reused, min(workers, len(jobs) * settings.tasks_per_node) if jobs else workers)
+                if jobs:
+                    print(in_words(jobs, settings))
                 raise Shown
             Sweep.start(plan, reused)
         except Exception as error:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import psutil
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -19,6 +20,7 @@ from bench.config import CONF, register
 from bench.records.folder import identify
 from bench.records.read import read_records
 from bench.report.write.html import write_index
+from bench.run.pack import grouped
 from tests.report.page_data import Page
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, errors, wait_for
 from tests.run.test_process import CASES
@@ -28,6 +30,7 @@ LAUNCHERS = {
     "joblib": ("hydra_plugins.hydra_joblib_launcher", ("hydra.launcher.n_jobs=2",)),
     "workers": ("hydra_plugins.hydra_joblib_launcher", ()),
     "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ("hydra.launcher.timeout_min=5",)),
+    "slurm": ("hydra_plugins.hydra_submitit_launcher", ("hydra.launcher.cluster=local",)),
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", ()),
 }
 # The cells of a sweep; `terminate` stands for a cell whose run folder cannot be made.
@@ -132,7 +135,13 @@ def test_its_runs_have_the_threads_that_the_launcher_pins(swept):
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
     need(launcher)
-    cells = (f"hydra/launcher={launcher}", f"+renderer.how={','.join(CASES)}", *LIMITED, "memory_limit=1.5")
+    cells = (
+        f"hydra/launcher={launcher}",
+        *LAUNCHERS[launcher][1],
+        f"+renderer.how={','.join(CASES)}",
+        *LIMITED,
+        "memory_limit=1.5",
+    )
     by_program("-m", *FAILING, *cells, f"results_dir={tmp_path}")
     records, problems = read_records(tmp_path)
     assert problems == []
@@ -201,3 +210,68 @@ def test_a_sweep_of_nothing_is_an_error(isolated):
     assert code == 2
     assert "error: the sweep has no cell" in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "seconds, places",
+    [
+        ([], []),
+        ([60.0, 60.0, 60.0], [[0], [1], [2]]),
+        ([30.0, 30.0, 30.0], [[0, 1], [2]]),
+        ([90.0, 10.0, 10.0, 41.0], [[0], [1, 2], [3]]),  # the first takes longer than a job is to take
+    ],
+)
+def test_a_job_has_as_many_runs_as_its_minutes_hold(seconds, places):
+    assert grouped(seconds, 60.0) == places
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (
+            ("time_limit=601", "hydra.launcher.timeout_min=10", "hydra.launcher.minutes_per_job=5"),
+            "hydra.launcher.timeout_min=10 ends a job before time_limit=601 seconds end its run: "
+            "set hydra.launcher.timeout_min=11 or more, or time_limit=600 or less",
+        ),
+        (("hydra.launcher.timeout_min=40",), "minutes_per_job=60 is more than hydra.launcher.timeout_min=40, "),
+        (("hydra.launcher.array_size=0",), "hydra.launcher.array_size must be positive, not 0: leave it out"),
+        (("hydra.launcher.cluster=locl",), "hydra.launcher.cluster must be slurm or local, not 'locl'"),
+    ],
+)
+def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, wrong, words):
+    need("slurm")
+    for more in ((), ("plan=true",)):
+        done = command("-m", *FAILING, "hydra/launcher=slurm", *wrong, *more, f"results_dir={tmp_path / 'r'}")
+        assert done.code == 2 and words in errors(done.err)[0] and len(errors(done.err)) == 1
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number, words", [(signal.SIGKILL, " was lost; "), (signal.SIGUSR1, ": stopped by SIGUSR1; ")])
+def test_a_job_that_a_signal_ends_loses_no_run(tmp_path, number, words):
+    need("slurm")
+    jobs = ("cluster=local", "minutes_per_job=3", "minutes_per_run=1", "tasks_per_node=2", "array_size=1")
+    cells = ("+renderer.how=not,raise", "+renderer.pause=0.3", "seed=range(0,6)", f"results_dir={tmp_path}")
+    arguments = ("-m", *FAILING, "hydra/launcher=slurm", *(f"hydra.launcher.{key}" for key in jobs), *cells)
+
+    def by_end() -> tuple[dict[str, dict], set[str]]:
+        """The records of runs that ended by themselves, by their ids, and the statuses of the others."""
+        records = read_records(tmp_path)[0]
+        ended = {record["id"]: record for record in records if record["status"] not in ("killed", "not_run")}
+        return ended, {record["status"] for record in records if record["id"] not in ended}
+
+    with driver(tmp_path / "output", *arguments) as running:
+        wait_for(lambda: by_end()[0], running)
+        first, *others = tmp_path.glob("sweeps/.hydra/.submitit/[0-9]*")  # named by the processes that hold jobs
+        assert others == []
+        psutil.Process(int(first.name)).children()[0].send_signal(number)
+        code, _, err = running.ended()
+    before, left = by_end()
+    assert code == 1 and f"error: job {first.name}{words}" in err, err
+    assert "12 runs in 2 jobs, 2 at a time in each, by hydra.launcher.minutes_per_job=3" in err
+    assert left == {"killed", "not_run"} and 6 < len(before) < 12
+    again = by_program(*arguments)
+    assert again.code == 1 and "error: job" not in again.err
+    after, left = by_end()
+    assert len(after) == 12 and all(after[name]["started"] == record["started"] for name, record in before.items())
+    assert {record["environment"].get("runs_at_once") for record in after.values()} == {2}

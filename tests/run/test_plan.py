@@ -83,6 +83,18 @@ def test_what_is_there_is_reused_and_tells_of_like_runs(results):
     assert "; about 30.0 s, 2 at a time, without" in again.splitlines()[-1]
 
 
+def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    cells, jobs = planned(results), ("hydra/launcher=slurm", "plan=true", f"results_dir={results}")
+    for cell in cells[:2]:
+        write(results, cell, 1000.0)  # so much do others of that renderer take, but for the limit
+    told = ("rerun=all", "time_limit=900", "hydra.launcher.minutes_per_job=30", "hydra.launcher.minutes_per_run=20")
+    assert command(*SWEEP, *jobs, *told).out.splitlines()[-1].startswith("4 runs in 2 jobs, by ")
+    done = command(*SWEEP, *jobs, "hydra.launcher.tasks_per_node=4").out.splitlines()
+    assert done[-1] == "2 runs in 1 job, 4 at a time in each, by hydra.launcher.minutes_per_job=60"
+    assert done[-2].startswith("4 planned: 2 to run, 2 reused")
+
+
 @pytest.mark.parametrize("arguments", [
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
