@@ -87,8 +87,9 @@ class Plan:
         """Writes `plan.json`."""
         check_links(self.results_dir)
         self.folder.mkdir(parents=True, exist_ok=True)
-        plain = {"schema": SCHEMA, "name": self.name, "asked": self.asked, "cells": [asdict(c) for c in self.cells]}
-        write_text(self.folder / PLAN, to_json(plain))
+        head = to_json({"schema": SCHEMA, "name": self.name, "asked": self.asked, "cells": []}).rstrip(" \n]}")
+        cells = ",\n".join(to_json(vars(cell)).rstrip() for cell in self.cells)  # cell by cell, which takes less memory
+        write_text(self.folder / PLAN, f"{head}\n{cells}\n]}}\n")
 
     def record(self, cell: PlannedCell) -> dict[str, Any] | None:
         """The record of a cell, if it was requested since the plan was made and has ended."""
