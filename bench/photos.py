@@ -5,32 +5,22 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench.evaluate.evaluate import mask_iou
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from datasets.captures.hull import hull_mesh, hull_views
-from datasets.own_photographs import AXES, Capture, read_capture
+from datasets.captures.hull import Fit
+from datasets.own_photographs import AXES, DOUBTFUL, GOOD, Capture, Reading, read_capture
 from renderers.camera import sphere_span
 
 MOST = 8  # photographs in the picture
-SAMPLES = 96  # of the hull, per axis
-GOOD, DOUBTFUL = 0.9, 0.8  # overlap of hull and masks: above the first cameras are right, below the second hardly
 OUTLINE = "#e5007d"
 NAMED = 5  # photographs that fit worst
 
 
-def hull_fit(capture: Capture) -> tuple[list[Bool[np.ndarray, "height width"]], list[float]]:
-    """The silhouettes of the visual hull, and their intersection over union with the mask of each photograph."""
-    silhouettes = [seen.numpy() for seen in hull_views(capture.shots, hull_mesh(capture.shots, SAMPLES))]
-    pairs = zip(silhouettes, capture.shots, strict=True)
-    return silhouettes, [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in pairs]
-
-
-def told(overlaps: list[float], capture: Capture) -> list[str]:
+def told(fit: Fit, capture: Capture) -> list[str]:
     """The fit of the visual hull in words."""
+    overlaps = fit.overlaps
     middle, order = float(np.median(overlaps)), np.argsort(overlaps)
     found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD:.0%} and more is good)"]
     worst = [place for place in order[:NAMED] if overlaps[place] < DOUBTFUL]
@@ -43,8 +33,9 @@ def told(overlaps: list[float], capture: Capture) -> list[str]:
 
 
 @rc_context(SCREEN)
-def draw(capture: Capture, silhouettes: list[Bool[np.ndarray, "height width"]], overlaps: list[float]) -> Figure:
+def draw(capture: Capture) -> Figure:
     """Photographs, evenly spaced and the one that fits worst, with the unit sphere; the hull over the masks below."""
+    silhouettes, overlaps = (capture.fit.silhouettes, capture.fit.overlaps) if capture.fit else ((), ())
     chosen = np.linspace(0, len(capture.shots) - 1, min(MOST, len(capture.shots))).round().astype(int)
     if overlaps and (worst := int(np.argmin(overlaps))) not in chosen:
         chosen[np.abs(chosen - worst).argmin()] = worst
@@ -74,23 +65,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="with photographs and their cameras, see datasets/README.md")
     parser.add_argument("--longest", type=int, default=128, help="pixels of the longer side (default: %(default)s)")
     parser.add_argument("--axes", choices=tuple(AXES), default="stated", help="flipped: y and z turned round")
+    parser.add_argument("--images", help="the folder of COLMAP's images, where it is not the usual one")
     parser.add_argument("--without-masks", action="store_true", help="as if there were none")
     parser.add_argument("--into", type=Path, default=Path("photos.png"), help="the picture (default: %(default)s)")
     given = parser.parse_args(arguments)
     into = given.into / "photos.png" if given.into.is_dir() else given.into.with_suffix(".png")
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
-        capture = read_capture(given.folder, longest=given.longest, masks=not given.without_masks, axes=given.axes)
-        silhouettes, overlaps = hull_fit(capture) if capture.masks else ([], [])
-        draw(capture, silhouettes, overlaps).savefig(into, dpi=110)
+        reading = Reading(given.longest, not given.without_masks, given.axes, images=given.images, unchecked=True)
+        capture = read_capture(given.folder, reading)
+        draw(capture).savefig(into, dpi=110)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(capture.summary)
     for note in capture.notes:
         print(f"note: {note}")
-    if overlaps:
-        print("\n".join(told(overlaps, capture)))
+    if capture.fit:
+        print("\n".join(told(capture.fit, capture)))
     print(into)
     return 0
 

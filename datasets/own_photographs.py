@@ -1,14 +1,18 @@
 """One's own photographs as a dataset: one object, moved into the unit sphere, whose true shape is not known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
-from datasets.captures.formats import OPENGL, find_layout
-from datasets.captures.hull import Sphere, sphere_of
-from datasets.captures.take import take
+from datasets.captures.formats import find_layout
+from datasets.captures.frames import OPENGL, Frame, Layout, motion
+from datasets.captures.hull import Fit, fit_of
+from datasets.captures.sphere import Sphere, hull_sphere, looked_at, size_doubt
+from datasets.captures.take import take, turning_notes
 from datasets.mesh import Mesh
 from datasets.scene import Split
 from datasets.shot import Shot
@@ -16,6 +20,10 @@ from renderers.checks import BadInput, check_at_least, check_choice
 
 AXES = {"stated": np.eye(4), "flipped": OPENGL}
 FEWEST = 3  # photographs
+HULL_SAMPLES = 64  # per axis, of the hull that is compared with masks
+GOOD, DOUBTFUL, WRONG = 0.9, 0.8, 0.5  # overlap of hull and masks: cameras are right; hardly; photographs are refused
+LOOK = "python -m bench.photos shows it"
+CLEARLY = 0.1  # by which a way of pairing must fit better than another
 
 
 @dataclass(frozen=True)
@@ -26,15 +34,24 @@ class Capture:
         format: of the folder.
         shots: the photographs, by name.
         masks: where the masks come from, in words; empty without masks.
-        sphere: which part of the file's world became the unit sphere.
-        notes: what was left out or changed.
+        found: how the unit sphere was found, in words.
+        to_world: the similarity from the world of the unit sphere into that of the file.
+        notes: how files were paired, where that is not plain; what was left out, changed, or is doubtful.
+        fit: of cameras and masks; None without masks.
     """
 
     format: str
     shots: tuple[Shot, ...]
     masks: str
-    sphere: Sphere
+    found: str
+    to_world: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...]
+    fit: Fit | None
+
+    @property
+    def sphere(self) -> Sphere:
+        """The unit sphere in the file's world."""
+        return Sphere(self.to_world[:3, 3], float(np.linalg.norm(self.to_world[:3, 0])), self.found)
 
     @property
     def summary(self) -> str:
@@ -42,10 +59,10 @@ class Capture:
         sizes = sorted({(shot.camera.width, shot.camera.height) for shot in self.shots})
         pixels = " and ".join(f"{width} x {height}" for width, height in sizes)
         masks = f"masks from {self.masks}" if self.masks else "no masks"
-        place = ", ".join(f"{value:.3g}" for value in self.sphere.centre)
+        place = ", ".join(str(float(value)) for value in self.sphere.centre)  # all digits: a world may be far away
         return (
             f"{self.format}: {len(self.shots)} photographs of {pixels} pixels, {masks}; the unit sphere has its centre "
-            f"at ({place}) and radius {self.sphere.radius:.3g}, {self.sphere.found}"
+            f"at ({place}) and radius {self.sphere.radius}, {self.found}"
         )
 
 
@@ -69,11 +86,15 @@ class OwnPhotographs:
         path: the folder.
         masks: False reads none, as if there were none.
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
+        images: the folder of COLMAP's images; None for the usual ones in `path`.
+        unchecked: whether photographs are used although cameras hardly fit masks or sizes.
     """
 
     path: str
     masks: bool
     axes: str
+    images: str | None
+    unchecked: bool
 
     def __post_init__(self) -> None:
         check_choice("dataset.axes", self.axes, tuple(AXES))
@@ -87,7 +108,8 @@ class OwnPhotographs:
 
     def capture(self, longest: int, held_out: int) -> Capture:
         """See `Photographed`."""
-        return read_capture(Path(self.path), longest=longest, masks=self.masks, axes=self.axes, held_out=held_out)
+        reading = Reading(longest, self.masks, self.axes, held_out, self.images, self.unchecked)
+        return read_capture(Path(self.path), reading)
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """Raises BadInput: photographs have no true shape."""
@@ -95,55 +117,144 @@ class OwnPhotographs:
 
     def identity(self) -> dict[str, Any]:
         """The folder; runs are told apart by the contents of its files."""
-        return {"name": "photos", "path": self.path, "masks": self.masks, "axes": self.axes}
+        more = {} if self.images is None else {"images": self.images}
+        return {"name": "photos", "path": self.path, "masks": self.masks, "axes": self.axes} | more
 
 
-def read_capture(
-    folder: Path, *, longest: int, masks: bool = True, axes: str = "stated", held_out: int | None = None
-) -> Capture:
-    """Reads the photographs of a folder.
+@dataclass(frozen=True)
+class Reading:
+    """How photographs are read.
 
     Args:
-        folder: in one of the formats of `formats`.
         longest: most pixels of a photograph's longer side; larger ones are made smaller.
         masks: whether masks are used where there are any.
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
         held_out: of so many photographs one, from the first on, has no part in finding the sphere; None: all have.
+        images: the folder of COLMAP's images; None for the usual ones.
+        unchecked: whether what hardly fits is used, with a note.
+    """
+
+    longest: int
+    masks: bool = True
+    axes: str = "stated"
+    held_out: int | None = None
+    images: str | None = None
+    unchecked: bool = False
+
+    def __post_init__(self) -> None:
+        check_at_least("longest", self.longest, 8, "128 shows what there is")
+        check_choice("axes", self.axes, tuple(AXES))
+
+
+def read_capture(folder: Path, reading: Reading) -> Capture:
+    """Reads the photographs of a folder, in one of the formats of `formats`.
 
     Raises:
         BadInput: where something is missing, or cameras and masks do not fit.
     """
-    check_at_least("longest", longest, 8, "128 shows what there is")
-    check_choice("axes", axes, tuple(AXES))
-    layout = find_layout(folder)
+    layout = find_layout(folder, reading.images)
     if len(layout.frames) < FEWEST:
         raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
-    frames = [replace(frame, world_to_camera=AXES[axes] @ frame.world_to_camera) for frame in layout.frames]
-    middle = -np.mean([frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in frames], axis=0)
-    moved = np.eye(4)
-    moved[:3, 3] = middle  # the origin among the cameras: single precision would round a far world
-    frames = [replace(frame, world_to_camera=frame.world_to_camera @ moved) for frame in frames]
-    shots = [take(frame, longest) for frame in frames]
-    lacking = [shot.name for shot in shots if shot.mask is None]
-    if masks and 0 < len(lacking) < len(shots):
-        raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
-    masked = masks and not lacking
+    if layout.rival:
+        return _by_masks(layout, reading)
+    capture, doubts = _checked(_capture(layout, reading), layout.frames)
+    if doubts and not reading.unchecked:
+        raise BadInput(f"{folder}: {'; '.join(doubts)}; or set dataset.unchecked=true")
+    return replace(capture, notes=(*capture.notes, *doubts))
+
+
+def _by_masks(layout: Layout, reading: Reading) -> Capture:
+    """The pairs of images and cameras whose masks fit, of two that the names allow."""
+    captures = []
+    for frames in (layout.frames, layout.rival):
+        try:
+            captures.append(_capture(replace(layout, frames=frames), reading))
+        except BadInput:  # an empty hull
+            continue
+    fits = [0.0 if one.fit is None else float(np.median(one.fit.overlaps)) for one in captures]
+    best = int(np.argmax(fits)) if fits else 0
+    if not fits or fits[best] < DOUBTFUL or any(fits[best] - fit < CLEARLY for i, fit in enumerate(fits) if i != best):
+        first, last = layout.frames[0].image.name, layout.frames[-1].image.name
+        raise BadInput(
+            f"images are missing, and the names {first} to {last} do not tell which, nor do masks: add the missing "
+            "images, or remove their cameras"
+        )
+    told = f"which images are missing was found by the masks, which fit by {fits[best]:.0%}"
+    return replace(captures[best], notes=(*captures[best].notes, told))
+
+
+def _capture(layout: Layout, reading: Reading) -> Capture:
+    """The photographs of a layout, with their fit."""
+    frames, middle = _centred(layout.frames, AXES[reading.axes])
+    frames = frames if reading.masks else [replace(frame, mask=None) for frame in frames]
+    shots = [take(frame, reading.longest) for frame in frames]
+    masked = reading.masks and _all_masked(shots)
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
-    if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
-        raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
-    given = [shot for place, shot in enumerate(shots) if held_out is None or place % held_out]
-    if layout.sphere:
-        sphere = Sphere(*layout.sphere, "as the format states")
-    else:
-        found = sphere_of(given)
-        sphere = replace(found, centre=found.centre + middle)
+    every = reading.held_out
+    given = [place for place in range(len(shots)) if every is None or place % every]
+    sphere = _sphere(layout, middle, [shots[place] for place in given], [frames[place].span for place in given])
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
+    longest = reading.longest
     whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
+    within = tuple(shot.within(sphere.centre, sphere.radius) for shot in shots)
+    to_world = np.diag([*[sphere.radius] * 3, 1.0])
+    to_world[:3, 3] = sphere.centre + middle
     return Capture(
         layout.format,
-        tuple(shot.within(sphere.centre - middle, sphere.radius) for shot in shots),
+        within,
         source if masked else "",
-        sphere,
-        (*layout.notes, *whole),
+        sphere.found,
+        layout.world @ to_world,
+        (*layout.notes, *turning_notes(frames), *whole),
+        fit_of(within, HULL_SAMPLES) if masked else None,
     )
+
+
+def _centred(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[list[Frame], Float[np.ndarray, "3"]]:
+    """Frames with the origin among the cameras, since digits would be lost in a far world; and where that was."""
+    turned = [replace(frame, world_to_camera=axes @ frame.world_to_camera) for frame in frames]
+    middle = -np.mean([frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in turned], axis=0)
+    moved = motion(np.eye(3), middle)
+    return [replace(frame, world_to_camera=frame.world_to_camera @ moved) for frame in turned], middle
+
+
+def _all_masked(shots: Sequence[Shot]) -> bool:
+    """Whether photographs have masks; raises BadInput where only some have, or one is empty."""
+    lacking = [shot.name for shot in shots if shot.mask is None]
+    if 0 < len(lacking) < len(shots):
+        raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
+    if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
+        raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
+    return not lacking
+
+
+def _sphere(
+    layout: Layout, middle: Float[np.ndarray, "3"], shots: Sequence[Shot], spans: Sequence[tuple[float, float] | None]
+) -> Sphere:
+    """The sphere that the format states; else about the masks' hull, the reconstructed points, or what is looked at."""
+    if layout.sphere:
+        centre, radius = layout.sphere
+        return Sphere(centre - middle, radius, "as the format states")
+    if all(shot.mask is not None for shot in shots):
+        return hull_sphere(shots, looked_at(shots, spans))
+    if layout.points:
+        centre, radius = layout.points
+        return Sphere(centre - middle, radius, "about most of the reconstructed points")
+    return looked_at(shots, spans)
+
+
+def _checked(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[str]]:
+    """A capture with notes on what is doubtful, and what is so doubtful that it is refused."""
+    fit = capture.fit
+    overlap, shown = (float(np.median(one)) for one in ((fit.overlaps, fit.shown) if fit else ([1.0], [1.0])))
+    sizes = None in [frame.size for frame in frames] and (fit is None or overlap < DOUBTFUL)
+    if sizes and (doubt := size_doubt([shot.camera for shot in capture.shots])):
+        return capture, [doubt]
+    told = {
+        f"the visual hull of the masks overlaps with them by {overlap:.0%} (median): cameras may be those of other "
+        f"images; {LOOK}": overlap,
+        f"the photographs show {shown:.0%} of the object (median): cameras may look elsewhere; {LOOK}": shown,
+    }
+    notes = [text for text, share in told.items() if WRONG <= share < DOUBTFUL]
+    return replace(capture, notes=(*capture.notes, *notes)), [text for text, share in told.items() if share < WRONG]

@@ -38,8 +38,9 @@ class Shot:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(part.shape[:2])}")
 
     def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
-        """The same photograph in a world where the sphere about `centre` is the unit sphere about the origin."""
+        """The same photograph, in single precision, in a world where the sphere about `centre` is the unit sphere."""
         motion = self.camera.world_to_camera.double().clone()
         motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
         depth = None if self.depth is None else self.depth / radius
-        return replace(self, camera=replace(self.camera, world_to_camera=motion.float()), depth=depth)
+        camera = replace(self.camera, intrinsics=self.camera.intrinsics.float(), world_to_camera=motion.float())
+        return replace(self, camera=camera, depth=depth)

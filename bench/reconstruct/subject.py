@@ -3,9 +3,11 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Bool, Float
 
 from bench.setup.inputs import RunContext, RunInputs
@@ -51,7 +53,7 @@ class Depths:
         first, second = np.random.default_rng(seed).integers(2**62, size=2).tolist()
         chosen = observed_pixels(shot.mask, self.points, first)
         noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(second))
-        return replace(shot, depth=torch.where(chosen, shot.depth + noise, 0.0))
+        return replace(shot, depth=torch.where(chosen & (shot.depth > 0), shot.depth + noise, 0.0))
 
 
 @dataclass(frozen=True)
@@ -63,15 +65,29 @@ class Subject:
         held_out: that it is judged by.
         truth: the true surface, where it is known.
         found: what there is, in words.
+        to_world: from the unit sphere's world into that of the file; None of a scene.
     """
 
     given: tuple[Shot, ...]
     held_out: tuple[Shot, ...]
     truth: Mesh | None
     found: str
+    to_world: Float[np.ndarray, "4 4"] | None = None
     known: dict[tuple[int, int], tuple[Surface, Bool[np.ndarray, " n"]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+
+    def save_world(self, folder: Path) -> None:
+        """Writes `to_world.txt`, a 4 x 4 matrix, and `mesh_world.ply`, in the file's world; all digits of both."""
+        if self.to_world is None:
+            return
+        np.savetxt(folder / "to_world.txt", self.to_world, fmt="%.17g")
+        if (folder / "mesh.ply").is_file():
+            found = trimesh.load_mesh(folder / "mesh.ply", process=False)
+            vertices = found.vertices @ self.to_world[:3, :3].T + self.to_world[:3, 3]
+            coloured = found.visual.kind == "vertex"
+            colours = found.visual.vertex_colors[:, :3] / 255 if coloured else None
+            Mesh(vertices, np.asarray(found.faces), colours=colours).save(folder / "mesh_world.ply")
 
     def true_surface(self, count: int, seed: int) -> tuple[Surface, Bool[np.ndarray, " n"]]:
         """Samples of the true surface, and which of them a given photograph sees; drawn once."""
@@ -135,12 +151,12 @@ class PhotographTask(ABC):
         """
         if inputs.photographed is not None:
             capture = inputs.photographed.capture(self.longest, self.held_out)
-            shots, truth, seed = capture.shots, None, inputs.seed
+            shots, truth, seed, to_world = capture.shots, None, inputs.seed, capture.to_world
             found = "; ".join([capture.summary, *capture.notes])
         else:
             scene = inputs.scene
             camera = scene.view.camera.resized(self.longest, self.longest)
-            seed, truth = scene.seed(inputs.seed), scene.mesh
+            seed, truth, to_world = scene.seed(inputs.seed), scene.mesh, None
             shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
             found = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
         every = self.held_out
@@ -150,7 +166,7 @@ class PhotographTask(ABC):
         given = tuple(self.depths.of(shot, (seed, place)) for place, shot in enumerate(given))
         given = given if self.masks else tuple(replace(shot, mask=None) for shot in given)
         found += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
-        return Subject(given, held_out, truth, found)
+        return Subject(given, held_out, truth, found, to_world)
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:

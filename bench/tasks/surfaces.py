@@ -36,6 +36,7 @@ class _Surface(PhotographTask):
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
             note_surface(run, mesh, subject, {})
+            subject.save_world(run.folder)
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,12 @@ from torch import Tensor
 from datasets.mesh import Mesh, extract
 from datasets.scene import Truth, see
 from datasets.shot import Shot
-from renderers.checks import BadInput
 from renderers.field import Kind
 from renderers.fields.analytic import Shape
 
 SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
 FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
 CHUNK = 65_536  # points projected at once
-SAMPLES = 48  # per axis, while the hull is looked for
-ROUNDS = 4  # in which the part of the world that is sampled shrinks to the hull
-FILLED = 0.9  # of the unit sphere's radius that the hull takes
 
 
 @torch.no_grad()
@@ -45,10 +41,10 @@ def _carved(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor
     for shot in shots:
         assert shot.mask is not None
         pixels, depth = shot.camera.project(points[left])
-        size = torch.tensor([shot.camera.width, shot.camera.height], device=points.device)
+        size = points.new_tensor([shot.camera.width, shot.camera.height])
         inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
         places = (2 * pixels / size - 1)[None, :, None]
-        mask = shot.mask.float()[None, None]
+        mask = shot.mask.to(points.dtype)[None, None]
         found = torch.nn.functional.grid_sample(mask, places, padding_mode="border", align_corners=False).flatten()
         least[left] = torch.where(inside, torch.minimum(least[left], found), least[left])
         seen[left] += inside
@@ -75,48 +71,31 @@ def hull_views(shots: Sequence[Shot], hull: Mesh | None) -> list[Bool[Tensor, "h
 
 
 @dataclass(frozen=True)
-class Sphere:
-    """A sphere about the object, in the file's world, and how it was found."""
+class Fit:
+    """How well cameras and masks fit.
 
-    centre: Float[np.ndarray, "3"]
-    radius: float
-    found: str
-
-
-def sphere_of(shots: Sequence[Shot]) -> Sphere:
-    """A sphere about the object: about the visual hull of the masks or, without masks, about what all cameras look at.
-
-    Raises:
-        BadInput: where the hull is empty.
+    Args:
+        silhouettes: of the visual hull, in each photograph.
+        overlaps: their intersection over union with the masks.
+        shown: the share of the hull's vertices that each photograph shows.
     """
-    centre, half = _looked_at(shots)
-    if any(shot.mask is None for shot in shots):
-        return Sphere(centre, half, "about the point that the cameras look at, as far as most of them see")
-    for _ in range(ROUNDS):
-        axis = torch.linspace(-half, half, SAMPLES, dtype=torch.float64)
-        points = torch.from_numpy(centre) + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-        inside = points[carve(shots, points.float()) < 0].numpy()
-        if len(inside) == 0:
-            raise BadInput(
-                "the visual hull of the masks is empty: no point is inside of all masks, so that cameras do not fit "
-                "the masks. Try flipped axes (stated ones, where they are flipped), check the order of the images and "
-                "that masks are white on the object"
-            )
-        spacing = 2 * half / (SAMPLES - 1)
-        low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing
-        centre, half = (low + high) / 2, float((high - low).max()) / 2
-    radius = float(np.linalg.norm(inside - centre, axis=1).max()) + spacing
-    return Sphere(centre, radius / FILLED, "about the visual hull of the masks")
+
+    silhouettes: tuple[Bool[np.ndarray, "_ _"], ...]
+    overlaps: tuple[float, ...]
+    shown: tuple[float, ...]
 
 
-def _looked_at(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3"], float]:
-    """The point nearest to all optical axes, and half the width that the narrower side of most images shows there."""
-    motions = [shot.camera.camera_to_world.double().numpy() for shot in shots]
-    across = [np.eye(3) - np.outer(motion[:3, 2], motion[:3, 2]) for motion in motions]
-    places = [motion[:3, 3] for motion in motions]
-    pulled = np.sum([one @ place for one, place in zip(across, places, strict=True)], axis=0)
-    centre = np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=None)[0]
-    away = np.array([np.linalg.norm(place - centre) for place in places])
-    cameras = [shot.camera for shot in shots]
-    shown = np.array([min(one.width, one.height) / 2 / one.intrinsics[0, 0].item() for one in cameras])
-    return centre, float(np.median(away * shown))
+def fit_of(shots: Sequence[Shot], samples: int) -> Fit:
+    """How well photographs with masks fit, by their visual hull in the unit sphere, `samples` per axis."""
+    hull = hull_mesh(shots, samples)
+    silhouettes = tuple(seen.numpy() for seen in hull_views(shots, hull))
+    overlaps = [_overlap(seen, np.asarray(shot.mask)) for seen, shot in zip(silhouettes, shots, strict=True)]
+    points = torch.zeros(0, 3) if hull is None else torch.from_numpy(hull.vertices).float()
+    shown = [float(shot.camera.shows(points).float().mean()) if len(points) else 0.0 for shot in shots]
+    return Fit(silhouettes, tuple(overlaps), tuple(shown))
+
+
+def _overlap(seen: Bool[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> float:
+    """Intersection over union; 1 where both are empty."""
+    union = int((seen | mask).sum())
+    return float((seen & mask).sum() / union) if union else 1.0

@@ -63,7 +63,7 @@ def run_in(folder: Path, scene: Scene | None, *, renderer: str = "idr", field: s
     """A run under way, of a scene or of photographs on disk, which are written first."""
     if scene is None:
         nerf(folder)
-        more |= {"dataset": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated")}
+        more |= {"dataset": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated", None, False)}
     else:
         more |= {"make_scene": lambda: scene}
     more |= {"field": FieldChoice(field, None)}

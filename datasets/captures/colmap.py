@@ -1,0 +1,109 @@
+"""COLMAP's sparse reconstructions."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from datasets.captures.frames import Frame, Layout, motion
+from datasets.captures.lenses import colmap_lens
+from datasets.captures.pairing import images_in, located, masks_of, without_camera, without_image
+from datasets.extras import install
+from renderers.checks import BadInput
+
+ROOTS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
+IMAGES = ("images", "images_2", "images_4", "images_8", "input", "image", ".")
+MOST = 0.9  # of the points lie in the sphere: others may be far away
+
+
+def colmap(folder: Path, images: str | None = None) -> Layout | None:
+    """The model with the most images, read by pycolmap; its points lie about the object, or about all that is seen.
+
+    Args:
+        images: the folder of images; None for the usual ones.
+    """
+    places = _models(folder)
+    if not places:
+        return None
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise BadInput(f"{places[0]} is read by pycolmap: {install('colmap')}") from error
+    models = {place: pycolmap.Reconstruction(str(place)) for place in places}
+    place = max(places, key=lambda one: len(models[one].images))  # of equal ones the first
+    cameras = _cameras(models[place], place)
+    bases = [folder / images] if images is not None else [folder / name for name in IMAGES]
+    if images is not None and not bases[0].is_dir():
+        raise BadInput(f"dataset.images={images} is no folder: give that of COLMAP's images, from {folder} or /")
+    tried = [(base, *located([*cameras], base)) for base in bases if base.is_dir()]
+    base, found, how = max(tried, key=lambda one: len(one[1]))
+    there = {file.relative_to(base).as_posix(): file for file in found.values()}
+    masks, masked = masks_of(folder, there)
+    frames = [
+        Frame(file, *cameras[name][:2], masks.get(file.relative_to(base).as_posix()), *cameras[name][2:])
+        for name, file in sorted(found.items())
+    ]
+    notes = [*_chosen(folder, place, {one: len(model.images) for one, model in models.items()})]
+    notes += [*([how] if how else []), *masked, *without_image([name for name in cameras if name not in found])]
+    if base != folder:
+        notes += without_camera(name for name in images_in(base, deep=True) if name not in there)
+    points = np.array([point.xyz for point in models[place].points3D.values()])
+    around = _about(points) if len(points) else None
+    return Layout("COLMAP", tuple(frames), None, tuple(notes), around, missing=next(iter(cameras), ""))
+
+
+def _models(folder: Path) -> list[Path]:
+    """The folders of models: several where COLMAP could not join all images."""
+    roots = [folder / name for name in ROOTS]
+    places = [place for root in roots if root.is_dir() for place in (*_numbered(root), root)]
+    return [place for place in places if _has(place, "cameras") and _has(place, "images")]
+
+
+def _numbered(root: Path) -> list[Path]:
+    """The folders 0, 1 and so on."""
+    return sorted((one for one in root.iterdir() if one.is_dir() and one.name.isdigit()), key=lambda one: int(one.name))
+
+
+def _has(place: Path, name: str) -> bool:
+    return any((place / f"{name}{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def _chosen(folder: Path, place: Path, counts: dict[Path, int]) -> list[str]:
+    """A note where there are several models."""
+    others = [f"{one.relative_to(folder)} with {count}" for one, count in counts.items() if one != place]
+    chosen = f"{place.relative_to(folder)} with {counts[place]} images is taken"
+    return [f"{chosen}, not {', '.join(others)}"] if others else []
+
+
+def _cameras(model: Any, place: Path) -> dict[str, tuple[Any, ...]]:
+    """Intrinsics, world_to_camera, size and lens of each image, by its name."""
+    names, found = _written_names(place), {}
+    for seen in (one for one in model.images.values() if one.has_pose):
+        camera = model.cameras[seen.camera_id]
+        lens = colmap_lens(camera.model.name, list(camera.params), str(place))
+        matrix = seen.cam_from_world().matrix()
+        moved = motion(matrix[:, :3], matrix[:, 3])
+        name = names.get(seen.image_id, seen.name)
+        found[name] = camera.calibration_matrix(), moved, (camera.height, camera.width), lens
+    return {name: found[name] for name in sorted(found)}
+
+
+def _written_names(place: Path) -> dict[int, str]:
+    """The names in images.txt by number: pycolmap ends them at the first space."""
+    file, names = place / "images.txt", {}
+    if (place / "images.bin").is_file() or not file.is_file():
+        return names
+    lines = iter(file.read_text().splitlines())
+    for line in lines:
+        if line.strip() and not line.startswith("#"):
+            number, *rest = line.split(maxsplit=9)
+            names[int(number)] = rest[-1].strip()
+            next(lines, "")  # its points
+    return names
+
+
+def _about(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """The sphere about most of the points."""
+    centre = np.median(points, axis=0)
+    return centre, float(np.quantile(np.linalg.norm(points - centre, axis=1), MOST))

@@ -1,0 +1,133 @@
+"""Lenses: how the models of OpenCV, COLMAP and NeRF's files bend rays, and which of them are understood."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from renderers.checks import BadInput
+
+RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4", "k5", "k6"), ("p1", "p2")
+BROWN = ("k1", "k2", "p1", "p2")
+PLAIN = {  # COLMAP's models, and the numbers behind focal lengths and principal point
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": BROWN,
+    "FULL_OPENCV": (*BROWN, "k3", "k4", "k5", "k6"),
+}
+FISHEYE = {
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])
+OTHER = re.compile(r"k[7-9]|k\d\d|p[3-9]|[sb]\d|tau_?[xy]|ftheta_\w+")  # numbers of models that are not understood
+SHAPES = ("equirectangular", "latlong", "orthographic", "orthophoto", "is_equirectangular", "is_orthographic")
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How a lens bends the rays of a pinhole camera.
+
+    Args:
+        fisheye: whether `radial` is OpenCV's equidistant fisheye; else it is its rational model (Brown's, where k4 to
+            k6 are 0).
+        radial: k1 and further ones, up to k6; of a fisheye up to k4.
+        tangential: p1, p2.
+    """
+
+    fisheye: bool = False
+    radial: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All of them."""
+        return (*self.radial, *self.tangential)
+
+    @property
+    def bends(self) -> bool:
+        """Whether it differs from a pinhole camera."""
+        return self.fisheye or any(self.numbers)
+
+    def bend(
+        self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
+    ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+        """Where a ray through (x, y, 1) meets the plane at depth 1 after the lens."""
+        square = x**2 + y**2
+        if self.fisheye:
+            radius = np.sqrt(square)
+            angle = np.arctan(radius)
+            bent = angle * _polynomial(self.radial, angle**2)
+            factor = np.divide(bent, radius, out=np.ones_like(radius), where=radius > 0)
+            return x * factor, y * factor
+        factor = _polynomial(self.radial[:3], square) / _polynomial(self.radial[3:], square)
+        p1, p2 = self.tangential
+        return (
+            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2),
+            y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
+        )
+
+
+def _polynomial(numbers: tuple[float, ...], square: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """1 + k1 s + k2 s^2 + ..."""
+    return np.polynomial.polynomial.polyval(square, (1.0, *numbers))
+
+
+def colmap_lens(model: str, numbers: list[float], where: str) -> Lens:
+    """The lens of a COLMAP camera.
+
+    Args:
+        model: its name.
+        numbers: all of the camera, focal lengths and principal point first.
+
+    Raises:
+        BadInput: for models that are not understood.
+    """
+    names = (PLAIN | FISHEYE).get(model)
+    if names is None:
+        raise BadInput(
+            f"{where} has cameras of the model {model}, which is not understood ({UNDERSTOOD} are): use colmap "
+            "image_undistorter first"
+        )
+    return _lens(dict(zip(names, numbers[len(numbers) - len(names) :], strict=True)), fisheye=model in FISHEYE)
+
+
+def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
+    """The lens of a frame of transforms.json.
+
+    Raises:
+        BadInput: for models that are not understood, by name.
+    """
+    model = str(known.get("camera_model") or "").upper()
+    flags = [name for name in SHAPES if known.get(name)]
+    if (model and model not in {*PLAIN, *FISHEYE, "PERSPECTIVE"}) or flags:
+        named = f"camera_model {model}" if not flags else flags[0]
+        raise BadInput(f"{where}: {named} is not understood ({UNDERSTOOD} are): undistort the images, and export again")
+    if others := [name for name, value in known.items() if OTHER.fullmatch(name) and np.any(value)]:
+        raise BadInput(
+            f"{where}: the lens has {', '.join(others)}, which is not understood ({', '.join((*RADIAL, *TANGENTIAL))} "
+            "are): undistort the images, and export again"
+        )
+    fisheye = model in FISHEYE or bool(known.get("is_fisheye"))
+    if fisheye and model in PLAIN:
+        raise BadInput(f"{where}: is_fisheye does not fit camera_model {model}: leave one of them out")
+    bent = {name: float(known.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
+    if fisheye and any(bent[name] for name in ("k5", "k6", "p1", "p2")):
+        raise BadInput(f"{where}: a fisheye has k1 to k4, and this one k5, k6, p1 or p2 too: export it again")
+    if not fisheye and bent["k4"] and model != "FULL_OPENCV" and not {"k5", "k6"} & set(known):
+        raise BadInput(
+            f"{where}: k4 means one thing in a fisheye, another in OpenCV's rational model: set is_fisheye to true, or "
+            "camera_model to FULL_OPENCV"
+        )
+    return _lens(bent, fisheye=fisheye)
+
+
+def _lens(bent: Mapping[str, float], *, fisheye: bool) -> Lens:
+    radial = tuple(bent.get(name, 0.0) for name in RADIAL[: 4 if fisheye else 6])
+    return Lens(fisheye, radial, (bent.get("p1", 0.0), bent.get("p2", 0.0)))

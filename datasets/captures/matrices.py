@@ -1,0 +1,119 @@
+"""Cameras as matrices in one `.npz` file: IDR and NeuS, and DVR."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from datasets.captures.frames import Frame, Layout, decomposed, image_size, need
+from datasets.captures.pairing import by_order, first_images, made, masks_of, paired
+from renderers.checks import BadInput
+
+Matrices = dict[str, Float[np.ndarray, "4 4"]]
+SIMILAR = 1e-4  # most by which scale_mat may differ from a similarity, and from that of another camera, as a share
+CUBE = 0.75**0.5  # radius of the sphere about DVR's cube from -1/2 to 1/2
+
+
+def idr(folder: Path) -> Layout | None:
+    """IDR and NeuS: projections world_mat_i, and scale_mat_i from the unit sphere; i counts the sorted names."""
+    return _layout(folder, "IDR/NeuS", ("cameras_sphere.npz", "cameras.npz"), 1.0)
+
+
+def dvr(folder: Path) -> Layout | None:
+    """DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths."""
+    return _layout(folder, "DVR", ("cameras.npz",), CUBE)
+
+
+def _layout(folder: Path, name: str, files: tuple[str, ...], radius: float) -> Layout | None:
+    """What a folder has in either format; `radius` is that of the sphere about the object, before scale_mat."""
+    file = next((file for one in files if (file := folder / one).is_file()), None)
+    if file is None:
+        return None
+    with np.load(file) as stored:
+        known = {key: np.asarray(stored[key], dtype=np.float64) for key in stored if "_mat_" in key}
+    if ("camera_mat_0" in known) != (name == "DVR"):
+        return None
+    count = sum(key.startswith("world_mat_") and key[10:].isdigit() for key in known)
+    if count == 0:
+        raise BadInput(f"{file} has no world_mat_0: export it again, with world_mat_0, world_mat_1 and so on")
+    for i in range(count):
+        need(known, f"world_mat_{i}", str(file))
+    images = first_images(folder, "image", "images")
+    answers = by_order([*images], count, file.name)
+    scale, notes = _scale(known, count, str(file))
+    masks, how = masks_of(folder, images, sorted_too=True)
+    make = _dvr_frames(file, known, scale, images) if name == "DVR" else _idr_frames(file, known, scale)
+
+    def frame(i: int, name: str) -> Frame:
+        return make(i, images[name], masks.get(name))
+
+    frames, rival, found = made(answers, count, frame)
+    sphere = (np.zeros(3), radius) if any(key.startswith("scale_mat_") for key in known) else None
+    notes = (*notes, *found, *how)
+    return Layout(name, frames, sphere, notes, world=scale, rival=rival, missing="image/*")
+
+
+def _idr_frames(
+    file: Path, known: Matrices, scale: Float[np.ndarray, "4 4"]
+) -> Callable[[int, Path, Path | None], Frame]:
+    """What makes the frame of camera i."""
+
+    def frame(i: int, image: Path, mask: Path | None) -> Frame:
+        try:
+            return Frame(image, *decomposed((known[f"world_mat_{i}"] @ scale)[:3]), mask)
+        except ValueError as error:
+            raise BadInput(f"{file}, world_mat_{i}: {error}; export it again") from None
+
+    return frame
+
+
+def _dvr_frames(
+    file: Path, known: Matrices, scale: Float[np.ndarray, "4 4"], images: dict[str, Path]
+) -> Callable[[int, Path, Path | None], Frame]:
+    """What makes the frame of camera i: -1 and 1 are the centres of the first and of the last pixel."""
+    stored = {one.name: one for one in sorted(file.parent.glob("depth/*.exr")) if not one.name.startswith(".")}
+    depths = {images[name]: stored[depth] for name, depth in paired([*images], [*stored])[0].items()}
+
+    def frame(i: int, image: Path, mask: Path | None) -> Frame:
+        half = (np.array(image_size(image)) - 1) / 2
+        pixels = np.array([[half[0], 0, half[0], 0], [0, half[1], half[1], 0], [0, 0, 1.0, 0]])
+        seen = need(known, f"camera_mat_{i}", str(file)) @ known[f"world_mat_{i}"] @ scale
+        try:
+            intrinsics, motion = decomposed(pixels @ seen)
+        except ValueError as error:
+            raise BadInput(f"{file}, camera_mat_{i} and world_mat_{i}: {error}; export them again") from None
+        unit = 1 / float(seen[2, :3] @ motion[2, :3])  # a depth is the third number of a projected point
+        depth = (depths[image], unit) if image in depths else None
+        return Frame(image, intrinsics, motion, mask, depth=depth)
+
+    return frame
+
+
+def _scale(known: Matrices, count: int, file: str) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
+    """The one scale_mat of all cameras, the identity where there is none; and a note where some have none.
+
+    Raises:
+        BadInput: where it is no similarity, or cameras have different ones.
+    """
+    there = [i for i in range(count) if f"scale_mat_{i}" in known]
+    if not there:
+        return np.eye(4), ()
+    scale = known[f"scale_mat_{there[0]}"]
+    squares = scale[:3, :3].T @ scale[:3, :3]
+    size = float(np.trace(squares)) / 3
+    if not size > 0 or np.abs(squares / size - np.eye(3)).max() > SIMILAR or np.linalg.det(scale[:3, :3]) < 0:
+        lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(scale[:3, :3], axis=0))
+        raise BadInput(
+            f"{file}: scale_mat_{there[0]} must scale all axes alike, and turn and move them, but its columns have "
+            f"lengths {lengths}: a sphere would not stay one; write one scale for all axes"
+        )
+    for i in there:
+        if np.abs(known[f"scale_mat_{i}"] - scale).max() > SIMILAR * size**0.5:
+            raise BadInput(f"{file}: scale_mat_{i} differs from scale_mat_{there[0]}: the unit sphere must be the same")
+    lacking = [i for i in range(count) if i not in there]
+    if not lacking:
+        return scale, ()
+    return scale, (
+        f"scale_mat_{there[0]} is that of all cameras: {len(lacking)} have none, such as camera {lacking[0]}",
+    )

@@ -1,0 +1,92 @@
+"""Cameras in the JSON of NeRF, instant-ngp, nerfstudio and NeuS2."""
+
+import json
+from collections.abc import Mapping
+from math import pi, radians, tan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from datasets.captures.frames import OPENGL, Frame, Layout, image_size, inverse, need
+from datasets.captures.lenses import nerf_lens
+from datasets.captures.pairing import located, natural, without_image
+from renderers.checks import BadInput
+
+FILES = ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")
+
+
+def transforms(folder: Path) -> Layout | None:
+    """camera_to_world in OpenGL's axes (in OpenCV's where `from_na` is true); fields of view, or intrinsics; a lens."""
+    files = [file for name in FILES if (file := folder / name).is_file()]
+    if not files:
+        return None
+    try:
+        stored = json.loads(files[0].read_text(encoding="utf-8-sig"))
+    except ValueError as error:
+        raise BadInput(f"{files[0]} is no JSON file ({error}): export it again") from None
+    every = need(stored, "frames", str(files[0]))
+    if not isinstance(every, list) or not all(isinstance(frame, dict) for frame in every):
+        raise BadInput(f"{files[0]}: frames must be a list with a table for each image: export it again")
+    known = {str(need(frame, "file_path", f"{files[0]}: a frame")): stored | frame for frame in every}
+    if len(known) < len(every):
+        paths = [str(frame["file_path"]) for frame in every]
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise BadInput(f"{files[0]} has {twice} twice: name each image once")
+    found, how = located([*known], folder)
+    masks = _masks(folder, known, found)
+    frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
+    missing = [path for path in known if path not in found]
+    notes = (*([how] if how else []), *without_image(missing))
+    frames = sorted(frames, key=lambda frame: natural(frame.image.name))
+    return Layout("NeRF", tuple(frames), None, notes, missing=missing[0] if missing else "")
+
+
+def _masks(folder: Path, known: Mapping[str, Mapping[str, Any]], found: Mapping[str, Path]) -> dict[str, Path]:
+    """The masks that frames name, by their images' paths."""
+    named = {path: str(frame["mask_path"]) for path, frame in known.items() if path in found and frame.get("mask_path")}
+    masks, _ = located(named.values(), folder)
+    if lost := [mask for mask in named.values() if mask not in masks]:
+        raise BadInput(f"the mask {lost[0]} that transforms.json names is not in {folder}: add it, or use no masks")
+    return {path: masks[mask] for path, mask in named.items()}
+
+
+def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) -> Frame:
+    """The frame of one image from what the file says of all and of it."""
+    lens = nerf_lens(known, where)
+    stated = (int(known["h"]), int(known["w"])) if {"w", "h"} <= set(known) else None
+    width, height = image_size(image) if stated is None else stated[::-1]
+    matrix = np.asarray(need(known, "transform_matrix", where), dtype=np.float64)
+    axes = np.eye(4) if known.get("from_na") else OPENGL
+    motion = np.linalg.inv(axes) @ inverse(matrix, f"{where}: transform_matrix")
+    return Frame(image, _intrinsics(known, width, height, where), motion, mask, stated, lens)
+
+
+def _intrinsics(known: Mapping[str, Any], width: int, height: int, where: str) -> Float[np.ndarray, "3 3"]:
+    """Intrinsics from a matrix, from focal lengths, or from fields of view."""
+    if (matrix := known.get("intrinsic_matrix")) is not None:
+        return np.asarray(matrix, dtype=np.float64)[:3, :3]
+    across = _focal(known, "x", width, where)
+    down = _focal(known, "y", height, where)
+    if across is None and down is None:
+        raise BadInput(
+            f"{where} has no focal length: give fl_x, or camera_angle_x in radians, or intrinsic_matrix in each frame"
+        )
+    across, down = across or down or 0.0, down or across or 0.0
+    middle = float(known.get("cx", width / 2)), float(known.get("cy", height / 2))
+    return np.array([[across, 0, middle[0]], [0, down, middle[1]], [0, 0, 1.0]])
+
+
+def _focal(known: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
+    """The focal length along an axis, in pixels; None where the file does not say."""
+    if known.get(f"fl_{axis}") is not None:
+        return float(known[f"fl_{axis}"])
+    for key, angle in ((f"camera_angle_{axis}", float), (f"{axis}_fov", radians)):
+        if known.get(key) is not None:
+            value = angle(float(known[key]))
+            if not 0 < value < pi:
+                unit = "radians" if angle is float else "degrees"
+                raise BadInput(f"{where}: {key} must lie between 0 and pi, not {known[key]}: it is in {unit}")
+            return pixels / 2 / tan(value / 2)
+    return None

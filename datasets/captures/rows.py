@@ -1,0 +1,118 @@
+"""Cameras in rows of numbers, one an image: Middlebury, LLFF, BlendedMVS, and Choy's renderings of ShapeNet."""
+
+from math import cos, radians, sin
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from datasets.captures.frames import OPENGL, Frame, Layout, centred, image_size, motion
+from datasets.captures.pairing import by_order, first_images, images_in, located, made, masks_of, paired, without_image
+from renderers.checks import BadInput
+
+
+def middlebury(folder: Path) -> Layout | None:
+    """Middlebury: a line for each image: its name, K, R and t, row by row."""
+    files = [file for file in sorted(folder.glob("*_par.txt")) if not file.name.startswith(".")]
+    if not files:
+        return None
+    cameras = {}
+    for line in files[0].read_text().splitlines()[1:]:
+        if not line.strip():
+            continue
+        name, *numbers = line.rsplit(maxsplit=21)
+        if len(numbers) != 21:
+            raise BadInput(f"{files[0]}: the line of {name} must have 21 numbers, not {len(numbers)}: copy it again")
+        values = np.array(numbers, dtype=np.float64)
+        cameras[name] = centred(values[:9].reshape(3, 3)), motion(values[9:18].reshape(3, 3), values[18:])
+    found, how = located([*cameras], folder)
+    there = {file.name: file for file in found.values()}
+    if lost := [name for name in images_in(folder) if name not in there]:
+        raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
+    masks, masked = masks_of(folder, there)
+    frames = tuple(Frame(file, *cameras[name], masks.get(file.name)) for name, file in found.items())
+    missing = [name for name in cameras if name not in found]
+    notes = (*([how] if how else []), *masked, *without_image(missing))
+    return Layout("Middlebury", frames, None, notes, missing=missing[0] if missing else "")
+
+
+def llff(folder: Path) -> Layout | None:
+    """LLFF: a row an image, by sorted names: camera_to_world with axes down, right, backward; size; focal; depths."""
+    file = folder / "poses_bounds.npy"
+    if not file.is_file():
+        return None
+    rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
+    answers = by_order([*images], len(rows), file.name)
+    masks, how = masks_of(folder, images)
+
+    def frame(i: int, name: str) -> Frame:
+        down, right, back, centre, (height, width, focal) = rows[i, :15].reshape(3, 5).T
+        rotation = np.stack([right, down, -back])
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        moved = motion(rotation, -rotation @ centre)
+        near, far = map(float, rows[i, 15:])
+        return Frame(images[name], intrinsics, moved, masks.get(name), (int(height), int(width)), span=(near, far))
+
+    frames, rival, notes = made(answers, len(rows), frame)
+    return Layout("LLFF", frames, None, (*notes, *how), rival=rival, missing="images/*")
+
+
+def blended_mvs(folder: Path) -> Layout | None:
+    """BlendedMVS and MVSNet: a file for each image: world_to_camera, K, and the range of depths."""
+    files = {file.name[: -len("_cam.txt")]: file for file in sorted(folder.glob("cams/[!.]*_cam.txt"))}
+    if not files:
+        return None
+    images = first_images(folder, "blended_images", "images")
+    images = {name: file for name, file in images.items() if not file.stem.endswith("_masked")}
+    pairs, _ = paired([*files], [*images])
+    if lost := [name for name in images if name not in pairs.values()]:
+        raise BadInput(f"{images[lost[0]]} has no camera: there is no cams/{Path(lost[0]).stem}_cam.txt")
+    masks, how = masks_of(folder, images)
+    frames = [_mvs_frame(files[name], images[image], masks.get(image)) for name, image in pairs.items()]
+    missing = [name for name in files if name not in pairs]
+    notes = (*how, *without_image(missing))
+    return Layout("BlendedMVS", tuple(frames), None, notes, missing=missing[0] if missing else "")
+
+
+def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
+    words = file.read_text().split()
+    if len(words) < 29 or words[0] != "extrinsic" or words[17] != "intrinsic":
+        raise BadInput(f"{file} must have `extrinsic`, 16 numbers, `intrinsic`, 9 numbers and depths: copy it again")
+    extrinsics, intrinsics = (np.array(some, dtype=np.float64) for some in (words[1:17], words[18:27]))
+    near, step, *rest = map(float, words[27:])
+    far = rest[1] if len(rest) > 1 else near + step * (rest[0] if rest else 192)
+    return Frame(image, intrinsics.reshape(3, 3), extrinsics.reshape(4, 4), mask, span=(near, far))
+
+
+FOCAL, SENSOR, FARTHEST = 35.0, 32.0, 1.75  # of Choy's camera in Blender: millimetres; the unit of its distances
+
+
+def choy(folder: Path) -> Layout | None:
+    """Choy's renderings: a line for each image: azimuth, elevation, roll, distance, field of view."""
+    files = [file for name in (".", "rendering") if (file := folder / name / "rendering_metadata.txt").is_file()]
+    if not files:
+        return None
+    rows = np.loadtxt(files[0], ndmin=2)
+    if rows.shape[1] < 4 or rows[:, 2].any():
+        raise BadInput(f"{files[0]} must have azimuth, elevation, a roll of 0, and distance in each line")
+    images = images_in(files[0].parent)
+
+    def frame(i: int, name: str) -> Frame:
+        width, height = image_size(images[name])
+        focal = FOCAL / SENSOR * width
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        return Frame(images[name], intrinsics, _from_angles(*rows[i, :2], rows[i, 3] * FARTHEST), None)
+
+    frames, rival, notes = made(by_order([*images], len(rows), files[0].name), len(rows), frame)
+    return Layout("Choy", frames, None, notes, rival=rival, missing="*.png")
+
+
+def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, "4 4"]:
+    """world_to_camera of a camera that looks at the origin, z up; angles in degrees, azimuth from x to -y."""
+    across, up = radians(-azimuth), radians(elevation)
+    back = np.array([cos(up) * cos(across), cos(up) * sin(across), sin(up)])
+    right = np.array([-sin(across), cos(across), 0.0])
+    rotation = np.stack([right, np.cross(back, right), back])
+    return OPENGL @ motion(rotation, np.array([0, 0, -distance]))
