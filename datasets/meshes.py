@@ -1,7 +1,6 @@
 """Finds, reads and checks the user's mesh files, and makes them closed solids by `repair`."""
 
 import difflib
-import re
 import struct
 import warnings
 from collections.abc import Callable
@@ -13,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from datasets.mesh import Mesh
+from datasets.readers.ply import read_ply
+from datasets.readers.text import read_obj, read_off
 from datasets.repair import repair
 from renderers.checks import BadInput
 
@@ -22,6 +23,14 @@ READ_ERRORS = (  # what trimesh raises on broken files; it has no exception of i
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError,
     RuntimeError, TypeError, ValueError, struct.error,
 )  # fmt: skip
+READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply}  # other formats by trimesh
+MISTAKEN = {  # how other files begin: what they are, and the remedy
+    b"\x00\x05\x16\x07": ("a Mac's notes on a file, whose names begin with '._'", "take the file without '._'"),
+    b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull'"),
+    b"\x1f\x8b": ("a file compressed by gzip", "unpack it"),
+    b"PK\x03\x04": ("a .zip archive", "unpack it"),
+    b"<": ("a web page or XML", "download the file itself"),
+}
 GREY = 0.7  # of parts without colours, beside parts that have some
 
 
@@ -33,7 +42,8 @@ def find_meshes(path: str | Path) -> list[Path]:
     """
     path, known = Path(path), " ".join(SUFFIXES)
     if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+        files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        found = sorted(file for file in files if not file.name.startswith("._"))  # a Mac's notes on files
         if not found:
             raise ValueError(
                 f"a folder must hold mesh files ({known}), found none directly in '{path}'; "
@@ -88,44 +98,18 @@ def read_mesh(path: str | Path) -> Mesh:
         raise BadInput(f"mesh file '{path}': {error}") from None
 
 
-def check_counts(path: Path, vertices: int, faces: int) -> None:
-    """Refuses an .off or a .ply that holds less than its header claims: trimesh reads what is left of a cut file."""
-    suffix = path.suffix.lower()
-    if suffix not in (".off", ".ply"):
-        return
-    header = path.read_bytes().partition(b"end_header")[0].decode("ascii", "replace")
-    if suffix == ".off":
-        claims = [int(number) for number in re.findall(r"\d+", re.sub("#.*", "", header))[:2]]
-    else:
-        found = dict(re.findall(r"element (vertex|face) (\d+)", header))
-        claims = [int(found.get(name, 0)) for name in ("vertex", "face")]
-    if vertices < claims[0] or faces < claims[1]:
-        claimed = f"its header claims {claims[0]} vertices and {claims[1]} faces"
-        what = f"must be a whole {suffix} file, but it is truncated: {claimed}"
-        raise ValueError(f"{what}, and it holds {vertices} and {faces}; export or copy it again")
-
-
 def _read(path: Path) -> Mesh:
-    import trimesh
-
-    if path.stat().st_size == 0:
+    content = path.read_bytes()
+    if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a broken file makes numpy warn; its numbers are checked below
-            scene = trimesh.load_scene(path, process=False)
-            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-            vertices, faces = [np.asarray(part.vertices) for part in parts], [np.asarray(part.faces) for part in parts]
-            colours = [_vertex_colours(part) for part in parts]
-    except READ_ERRORS as error:
-        raise ValueError(
-            f"must be a whole {path.suffix.lower()} file, but reading failed ({type(error).__name__}: "
-            f"{' '.join(str(error).split())[:120]}); export or copy it again"
-        ) from None
-    if not parts:
-        where = "the file is truncated, or holds points or lines"
-        raise ValueError(f"must have faces, found none: {where}; copy it again, or export it as a surface of triangles")
-    check_counts(path, sum(map(len, vertices)), sum(map(len, faces)))
+    for start, (what, remedy) in MISTAKEN.items():
+        if content.lstrip().startswith(start):
+            raise ValueError(f"must hold a mesh, found {what}; {remedy}")
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # a broken file makes numpy warn; its numbers are checked below
+        parts = _parts(path, content)
+    vertices, faces = [np.asarray(part.vertices) for part in parts], [np.asarray(part.faces) for part in parts]
+    colours = [_vertex_colours(part) for part in parts]
     offsets = np.cumsum([0] + [len(part) for part in vertices[:-1]])
     joined = np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=True)])
     mesh = Mesh(np.concatenate(vertices), joined, colours=_painted(vertices, colours))
@@ -135,6 +119,36 @@ def _read(path: Path) -> Mesh:
             "look for a stray vertex, or export it again"
         )
     return mesh
+
+
+def _parts(path: Path, content: bytes) -> list[Any]:
+    """The parts of a file, as trimesh.Trimesh: one or more, all with faces."""
+    import trimesh
+
+    suffix = path.suffix.lower()
+    if suffix in READERS:
+        polygons = READERS[suffix](content)
+        triangles, owner = polygons.triangles()
+        if not len(triangles):
+            raise ValueError(
+                f"must have faces, found none: it holds {len(polygons.vertices)} vertices, as points or lines; "
+                "export it as a surface"
+            )
+        shades = None if polygons.face_colours is None else polygons.face_colours[owner]
+        painted = {"vertex_colors": polygons.vertex_colours, "face_colors": shades}
+        return [trimesh.Trimesh(polygons.vertices, triangles, process=False, **painted)]
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    except READ_ERRORS as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+        raise ValueError(
+            f"must be a whole {suffix} file, but reading failed ({why}); export or copy it again"
+        ) from None
+    if not parts:
+        where = "the file is truncated, or holds points or lines"
+        raise ValueError(f"must have faces, found none: {where}; copy it again, or export it as a surface of triangles")
+    return parts
 
 
 def _painted(

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from datasets.mesh import Mesh, fit_in_sphere, normalise
-from datasets.meshes import READ_ERRORS, check_counts, load_mesh
+from datasets.meshes import load_mesh
+from datasets.readers.ply import read_ply
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
 from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_share
@@ -43,14 +44,10 @@ class Scan:
         Raises:
             BadInput: where the file is cut short, or has no points.
         """
-        import trimesh
-
         try:
-            read = trimesh.load(self.file, process=False)
-            points = np.asarray(getattr(read, "vertices", ()))
-            check_counts(self.file, len(points), len(getattr(read, "faces", ())))
-        except READ_ERRORS as error:
-            raise BadInput(f"scan '{self.file}': must be a whole .ply file ({error}); copy it again") from None
+            points = read_ply(self.file.read_bytes()).vertices
+        except ValueError as error:
+            raise BadInput(f"scan '{self.file}' {error}") from None
         if len(points) < 3 or not np.isfinite(points).all():
             raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
         faces = Delaunay(points[:, :2]).simplices

@@ -167,7 +167,7 @@ ERRORS = (
     (["killed"], "killed has no mesh.ply: the run has no mesh (killed: out of time); name another run"),
     (["nothing.ply"], "error: a mesh file or a folder of them is asked for, found nothing at 'nothing.ply'"),
     (["notes.txt"], "a mesh file must end in one of .obj .ply .stl .off .glb, found 'notes.txt'; export it"),
-    (["broken.ply"], "broken.ply': must be a whole .ply file, but reading failed"),
+    (["broken.ply"], "broken.ply': must be a whole .ply file, but it does not begin with a line 'ply'"),
     (["empty.ply"], "empty.ply': must hold a mesh, found 0 bytes; export or copy it again"),
     (["points.ply"], "points.ply': must have faces, found none: "),
     (["line.ply"], "line.ply': must have an area, found 0 in a box"),

@@ -41,6 +41,7 @@ def sheet(height) -> Mesh:
 def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path):
     for name in ("b.OBJ", "a ü.ply", "notes.txt"):
         (tmp_path / name).write_text("x")
+    (tmp_path / "._b.OBJ").write_bytes(b"\x00\x05\x16\x07")
     (tmp_path / "folder.stl").mkdir()
     assert [path.name for path in find_meshes(tmp_path)] == ["a ü.ply", "b.OBJ"]
     assert find_meshes(str(tmp_path / "b.OBJ")) == [tmp_path / "b.OBJ"]
@@ -105,16 +106,23 @@ BROKEN = {
     "range.obj": ((TRIANGLE + "f 1 2 9\n").encode(), "export or copy it again"),
     "nan.obj": ((TRIANGLE + "v nan 0 0\nf 1 2 4\n").encode(), "NaN"),
     "inf.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "infinite"),
-    "range.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "face index outside the range"),
+    "range.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "vertices, but one uses number 7"),
     "fewer.off": (
         b"# 9 parts\nOFF 3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "claims 3 vertices and 2 faces",
     ),
     "line.obj": (b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must have an area, found 0"),
     "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "must have an area, found 0"),
-    "words.ply": (b"this is\nno mesh\n", "reading failed"),
+    "words.ply": (b"this is\nno mesh\n", "does not begin with a line 'ply'"),
     "words.stl": (b"this is\nno mesh\n", "."),
     "words.glb": (b"this is\nno mesh\n", "reading failed"),
+    "mac.ply": (b"\x00\x05\x16\x07\x00\x02", "found a Mac's notes on a file"),
+    "pointer.glb": (
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+        "found a pointer of Git LFS; run 'git",
+    ),
+    "packed.obj": (b"\x1f\x8b\x08\x00", "found a file compressed by gzip; unpack it"),
+    "page.stl": (b"\n<!DOCTYPE html>\n", "found a web page"),
 }
 
 

@@ -1,0 +1,212 @@
+"""Reads the polygons of .ply files, text or binary, and their triangle strips."""
+
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datasets.readers.polygons import Polygons, shades
+
+CODES = {  # of numpy and of struct
+    "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d",
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
+    "float16": "e", "float32": "f", "float64": "d",
+}  # fmt: skip
+HEADER = re.compile(rb"ply[ \t]*(?:\r?\n(.*?)\nend_header[ \t]*\r?(?:\n|$)|\r(.*?)\rend_header[ \t]*\r)", re.DOTALL)
+FULL = {"B": 255, "H": 65535}  # the brightest colour of a code
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+BANDS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+
+
+@dataclass(frozen=True)
+class Lists:
+    """A column of lists: how long each is, and all their numbers."""
+
+    counts: Int[np.ndarray, " n"]
+    numbers: Int[np.ndarray, " m"]
+
+
+@dataclass(frozen=True)
+class Element:
+    """A table of the file.
+
+    Args:
+        count: of its rows.
+        codes: of each column that of its numbers, and that of its lists' lengths or "".
+        columns: filled when the body is read.
+    """
+
+    name: str
+    count: int
+    codes: dict[str, tuple[str, str]] = field(default_factory=dict)
+    columns: dict[str, Any] = field(default_factory=dict)
+
+    def put(self, name: str, numbers: np.ndarray, counts: Any) -> None:
+        """Fills a column; `counts` are the lengths of its lists, if it has some."""
+        code = self.codes[name][0]
+        self.columns[name] = numbers.astype(code) if counts is None else _lists(counts, numbers)
+
+    @property
+    def colours(self) -> Float[np.ndarray, "n 3"] | None:
+        """RGB of each row, from 0 to 1."""
+        for names in BANDS:
+            if all(name in self.columns for name in names):
+                rgb = np.stack([np.asarray(self.columns[name], dtype=np.float64) for name in names], axis=1)
+                return shades(rgb, FULL.get(self.codes[names[0]][0]))
+        return None
+
+
+@dataclass(frozen=True)
+class Body:
+    """What follows the header, as bytes; the numbers of a text are doubles."""
+
+    content: bytes
+    order: str
+    text: bool
+
+    def code(self, code: str) -> str:
+        """The code of a number as it is stored."""
+        return "<d" if self.text else self.order + code
+
+    def take(self, code: str, size: int, at: int) -> tuple[tuple, int]:
+        """So many numbers from a place on, and the place after them."""
+        order, stored = self.code(code)
+        layout = f"{order}{size}{stored}"
+        return struct.unpack_from(layout, self.content, at), at + struct.calcsize(layout)
+
+
+def read_ply(content: bytes) -> Polygons:
+    """The polygons of a .ply file, or the triangles of its strips, with their colours.
+
+    Raises:
+        ValueError: where its header is not understood, or what follows is less or more than the header describes.
+    """
+    elements, body = _header(content.removeprefix(b"\xef\xbb\xbf"))
+    at = 0
+    for element in elements.values():
+        try:
+            at = _fill(element, body, at)
+        except (struct.error, ValueError, MemoryError, OverflowError):
+            raise ValueError(
+                f"must be a whole .ply file, but it is truncated or damaged: it ends within the {element.count} rows "
+                f"of '{element.name}' that its header claims; export or copy it again"
+            ) from None
+    if more := len(body.content[at:].strip(b"\0\r\n\t ")):
+        raise ValueError(
+            f"must end where its header says, found {more} bytes more; copy it again, as a binary file, or export it"
+        )
+    return _polygons(elements)
+
+
+def _header(content: bytes) -> tuple[dict[str, Element], Body]:
+    match = HEADER.match(content)
+    if match is None:
+        begins = content.startswith(b"ply")
+        why = "its header has no line 'end_header'" if begins else "it does not begin with a line 'ply'"
+        raise ValueError(f"must be a whole .ply file, but {why}; export or copy it again")
+    elements, kind, element = {}, "", Element("", 0)
+    for line in (match[1] or match[2]).decode("ascii", "replace").splitlines():
+        match line.split():
+            case ["format", word, _] if word in ORDERS:
+                kind = word
+            case ["element", name, count] if count.isdigit():
+                element = elements[name] = Element(name, int(count))
+            case ["property", "list", length, code, name] if {length, code} <= {*CODES} and name not in element.codes:
+                element.codes[name] = CODES[code], CODES[length]
+            case ["property", code, name] if code in CODES and name not in element.codes:
+                element.codes[name] = CODES[code], ""
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"must have a header that is understood, found '{line[:60]}'; export it again")
+    if not kind:
+        raise ValueError("must name its format in the header, as 'format ascii 1.0'; export it again")
+    rest = content[match.end() :]
+    return elements, Body(_doubles(rest) if kind == "ascii" else rest, ORDERS[kind], kind == "ascii")
+
+
+def _doubles(text: bytes) -> bytes:
+    try:
+        return np.array(text.split(), dtype="<f8").tobytes()
+    except ValueError as error:
+        raise ValueError(f"must hold numbers after its header ({error}); export it again") from None
+
+
+def _fill(element: Element, body: Body, at: int) -> int:
+    """Reads an element's columns from a place on; gives the place after them."""
+    fields: list[tuple] = []
+    for name, (code, length) in element.codes.items() if element.count else ():
+        if length:  # as in the first row, perhaps
+            (size,), _ = body.take(length, 1, at + np.dtype(fields).itemsize)
+            fields += [(f"{name} count", body.code(length)), (name, body.code(code), (int(size),))]
+        else:
+            fields.append((name, body.code(code)))
+    row = np.dtype(fields)
+    if not element.count or at + element.count * row.itemsize > len(body.content):
+        return _fill_by_rows(element, body, at)
+    rows = np.frombuffer(body.content, row, element.count, at)
+    lists = {name: rows[f"{name} count"] for name, (_, length) in element.codes.items() if length}
+    if any((counts != counts[0]).any() for counts in lists.values()):
+        return _fill_by_rows(element, body, at)
+    for name in element.codes:
+        element.put(name, rows[name].ravel(), lists.get(name))
+    return at + rows.nbytes
+
+
+def _fill_by_rows(element: Element, body: Body, at: int) -> int:
+    """The same for lists of several lengths."""
+    columns: dict[str, list] = {name: [] for name in element.codes}
+    counts: dict[str, list] = {name: [] for name, (_, length) in element.codes.items() if length}
+    for _ in range(element.count):
+        for name, (code, length) in element.codes.items():
+            size = 1
+            if length:
+                (size,), at = body.take(length, 1, at)
+                counts[name].append(size := int(size))
+            numbers, at = body.take(code, size, at)
+            columns[name] += numbers
+    for name, numbers in columns.items():
+        element.put(name, np.array(numbers), counts.get(name))
+    return at
+
+
+def _lists(counts: Any, numbers: Any) -> Lists:
+    return Lists(np.asarray(counts).astype(np.int64), np.asarray(numbers).astype(np.int64))
+
+
+def _polygons(elements: dict[str, Element]) -> Polygons:
+    vertex, face = elements.get("vertex"), elements.get("face", Element("face", 0))
+    if vertex is None or not {"x", "y", "z"} <= {*vertex.columns}:
+        raise ValueError("must have an element 'vertex' with x, y and z; export it again")
+    vertices = np.stack([np.asarray(vertex.columns[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    faces, strips = _indices(face), _indices(elements.get("tristrips", Element("tristrips", 0)))
+    cut = _cut(strips)
+    counts = np.concatenate([faces.counts, np.full(len(cut), 3)])
+    shade = None if len(cut) else face.colours
+    return Polygons(vertices, counts, np.concatenate([faces.numbers, cut.ravel()]), vertex.colours, shade)
+
+
+def _indices(element: Element) -> Lists:
+    """The vertices that each row of an element names."""
+    for name, column in element.columns.items():
+        if name.startswith("vertex_ind") and isinstance(column, Lists):
+            return column
+    if element.count:
+        found = ", ".join(element.codes) or "nothing"
+        raise ValueError(f"must have lists vertex_indices in its '{element.name}', found {found}; export it again")
+    return _lists([], [])
+
+
+def _cut(strips: Lists) -> Int[np.ndarray, "t 3"]:
+    """The triangles of strips, every second one turned; -1 begins a strip anew within a row."""
+    numbers = np.insert(strips.numbers, np.cumsum(strips.counts), -1)
+    place = np.arange(len(numbers))
+    begin = np.maximum.accumulate(np.where(numbers < 0, place + 1, 0))
+    three = np.stack([numbers, np.roll(numbers, -1), np.roll(numbers, -2)], axis=1)  # the last is -1
+    turned = (place - begin)[:, None] % 2 == 1
+    triangles = np.where(turned, three[:, [1, 0, 2]], three)
+    distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return triangles[(three >= 0).all(axis=1) & distinct]

@@ -1,0 +1,236 @@
+"""What .obj, .off and .ply files hold, in every way to write it: prisms over random polygons, of known volume."""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from datasets.mesh import Mesh
+from datasets.readers.ply import read_ply
+from datasets.readers.polygons import Polygons, ears
+from datasets.readers.text import read_obj, read_off
+from tests.looped import each
+
+FEW = settings(max_examples=30, deadline=None)
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed solid of polygons that wind outward."""
+
+    vertices: np.ndarray
+    polygons: list[list[int]]
+    volume: float
+    area: float
+
+
+def star(draw: np.random.Generator) -> np.ndarray:
+    """A polygon about the origin, most often concave."""
+    count = draw.integers(4, 13)
+    angles = 2 * np.pi * (np.arange(count) + 0.8 * draw.random(count)) / count
+    return draw.uniform(0.2, 1, (count, 1)) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def comb(draw: np.random.Generator) -> np.ndarray:
+    """A comb: no point sees all of it."""
+    teeth = draw.integers(2, 6)
+    x, y = np.arange(2 * teeth), np.full(2 * teeth, 0.2)
+    upper = np.stack([np.repeat(x, 2)[1:-1], np.tile([1, 1, 0.2, 0.2], teeth)[: 4 * teeth - 2]], axis=1)
+    return np.concatenate([[(x[-1], -y[0]), (x[-1], y[0])][:1], upper[::-1], [(0, -y[0])]])
+
+
+def with_flat_corners(polygon: np.ndarray, draw: np.random.Generator) -> np.ndarray:
+    """Some edges get one to three more corners."""
+    points = []
+    for first, second in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        shares = np.sort(draw.random(draw.integers(0, 4)))[:, None]
+        points += [first[None], first + shares * (second - first)]
+    return np.concatenate(points)
+
+
+def prism(seed: int) -> Solid:
+    """A prism over a random polygon that begins at any corner, turned in space. Its polygons are in any order."""
+    draw = np.random.default_rng(seed)
+    polygon = (star, comb)[draw.integers(2)](draw)
+    polygon = with_flat_corners(polygon, draw) if draw.integers(2) else polygon
+    count, height = len(polygon), draw.uniform(0.3, 2)
+    ring, after = np.arange(count), np.roll(np.arange(count), -1)
+    x, y = polygon.T
+    base = (x * y[after] - y * x[after]).sum() / 2
+    assert base > 0
+    sides = np.stack([ring, after, after + count, ring + count], axis=1).tolist()
+    caps = [np.roll(ring[::-1], draw.integers(count)).tolist(), np.roll(ring + count, draw.integers(count)).tolist()]
+    flat = np.concatenate([np.c_[polygon, np.zeros(count)], np.c_[polygon, np.full(count, height)]])
+    vertices = Rotation.random(rng=draw).apply(flat) + draw.uniform(-3, 3, 3)
+    around = np.linalg.norm(polygon[after] - polygon, axis=1).sum()
+    polygons = sides + caps
+    order = draw.permutation(len(polygons))
+    return Solid(vertices, [polygons[i] for i in order], base * height, 2 * base + around * height)
+
+
+def check(read: Polygons, solid: Solid) -> None:
+    """What was read is the solid: closed, with its volume and its area, which folded triangles would exceed."""
+    mesh = Mesh(read.vertices, read.triangles()[0])
+    assert mesh.watertight
+    assert mesh.volume == pytest.approx(solid.volume, rel=1e-9)
+    assert mesh.area == pytest.approx(solid.area, rel=1e-9)
+    assert len(mesh.faces) == sum(len(polygon) - 2 for polygon in solid.polygons)
+
+
+def obj_text(solids: list[Solid], draw: np.random.Generator) -> str:
+    """The solids one after the other, in one of the ways to write an .obj file."""
+    gap, indent = draw.choice([" ", "\t", "  "]), draw.choice(["", " ", "\t"])
+    corner = draw.choice(["{0}", "{0}/{0}", "{0}//{0}", "{0}/{0}/{0}"])
+    relative, joint = draw.integers(2), draw.choice([gap, f"{gap}\\\n"])
+    lines, before = ["# C:\\made\\"], 0
+    for solid in solids:
+        count = len(solid.vertices)
+        lines += [f"o part # {count}", *("v " + " ".join(map(repr, map(float, v))) for v in solid.vertices)]
+        lines += [f"vt {v[0]} {v[1]}" for v in solid.vertices] + [f"vn {v[0]} {v[1]} {v[2]}" for v in solid.vertices]
+        first = -count if relative else before + 1
+        for polygon in solid.polygons:
+            lines.append("f " + joint.join(corner.format(first + i) for i in polygon))
+        before += count
+    text = "\n".join(indent + line.replace(" ", gap) for line in lines) + draw.choice(["", "\n", "  # end\n"])
+    return draw.choice(["", "\ufeff"]) + text.replace("\n", draw.choice(["\n", "\r\n", "\r"]))
+
+
+def off_text(solid: Solid, draw: np.random.Generator) -> str:
+    """The solid in one of the ways to write an .off file."""
+    letters = draw.choice(["", "C", "N", "CN", "ST"])
+    more = " 0 0 1" * ("N" in letters) + " 255 0 0 255" * ("C" in letters) + " 0.5 0.5" * ("T" in letters)
+    numbers = f"{len(solid.vertices)} {len(solid.polygons)} 0"
+    lines = [f"{letters}OFF" + draw.choice(["", " ", "\n", " # comment\n", "\n# comment\n\n"]) + numbers]
+    lines += [" ".join(map(repr, map(float, v))) + more for v in solid.vertices]
+    paint = draw.choice(["", " 255 0 0", " 0.1 0.2 0.3 1", " # face"])
+    if not letters and draw.integers(2):
+        lines = [lines[0] + "\n" + " ".join(lines[1:])]  # all vertices in one line
+        paint = ""
+    lines += [f"{len(polygon)} " + " ".join(map(str, polygon)) + paint for polygon in solid.polygons]
+    return draw.choice(["", "\ufeff"]) + ("\n".join(lines) + "\n").replace("\n", draw.choice(["\n", "\r\n"]))
+
+
+def ply_bytes(solid: Solid, draw: np.random.Generator) -> bytes:
+    """The solid in one of the ways to write a .ply file, with elements and properties that nobody asks for."""
+    kind, end = draw.choice(["ascii", "binary_little_endian", "binary_big_endian"]), draw.choice(["\n", "\r\n"])
+    name, lengths = draw.choice(["vertex_index", "vertex_indices"]), draw.choice(["uchar", "int"])
+    extra = draw.integers(2)
+    header = ["ply", f"format {kind} 1.0", "comment made", *(["element camera 1", "property float view"] * extra)]
+    header += [f"element vertex {len(solid.vertices)}", *(f"property double {axis}" for axis in "xyz")]
+    header += ["property float nx"] * extra + [f"element face {len(solid.polygons)}"]
+    header += ["property uchar flags", "property list uchar float texcoord"] * extra
+    header += [f"property list {lengths} int {name}", "end_header", ""]
+    rows = [("f", [0.5])] * extra
+    for vertex in solid.vertices:
+        rows += [("ddd", vertex)] + [("f", [1.0])] * extra
+    for polygon in solid.polygons:
+        rows += [("B", [3]), ("Bff", [2, 0.5, 0.5])] * extra
+        rows.append(({"uchar": "B", "int": "i"}[lengths] + "i" * len(polygon), [len(polygon), *polygon]))
+    order = ">" if "big" in kind else "<"
+    if kind == "ascii":
+        body = end.join(" ".join(repr(x) for x in map(float, row)) for _, row in rows).replace(".0 ", " ").encode()
+    else:
+        body = b"".join(struct.pack(order + code, *row) for code, row in rows)
+    return end.join(header).encode() + body
+
+
+@FEW
+@given(seed=SEEDS)
+def test_polygons_are_filled_as_they_are_and_no_corner_is_lost(seed):
+    draw = np.random.default_rng(seed)
+    polygon = with_flat_corners((star, comb)[seed % 2](draw), draw)
+    corners = polygon[ears(polygon)]
+    (ax, ay), (bx, by) = np.moveaxis(corners[:, 1:] - corners[:, :1], 0, -1).transpose(1, 0, 2)
+    areas, (x, y) = (ax * by - ay * bx) / 2, polygon.T
+    assert (areas > 0).all() and areas.sum() == pytest.approx((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+    assert {*ears(polygon).ravel().tolist()} == {*range(len(polygon))}
+
+
+@FEW
+@given(seed=SEEDS)
+def test_an_obj_is_read_however_it_is_written(seed):
+    draw = np.random.default_rng(seed)
+    first, second = prism(seed), prism(seed + 1)
+    shift = len(first.vertices)
+    both = Solid(
+        np.concatenate([first.vertices, second.vertices]),
+        first.polygons + [[i + shift for i in polygon] for polygon in second.polygons],
+        first.volume + second.volume,
+        first.area + second.area,
+    )
+    check(read_obj(obj_text([first, second], draw).encode()), both)
+
+
+@FEW
+@given(seed=SEEDS)
+def test_an_off_is_read_however_it_is_written(seed):
+    check(read_off(off_text(prism(seed), np.random.default_rng(seed)).encode()), prism(seed))
+
+
+@FEW
+@given(seed=SEEDS)
+def test_a_ply_is_read_however_it_is_written(seed):
+    check(read_ply(ply_bytes(prism(seed), np.random.default_rng(seed))), prism(seed))
+
+
+PLACES = "0 0 0", "1 0 0", "0 1 0", "0 0 1"
+FACES = "0 2 1", "0 1 3", "1 2 3", "0 3 2"
+V, F = "".join(f"v {place}\n" for place in PLACES), "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+ROWS = "\n".join([*PLACES, *(f"3 {face}" for face in FACES)])
+HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+STRIPS = f"{HEAD}element tristrips 1\nproperty list int int vertex_indices\nend_header\n" + "\n".join(PLACES)
+TETRAHEDRA = {
+    "faces before their vertices": (read_obj, F + V),
+    "relative after half of the vertices": (read_obj, V[:16] + "f 1 3 -1\n" + V[16:] + F[8:]),
+    "a folder's name that ends in a backslash": (read_obj, "mtllib C:\\made\\\n" + V + F),
+    "lines and points beside": (read_obj, V + F + "l 1 2\np 3\nf 1 2\n"),
+    "weights": (read_obj, V.replace("\n", " 1.0\n") + F),
+    "utf-16": (read_obj, (V + F).encode("utf-16")),
+    "a glued header": (read_off, "OFF4 4 6\n" + ROWS),
+    "a comment that names OFF": (read_off, "# an OFF file\nOFF\n4 4 0\n" + ROWS),
+    "two counts": (read_off, "off\n4 4\n" + ROWS),
+    "no header": (read_off, "4 4 6\n" + ROWS),
+    "one line": (read_off, " ".join(f"OFF 4 4 6 {ROWS}".split())),
+    "a strip": (read_ply, STRIPS + "\n6 0 2 1 3 0 2\n"),
+    "strips that begin anew": (read_ply, STRIPS + "\n13 0 2 1 -1 1 2 3 3 -1 1 3 0 2\n"),
+}
+
+
+@each("name", TETRAHEDRA)
+def test_a_tetrahedron_is_read_in_unusual_spellings(name):
+    reader, content = TETRAHEDRA[name]
+    read = reader(content if isinstance(content, bytes) else content.encode())
+    mesh = Mesh(read.vertices, read.triangles()[0])
+    assert mesh.watertight and mesh.volume == pytest.approx(1 / 6)
+
+
+REFUSED = {
+    "comma": (read_obj, "v 0,5 0 0\n", r"'v x y z', found 'v 0,5 0 0'"),
+    "zero": (read_obj, V + "f 0 1 2\n", "found 'f 0 1 2'"),
+    "too far back": (read_obj, V + "f -5 1 2\n", "from -4 to -1, found 'f -5 1 2'"),
+    "beyond": (read_obj, V + "f 1 2 5\n", "4 vertices, but one uses number 4, counted from 0"),
+    "free form": (read_obj, V + F + "surf 0 1 0 1 1 2 3 4\n", "has a free-form surface"),
+    "four dimensions": (read_off, "4OFF\n4 4 6\n" + ROWS, "must be text and begin with OFF.*found '4OFF'"),
+    "binary": (read_off, "OFF BINARY\n\0\0", "must be text .*found 'OFF BINARY'"),
+    "fewer": (read_off, "OFF4 5 6\n" + ROWS, "truncated.* claims 4 vertices and 5 faces, and it holds 4 and 4"),
+    "fewer, with colours": (read_off, "OFF4 9 6\n" + ROWS.replace("\n3", " 1 0 0\n3"), "and it holds 4 and 4"),
+    "more": (read_off, "OFF4 3 6\n" + ROWS, "claims 4 vertices and 3 faces, and it holds 4 and 4"),
+    "words": (read_off, "OFF\n4 4 6\n" + ROWS.replace("3 0 2 1", "3 0 two 1"), "'two'"),
+    "no list": (read_ply, f"{HEAD}element face 1\nproperty int a\nend_header\n" + "0 " * 13, "found a;"),
+    "rows cut short": (read_ply, STRIPS, "ends within the 1 rows of 'tristrips'"),
+    "a longer body": (read_ply, STRIPS + "\n3 0 1 2 7\n", "must end where its header says"),
+    "no end of the header": (read_ply, HEAD, "its header has no line 'end_header'"),
+    "an unknown type": (read_ply, HEAD.replace("float x", "real x") + "end_header\n", "found 'property real x'"),
+}
+
+
+@each("name", REFUSED)
+def test_what_is_not_understood_is_named(name):
+    reader, content, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        reader(content.encode())
