@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 
 from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
@@ -66,9 +67,22 @@ def _tidy(mesh: Mesh) -> Mesh:
     parts = replace(mesh, faces=faces).parts
     double_sided = first[~np.isin(parts[first], parts[keep])]
     kept = np.sort(np.concatenate([keep, double_sided]))
-    if len(kept) == len(faces):
-        return replace(mesh, faces=faces)
-    return with_note(replace(mesh, faces=faces[kept]), f"{_count(len(faces) - len(kept), 'doubled face')} dropped")
+    tidy = replace(mesh, faces=faces[kept])
+    copies, of_copies = _copies(replace(mesh, faces=faces[first]), np.abs(net) - 1)
+    if copies:
+        tidy = with_note(tidy, f"{_count(copies, 'part')} with the same faces as another dropped")
+    left = len(faces) - len(kept) - of_copies
+    return with_note(tidy, f"{_count(left, 'doubled face')} dropped") if left else tidy
+
+
+def _copies(mesh: Mesh, again: Int[np.ndarray, " f"]) -> tuple[int, int]:
+    """How many closed parts are there once more, and the faces of these; `again` is how often each face is."""
+    if not (again > 0).any():
+        return 0, 0
+    twice, again = replace(mesh, faces=mesh.faces[again > 0]), again[again > 0]
+    closed = ~np.isin(twice.parts, twice.parts[twice.open_faces])
+    copies = sum(again[twice.parts == part].min() for part in np.unique(twice.parts[closed]))
+    return int(copies), int(again[closed].sum())
 
 
 def _close(mesh: Mesh) -> Mesh:

@@ -93,7 +93,10 @@ def _in_plane(places: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 2"]:
 
 
 def ears(points: Float[np.ndarray, "c 2"]) -> Int[np.ndarray, "t 3"]:
-    """The triangles of a simple polygon that winds anticlockwise: corners of which nothing is behind are cut off."""
+    """The triangles of a simple polygon that winds anticlockwise: corners of which nothing is behind are cut off.
+
+    None is flat, also beside corners on a straight edge. mapbox_earcut leaves flat ones there.
+    """
     left, found = list(range(len(points))), []
     while len(left) > 3:
         place = _ear(points[left])

@@ -170,6 +170,16 @@ REPAIRED = {  # a mesh, its volume then, and the notes, without a warning
         1,
         ("12 doubled faces dropped",),
     ),
+    "a part twice": (
+        joined(box(), box(at=(2, 0, 0)), box()),
+        2,
+        ("1 part with the same faces as another dropped",),
+    ),
+    "a part thrice, and one that touches it": (
+        joined(box(), box(), box(), box(at=(1, 0, 0))),
+        2,
+        ("2 parts with the same faces as another dropped",),
+    ),
     "apart": (joined(box(), box(at=(2, 0, 0))), 2, ()),
     "overlapping": (joined(box(), box(at=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
     "nested": (joined(box(), box(size=0.4)), 1, ("2 overlapping parts merged into 1",)),
