@@ -6,16 +6,16 @@
     python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
     python -m bench.suite set=pose,complete                     some sets of problems
     python -m bench.suite plan=true                             what would run, and for how long
-    python -m bench.suite verify=3                              three of the results again: which agree
+    python -m bench.suite verify=3                              three of the results, drawn anew: which agree
 
 Any other KEY=VALUE is that of `python -m bench`.
 """
 
+import random
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from hashlib import sha256
 from math import log
 from pathlib import Path
 
@@ -42,7 +42,7 @@ from bench.tables import nearest
 
 PAGE = "suite"  # its name in the folder `paper`
 GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
-AGREE = 0.05  # of an error's logarithm and of a cost: what rounding on another processor may change
+AGREE = 0.05  # of the logarithms of a curve's errors and costs: what rounding on another processor may change
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -76,7 +76,9 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "verify"):
             own[key] = value
-        elif key.lstrip("+~").partition(".")[0] in STATED and key not in [given for given, _ in GIVEN.values()]:
+        elif key.lstrip("+~").partition(".")[0] in (*STATED, "sizes") and key not in [
+            given for given, _ in GIVEN.values()
+        ]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
         elif "=" in argument:
             passed.append(argument)
@@ -127,7 +129,7 @@ def show(results_dir: Path) -> int:
 
 
 def verify(results_dir: Path, count: int) -> int:
-    """Runs some of the kept attempts again, the same ones each time, and says which agree; 1 where one does not.
+    """Runs some of the kept attempts again, drawn anew each time, and says which agree; 1 where one does not.
 
     Raises:
         ValueError: where there is none.
@@ -136,8 +138,7 @@ def verify(results_dir: Path, count: int) -> int:
     found = [one for one in kept if one.ok]
     if not found:
         raise ValueError(f"{place(results_dir)} has no results that ended ok: type python -m bench.suite")
-    chosen = sorted(found, key=lambda one: sha256(repr(one.key).encode()).digest())[:count]
-    agree = [_agrees(one) for one in chosen]
+    agree = [_agrees(one) for one in random.sample(found, min(count, len(found)))]
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
     return 0 if all(agree) and not problems else 1
@@ -154,9 +155,15 @@ def _agrees(attempt: Attempt) -> bool:
     if not again:
         print(f"not run again: {name}: {' '.join(said.stderr.split())[-300:]}")
         return False
-    pairs = [(attempt.final, again[0].final), (attempt.cost, again[0].cost)]
-    same = again[0].ok and all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
-    told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
+    points, found = (
+        [number for cost, _, error in one.curve for number in (cost, error)] for one in (attempt, again[0])
+    )
+    pairs = zip(points, found, strict=False)
+    same = again[0].ok and len(points) == len(found)
+    same &= all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
+    told = ", ".join(
+        f"{number(a)} and {number(b)}" for a, b in [(attempt.final, again[0].final), (attempt.cost, again[0].cost)]
+    )
     ended = "" if again[0].ok else f"; {again[0].status}: {again[0].reason}"
     print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}{ended}")
     return same

@@ -13,7 +13,6 @@ from bench import merge
 from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
-from bench.studies import suite as page
 from bench.suite import main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
@@ -56,9 +55,8 @@ def write_completion(results: Path, errors: list[float], **changed) -> Path:
         **changed.pop("settings", {}),
     }
     changed = {"metrics": {"chamfer_l1": errors[-1]}, "metrics_start": {"chamfer_l1": errors[0]}} | changed
-    folder = write_run(
-        results, "core_complete", None, overrides=["task.points=20", "results_dir=x"], settings=settings, **changed
-    )
+    changed = {"overrides": ["task.points=20", "results_dir=x"]} | changed
+    folder = write_run(results, "core_complete", None, settings=settings, **changed)
     lines = [
         {"iteration": n, "seconds": n + 1.0, "cost": 1000.0 * (n + 1), "total": 1.0, "chamfer_l1": error}
         for n, error in enumerate(errors[:-1])
@@ -84,17 +82,36 @@ def test_a_rendering_has_its_cost_and_its_pixel_errors(tmp_path):
     write_run(tmp_path, "core_render", None, seconds={"forward": 0.25, "backward": 1.0}, **known)
     (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
     assert (found.problem, found.start, found.curve) == ("car train 0, 64 pixels", 900, [[512, 0.25, 3]])
-    reached = Standing([found]).reached[found.key]
-    assert [cost for cost, _ in reached] == [512, 512, inf, inf, inf]  # of 30, 5.5, 2.0, 1.4 and 1.1 pixels
+    failed = replace(found, problem="another", status="timeout", final=inf)
+    assert Standing([found]).wrong("Mine") == 3 / 900 and Standing([found]).judged == []
+    assert Standing([found, failed]).wrong("Mine") == pytest.approx((3 / 900 + 1) / 2)
 
 
-def test_other_tables_are_asked_for_a_renderer_or_what_it_is_a_variant_of(monkeypatch):
-    monkeypatch.setattr("bench.report.write.paper.SHIPPED", RESULTS)
-    known = {preset: page._beside(preset) for preset in ("dvr_64_early_stop", "dvr", "naive", "neus", "neus_budget")}
-    assert known["dvr_64_early_stop"] == known["dvr"] and None not in known["dvr"].values()
-    assert known["neus"]["hard"] == known["neus_budget"]["hard"] and known["neus"] != known["neus_budget"]
-    assert known["naive"]["hard"] is not None  # of a variant alone
-    assert page._beside("custom") == {"outline": None, "hard": None}
+def test_rows_are_compared_where_all_that_have_the_least_size_have_an_attempt(monkeypatch):
+    least = [("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]]
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: {*least})
+    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)]).everything
+    mine = [one for one in whole if one.row not in ("Mine", "Part") or one.key[:3] in least]
+    standing = Standing([one for one in mine if one.row != "Part" or one.scene == SCENES[0]])
+    assert standing.compared == {*least} and standing.ranks.keys() == {"B", "Dist", "Mine"}
+    assert standing.lacking("Part") == 5 and standing.rows[-1] == "Part"
+    assert len(Standing([one for one in standing.everything if one.row in ("B", "Dist")]).compared) == len(SCENES)
+
+
+def test_each_set_weighs_the_same_and_a_run_under_other_settings_is_not_judged():
+    many = [attempt("Dist", scene, {0: 1.0, 10: 0.01}) for scene in SCENES]
+    few = [replace(attempt("Dist", "s", {0: 90.0, 10: 90.0}), set="pose", problem="s, 20 degrees")]
+    assert Standing(many + few).share("Dist").value == 0.5
+    assert Standing(many + few).profile("Dist") == ([1, 1, 1], [0, 0.5, 0.5])
+    other = replace(many[0], row="Other", settings="x")
+    assert Standing([*many, other]).rows == ["Dist"]
+
+
+def test_the_chance_of_a_difference_is_that_of_flipped_signs_over_scenes():
+    standing = field([("Dist", 0.01, 100.0), ("Lost", 0.5, 1.0)])
+    assert standing._chance("Dist", "Lost") == 2 / 2 ** len(SCENES)  # all scenes one way, or all the other way
+    assert standing._chance("Dist", "Dist") == 1 and standing.told == {"Lost"}
+    assert field([("Dist", 0.01, 100.0), *((f"L{n}", 0.5, 1.0) for n in range(7))]).told == set()  # Holm: 7 x .0078
 
 
 def test_an_error_is_reached_where_it_stays_reached():
@@ -119,15 +136,26 @@ def test_the_shipped_references_are_used_where_there_are_any():
     assert all(0 < error < 0.1 for error in known.values())
 
 
-def test_rows_stand_by_what_they_reach_and_share_a_rank_where_they_cannot_be_told_apart():
+def test_rows_stand_by_what_they_reach_and_have_a_rank_where_they_are_told_from_the_first():
     standing = field([("Dist", 0.011, 100.0), ("Exact", 0.01, 300.0), ("Same", 0.011, 100.0), ("Lost", 0.5, 1.0)])
     assert standing.rows == ["Exact", "Dist", "Same", "Lost"]
     assert [standing.share(row).value for row in standing.rows] == [1.0, 0.8, 0.8, 0.0]
-    assert standing.ranks == {"Exact": 1, "Dist": 2, "Same": 2, "Lost": 4}
+    assert standing.ranks == {"Exact": 1, "Dist": 2, "Same": 3, "Lost": 4} and standing.told == {"Dist", "Same", "Lost"}
     assert standing.ratio("Exact").value == pytest.approx(3) and standing.ratio("Dist") is None
     assert standing.ratio("Lost") is None  # no target that both reach
-    assert standing.units == {"complete": 200}  # of a whole run of Dist
+    assert {*standing.units.values()} == {200}  # of a whole run of Dist
     assert standing.profile("Exact") == ([1.5, 1.5, 3, 3], [0, 0.2, 1, 1])
+
+
+def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another_name(tmp_path):
+    asked = {"overrides": ["+experiment=core_complete", "renderer=newton", "renderer.steps=9", "task.points=20"]}
+    write_completion(tmp_path, [0.8, 0.4, 0.2], **asked)
+    line = '{"iteration": 1, "seconds": 2.0, "cost": 2000.0, "total": NaN, "chamfer_l1": NaN}'
+    curve = next(tmp_path.glob("runs/*/curve.jsonl"))
+    curve.write_text(curve.read_text().splitlines()[0] + "\n" + line + "\n")
+    write_attempts(attempts_of(read_records(tmp_path)[0], tmp_path), tmp_path)
+    ((found,), problems) = read_attempts(tmp_path)
+    assert problems == [] and found.row == "Mine, steps=9" and [error for *_, error in found.curve] == [0.8, inf, 0.2]
 
 
 def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
@@ -170,17 +198,17 @@ def test_seconds_are_compared_on_the_same_machine_alone():
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
     good = attempt("A b", "s", {0: 1.0, 5: 0.5}, reason='said "no", twice', started="2026-01-02T00:00:00+00:00")
-    killed = replace(
+    failed = replace(
         good, status="oom", final=inf, curve=[[0.0, 0.0, 1.0], [5.0, 0.005, inf]], started="2026-01-03T00:00:00+00:00"
     )
     older = replace(good, started="2026-01-01T00:00:00+00:00")
     other = replace(good, row="A-b")  # whose file has the same name
-    for order in permutations([good, killed, older, other]):
-        assert joined(order) == {good.key: good, other.key: other}
-    write_attempts([killed, other], tmp_path)
-    assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(killed), repr(other)}
-    write_attempts([good], tmp_path)
-    assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [good, other]
+    for order in permutations([good, failed, older, other]):
+        assert joined(order) == {good.key: failed, other.key: other}
+    write_attempts([failed, other], tmp_path)
+    assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(failed), repr(other)}
+    write_attempts([latest := replace(good, started="2026-01-04T00:00:00+00:00")], tmp_path)
+    assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [latest, other]
     assert [path.name for path in place(tmp_path).iterdir()] == ["a_b.csv"]
 
 
@@ -199,21 +227,23 @@ def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     assert len(found) == 1 and problems[0].startswith("b.csv")
     with pytest.raises(ValueError, match=r"b\.csv"):  # whose lines would be lost
         write_attempts(found, tmp_path)
-    for wrong in ({"final": -1.0}, {"set": "none"}, {"status": "fine"}):
+    for wrong in ({"final": -1.0}, {"final": 0.4}, {"set": "none"}, {"status": "fine"}):
         write_attempts([replace(found[0], **wrong)], tmp_path / str(wrong))
         assert read_attempts(tmp_path / str(wrong))[0] == []
 
 
 def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, monkeypatch, capsys):
     shipped = tmp_path / "shipped"
-    write_attempts([attempt("Dist", "car test 0", {0: 0.8, 500: 0.011, 600: 0.01})], shipped)
-    monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
     write_completion(tmp_path / "own", [0.8, 0.4, 0.05])
+    (mine,) = attempts_of(read_records(tmp_path / "own")[0], tmp_path / "own")
+    dist = attempt("Dist", "car test 0", {0: 0.8, 500: 0.011, 600: 0.01}, settings=mine.settings)
+    write_attempts([dist], shipped)
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
     assert show(tmp_path / "own") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].split()[:2] == ["1", "Dist"] and "Mine" in said[1] and Path(said[-1]).is_file()
     table = (tmp_path / "own" / "paper" / "suite.md").read_text()
-    assert "| Dist |" in table and "| Mine |" in table and "of problems and targets, the most" in table
+    assert "| Dist |" in table and "| Mine |" in table and "reaches 100 %" in table
     assert [one.row for one in read_attempts(tmp_path / "own")[0]] == ["Mine"]
 
 

@@ -11,7 +11,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from io import StringIO
-from math import inf, isfinite
+from itertools import product
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ GIVEN = {  # the setting in which the problems of a scene differ, and its name
     **{"complete": ("task.points", "{} points"), "pose": ("task.degrees", "{:g} degrees")},
     **{"reconstruct": ("task.images.texture", "{}"), "render": ("task.size", "{} pixels")},
 }
+APART = ("render",)  # sets without a course of error over cost
 STATED = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")  # by a set, for all renderers
 
 
@@ -52,6 +54,22 @@ class Suite:
 def suite() -> Suite:
     """The suite of this version."""
     return Suite(**read_yaml(CONF / "suite.yaml"))
+
+
+@cache
+def problems_of(size: str) -> set[tuple[Any, ...]]:
+    """The set, problem and seed of all cells of a size of the suite."""
+    found: set[tuple[Any, ...]] = set()
+    for name in suite().errors:
+        node = read_yaml(CONF / "experiment" / f"{EXPERIMENT}{name}.yaml")
+        chosen = {key: str(value).split(",") for key, value in node["sizes"][suite().sizes[size]].items()}
+        parts = [chosen.pop(key) for key in ("families", "shapes", "seeds")]
+        text = GIVEN.get(name, ("", ""))[1]
+        for name_of, index, seed, *given in product(*parts, *chosen.values()):
+            named = [text.format(float(one) if one.isdecimal() and ":g" in text else one) for one in given]
+            problem = ", ".join([f"{name_of} {node.get('split', 'test')} {index}", *named])
+            found.add((name, problem, int(seed)))
+    return found
 
 
 @dataclass(frozen=True)
@@ -116,13 +134,14 @@ class Attempt:
 
     def reached(self, error: float) -> tuple[float, float] | None:
         """The cost and the seconds from which on the error stays at or below this one; None where it does not."""
-        found = None
+        found, after = None, None  # after a cost of 0 comes the first step, which shows the error
         if not isfinite(error):
             return None
         for cost, seconds, at in reversed(self.curve if self.ok else []):
             if not at <= error:
                 break
-            found = cost, seconds
+            found = (cost, seconds) if cost or after is None else after
+            after = cost, seconds
         return found
 
 
@@ -132,12 +151,11 @@ def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
 
 
 def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
-    """One attempt of each key: of several the last one that ended ok, or else the last one, in whatever order."""
+    """One attempt of each key: of several the last one, in whatever order."""
     found: dict[tuple[Any, ...], Attempt] = {}
     for attempt in (one for attempts in several for one in attempts):
         other = found.setdefault(attempt.key, attempt)
-        mine, theirs = (attempt.ok, attempt.started), (other.ok, other.started)
-        if mine > theirs or (mine == theirs and repr(attempt) > repr(other)):
+        if (attempt.started, repr(attempt)) > (other.started, repr(other)):
             found[attempt.key] = attempt
     return found
 
@@ -151,16 +169,18 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     scene = f"{family(record)} {config.get('split')} {config.get('index')}"
     given, text = GIVEN.get(of_set, ("", ""))
     named = [text.format(setting(config, *given.split(".")))] if given else []
-    final, start = (as_number(record[part].get(error)) for part in ("metrics", "metrics_start"))
+    final, start = (_finite(record[part].get(error)) for part in ("metrics", "metrics_start"))
     curve = _curve(record, folder, final if ok else None)
+    asked = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
+    changed = [text.removeprefix("renderer.") for text in asked if re.match(r"renderer\.[^_]", text)]
     return Attempt(
         **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
-        row=renderer_name(config, record["renderer"]),  # without the loss of the mask, which is the set's
+        row=", ".join([renderer_name(config, record["renderer"]), *changed]),  # without the loss, which is the set's
         preset=record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
-        start=inf if start is None else start,
-        final=inf if final is None or not ok else final,
+        start=start,
+        final=final if ok else inf,
         cost=curve[-1][0] if curve else 0.0,
         operations=record["flops"],
         seconds=loop_seconds(record),
@@ -171,6 +191,12 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         curve=curve,
         overrides=portable(record.get("overrides", ())),
     )
+
+
+def _finite(value: Any) -> float:
+    """A number; infinite where it is none."""
+    number = as_number(value)
+    return inf if number is None or isnan(number) else number
 
 
 def portable(overrides: Iterable[str]) -> list[str]:
@@ -191,8 +217,8 @@ def _curve(record: Record, folder: Path, final: float | None) -> list[list[float
     of_rendering = record["metrics"].get("cost"), record["seconds"].get("forward")  # of a run without a loop
     found, spent = list[list[float]](), [0.0 if lines else as_number(number) or 0.0 for number in of_rendering]
     for line in lines:
-        if (value := as_number(line.get(error))) is not None:
-            found.append([*spent, value])
+        if line.get(error) is not None:
+            found.append([*spent, _finite(line[error])])
         spent = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
     end = [[*spent, final]] if final is not None else []
     return [[float(f"{number:.5g}") for number in point] for point in found + end]
@@ -259,6 +285,9 @@ def _read(line: dict[str, str]) -> Attempt:
     sound = all(as_number(number) is not None and number >= 0 for number in numbers)
     if not sound or any(len(point) != 3 for point in values["curve"]):
         raise ValueError(f"{values['problem']}: errors and costs must be numbers of 0 or more")
+    end, (last,) = [values["cost"], float(f"{values['final']:.5g}")], values["curve"][-1:] or [[None] * 3]
+    if values["status"] == RunStatus.OK and [last[0], last[2]] != end:
+        raise ValueError(f"{values['problem']}: the curve does not end at the cost and the final error")
     if values["set"] not in suite().errors or values["status"] not in [*RunStatus]:
         raise ValueError(f"{values['problem']}: there is no set {values['set']!r} or status {values['status']!r}")
     return Attempt(**values)

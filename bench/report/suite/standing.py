@@ -1,14 +1,16 @@
-"""The standing of the suite: which share of problems and targets each row reaches within the budget, at what cost.
+"""The standing of the suite: which share of problems and targets each row reaches, and at what cost.
 
 After data profiles (Moré and Wild 2009, "Benchmarking derivative-free optimization algorithms") and the targets of COCO
 (Hansen et al. 2021): an error e has the remainder r = log(e / reference) / log(start / reference), 1 at the start and 0
-at the reference, and a target is an r that is reached once the error stays at or below it to the end of the run.
+at the reference, and a target is an r that is reached once the error stays at or below it to the end of the run. Each
+set of problems weighs the same. Renderings, which have no course, stand apart: their wrong pixels are a number.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from math import inf, isfinite, nan
 from typing import Any
 
@@ -16,20 +18,26 @@ import numpy as np
 
 from bench.report.data import statistics
 from bench.report.data.records import grouped
-from bench.report.data.statistics import Interval
-from bench.report.suite.attempts import Attempt, joined, suite
+from bench.report.data.statistics import LEVEL, Interval
+from bench.report.suite.attempts import APART, Attempt, joined, problems_of, suite
 from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
+LEAST_SIZE = "quick"  # a row that has its problems is judged
 COST, SECONDS = 0, 1  # places in what a target was reached at
+FLIPS = 12  # most scenes of which all signs are tried; of more, that many random ones
+POWERFUL = 1.43  # over half of a 95 % interval: a difference that is found in four cases of five
 
 
 @dataclass(frozen=True)
 class Standing:
     """Attempts of several rows, one of each at a problem and seed.
 
+    Rows are compared at the problems that all of them have, but for rows that lack some of the least size: these are
+    `lacking`. Attempts under other settings than most of the set's are not judged.
+
     Args:
-        everything: of which those at problems that the reference row has no attempt at are not judged.
+        everything: those at problems that the reference row has no attempt at are not judged.
         clocks: attempts of the reference row on other machines too, by whose seconds those of other rows are divided.
     """
 
@@ -50,21 +58,53 @@ class Standing:
         return label if label in rows else next(iter(rows), None)
 
     @cached_property
+    def alike(self) -> list[Attempt]:
+        """The attempts under the settings that most attempts of their set have."""
+        settings = {
+            of_set: max(Counter(one.settings for one in own).items(), key=lambda found: (found[1], found[0]))[0]
+            for of_set, own in grouped(self.everything, lambda one: one.set).items()
+        }
+        return [one for one in self.everything if one.settings == settings[one.set]]
+
+    @cached_property
+    def _known(self) -> dict[str, set[tuple[Any, ...]]]:
+        """The problems and seeds of each row, of those that the reference row has, if there is one."""
+        every = grouped(self.alike, lambda one: one.row)
+        keys = {row: {one.key[:3] for one in own} for row, own in every.items()}
+        return {row: own & keys.get(str(self.reference), own) for row, own in keys.items()}
+
+    @cached_property
+    def _needed(self) -> set[tuple[Any, ...]]:
+        """The problems and seeds that a row must have: the least size's, or all if the reference lacks one."""
+        known = self._known.get(str(self.reference)) or set().union(*self._known.values())
+        least = problems_of(LEAST_SIZE)
+        return least if least <= known else known
+
+    @cached_property
+    def compared(self) -> set[tuple[Any, ...]]:
+        """The problems and seeds at which rows are compared."""
+        whole = [own for own in self._known.values() if own >= self._needed]
+        return set.intersection(*whole) if whole else self._needed
+
+    def lacking(self, row: str) -> int:
+        """How many of the problems and seeds that it must have a row has no attempt at."""
+        return len(self._needed - self._known[row])
+
+    @cached_property
     def attempts(self) -> list[Attempt]:
-        """The attempts at problems and seeds that the reference row has one at; all where there is no such row."""
-        known = {one.key[:3] for one in self.everything if one.row == self.reference}
-        return [one for one in self.everything if not known or one.key[:3] in known]
+        """The attempts at the problems and seeds at which rows are compared."""
+        return [one for one in self.alike if one.key[:3] in self.compared]
 
     @cached_property
     def rows(self) -> list[str]:
         """The rows, the one that reaches the most first; of those that lack a problem, last."""
-        found = grouped(self.attempts, lambda one: one.row)
-        return sorted(found, key=lambda row: (self.lacking(row), -self.share(row).value, row))
+        found = dict.fromkeys(one.row for one in self.attempts)
+        return sorted(found, key=lambda row: (self.lacking(row), -np.nan_to_num(self.share(row).value), row))
 
     @cached_property
     def sets(self) -> list[str]:
-        """The sets of problems, in the order of the suite."""
-        return [name for name in suite().errors if any(one.set == name for one in self.attempts)]
+        """The sets of problems with judged attempts, in the order of the suite."""
+        return [name for name in suite().errors if any(one.set == name for one in self.judged)]
 
     @cached_property
     def references(self) -> dict[tuple[str, str], float]:
@@ -72,34 +112,35 @@ class Standing:
         found = {}
         for (of_set, problem), own in grouped(self.attempts, lambda one: (one.set, one.problem)).items():
             known = suite().references.get(of_set, {})
-            stated = known.get(own[0].scene, known.get("all"))
+            stated = known.get(problem, known.get(own[0].scene, known.get("all")))
             found[of_set, problem] = min(one.final for one in own) if stated is None else stated
         return found
 
     @cached_property
     def starts(self) -> dict[tuple[Any, ...], float]:
-        """The error before, of each problem and seed: the median of the finite ones of all rows."""
+        """The error before, of each problem and seed: the median of the finite ones, if any of attempts that are ok."""
         known = grouped((one for one in self.attempts if isfinite(one.start)), lambda one: one.key[:3])
-        return {key: float(np.median([one.start for one in own])) for key, own in known.items()}
+        sound = {key: [one for one in own if one.ok] or own for key, own in known.items()}
+        return {key: float(np.median([one.start for one in own])) for key, own in sound.items()}
 
     @cached_property
     def judged(self) -> list[Attempt]:
-        """The attempts at problems whose start is worse than the reference, so that there is something to do."""
+        """The attempts with a course, at problems whose start is worse than the reference."""
         return [
             one
             for one in self.attempts
-            if self.starts.get(one.key[:3], 0.0) > self.references[one.set, one.problem] > 0
+            if one.set not in APART and self.starts.get(one.key[:3], 0.0) > self.references[one.set, one.problem] > 0
         ]
 
-    @cached_property
-    def scenes(self) -> set[str]:
-        """The scenes of the judged attempts."""
-        return {one.scene for one in self.judged}
+    def scenes(self, of_set: str | None = None) -> int:
+        """The number of scenes of the judged attempts, in one set or in all."""
+        return len({one.scene for one in self.judged if of_set in (None, one.set)})
 
     @cached_property
     def left_out(self) -> list[str]:
-        """The problems that are not judged."""
-        every, judged = ({f"{one.set}: {one.problem}" for one in of} for of in (self.attempts, self.judged))
+        """The problems of sets with a course that are not judged."""
+        with_course = [one for one in self.attempts if one.set not in APART]
+        every, judged = ({f"{one.set}: {one.problem}" for one in of} for of in (with_course, self.judged))
         return sorted(every - judged)
 
     @cached_property
@@ -107,10 +148,13 @@ class Standing:
         """Of each judged attempt by its key, the cost and the seconds of each target; infinite where not reached."""
         return {one.key: self._reached(one) for one in self.judged}
 
-    def _reached(self, one: Attempt) -> list[tuple[float, float]]:
+    def errors(self, one: Attempt) -> list[float]:
+        """The errors that are the targets of an attempt."""
         reference, start = self.references[one.set, one.problem], self.starts[one.key[:3]]
-        errors = [reference * (start / reference) ** target for target in suite().targets]
-        return [one.reached(error) or (inf, inf) for error in errors]
+        return [reference * (start / reference) ** target for target in suite().targets]
+
+    def _reached(self, one: Attempt) -> list[tuple[float, float]]:
+        return [one.reached(error) or (inf, inf) for error in self.errors(one)]
 
     @cached_property
     def _by_row(self) -> dict[str, list[Attempt]]:
@@ -124,43 +168,61 @@ class Standing:
         """What decides a row's look."""
         return next(one.preset for one in self.attempts if one.row == row)
 
-    def lacking(self, row: str) -> int:
-        """How many problems and seeds of other rows a row has no attempt at."""
-        return len({one.key[:3] for one in self.attempts} - {one.key[:3] for one in self.attempts if one.row == row})
-
     def failures(self, row: str) -> Counter[str]:
         """How many attempts of a row ended otherwise than ok, by their status."""
         return Counter(one.status for one in self.attempts if one.row == row and not one.ok)
 
-    def share(self, row: str, of_set: str | None = None) -> Interval:
-        """The share of problems and targets that a row reaches, with its interval over scenes; nan without any."""
-        return _mean(self._solved(row, of_set).values())
+    def wrong(self, row: str) -> float | None:
+        """The mean share of the pixels of an object that a row renders wrongly; all of them where it failed."""
+        own = [one for one in self.attempts if one.row == row and one.set in APART and self.starts.get(one.key[:3])]
+        return float(np.mean([min(one.final / self.starts[one.key[:3]], 1.0) for one in own])) if own else None
 
-    def _solved(self, row: str, of_set: str | None = None) -> dict[str, np.ndarray]:
-        """Of each scene, which targets of its problems a row reaches: 1 or 0."""
-        scenes = grouped(sorted(self.of(row, of_set), key=lambda one: one.key), lambda one: one.scene)
-        return {
-            scene: np.array([float(isfinite(at[COST])) for one in own for at in self.reached[one.key]])
-            for scene, own in scenes.items()
-        }
+    def share(self, row: str, of_set: str | None = None) -> Interval:
+        """The share of targets that a row reaches, the mean of its sets', with its interval over scenes."""
+        return _over_scenes(*self._solved(row, of_set))
+
+    def _solved(self, row: str, of_set: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of targets that a row reaches, and of all [scenes, sets]."""
+        own = self.of(row, of_set)
+        scenes, sets = (sorted({part(one) for one in own}) for part in (lambda one: one.scene, lambda one: one.set))
+        reached, every = np.zeros((2, len(scenes), len(sets)))
+        for one in own:
+            at = scenes.index(one.scene), sets.index(one.set)
+            reached[at] += sum(isfinite(cost) for cost, _ in self.reached[one.key])
+            every[at] += len(suite().targets)
+        return reached, every
 
     @cached_property
-    def units(self) -> dict[str, float]:
-        """Of each set the median cost of a whole run of the reference row, or of any row where there is none."""
-        known = {one.row for one in self.judged} & {self.reference} or {one.row for one in self.judged}
-        found = grouped((one for one in self.judged if one.row in known), lambda one: one.set)
-        return {of_set: float(np.median([one.cost for one in own])) or 1.0 for of_set, own in found.items()}
+    def units(self) -> dict[tuple[Any, ...], float]:
+        """The cost of the reference's run at each judged problem and seed; where it failed its median in the set."""
+        known = [one for one in self.of(str(self.reference)) if one.ok and one.cost > 0]
+        medians = {
+            of_set: float(np.median([one.cost for one in own]))
+            for of_set, own in grouped(known, lambda one: one.set).items()
+        }
+        found = {one.key[:3]: medians[one.set] for one in self.judged if one.set in medians}
+        return found | {one.key[:3]: one.cost for one in known}
 
     def profile(self, row: str, of_set: str | None = None) -> tuple[list[float], list[float]]:
-        """Costs in units of their sets, ascending, to the largest of any attempt, and the share reached at each."""
-        own = self.of(row, of_set)
-        costs = [at[COST] / self.units[one.set] for one in own for at in self.reached[one.key]]
-        known = np.sort([cost for cost in costs if isfinite(cost)])
-        if not len(known):
+        """Costs over the reference's, ascending, to the row's largest, and the share that it has reached at each."""
+        own = [one for one in self.of(row, of_set) if one.key[:3] in self.units]
+        sizes = Counter(one.set for one in own)
+        steps = Counter[float]()
+        for one in own:
+            for at in self.reached[one.key]:
+                if isfinite(at[COST]):
+                    weight = 1 / (len(sizes) * sizes[one.set] * len(suite().targets))
+                    steps[at[COST] / self.units[one.key[:3]]] += weight
+        if not own:
             return [], []
-        steps = np.unique(known).tolist()
-        shares = [float(np.searchsorted(known, cost, side="right")) / len(costs) for cost in steps]
-        return [steps[0], *steps, max(one.cost / self.units[one.set] for one in own)], [0.0, *shares, shares[-1]]
+        last = max(one.cost / self.units[one.key[:3]] for one in own)
+        costs = sorted(steps)
+        shares = np.cumsum([steps[cost] for cost in costs]).round(12).tolist()
+        return [costs[0] if costs else last, *costs, last], [0.0, *shares, shares[-1] if shares else 0.0]
+
+    def share_at(self, row: str, cost: float) -> float:
+        """The share that a row has reached at a cost over the reference's."""
+        return max((share for at, share in zip(*self.profile(row), strict=True) if at <= cost), default=0.0)
 
     def ratio(self, row: str, of: int = COST) -> Interval | None:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
@@ -188,34 +250,55 @@ class Standing:
         return statistics.ratio([g[0] for g in groups], [g[1] for g in groups]) if groups else None
 
     @cached_property
-    def ranks(self) -> dict[str, int]:
-        """The rank of each row that lacks no problem; rows that cannot be told from the first of a rank share it."""
-        found, first, rank = dict[str, int](), "", 1
-        for place, row in enumerate([row for row in self.rows if not self.lacking(row)], 1):
-            if not first or (between := self.difference(first, row)).low > 0 or between.high < 0:
-                first, rank = row, place
-            found[row] = rank
-        return found
+    def ranked(self) -> list[str]:
+        """The rows that lack no problem, the one that reaches the most first."""
+        return [row for row in self.rows if not self.lacking(row) and self.of(row)]
 
-    def difference(self, first: str, second: str) -> Interval:
-        """By how much the share of one row is larger than that of another with the same problems."""
-        one, other = self._solved(first), self._solved(second)
-        return _mean(one[scene] - other[scene] for scene in one)
+    @cached_property
+    def told(self) -> set[str]:
+        """The ranked rows whose shares are told from the first's: signs flipped over scenes, Holm at 5 % in all."""
+        first, *others = self.ranked or [""]
+        chances = sorted((self._chance(first, row), row) for row in others)
+        sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(chances)]
+        return {row for place, (_, row) in enumerate(chances) if all(sure[: place + 1])}
+
+    def _chance(self, first: str, second: str) -> float:
+        """The probability of as large a difference of shares where each scene's has either sign (permutation test)."""
+        reached, every = self._solved(first)
+        apart = (reached - self._solved(second)[0]) / every.sum(axis=0)
+        by_scene = apart.sum(axis=1)
+        if len(by_scene) <= FLIPS:
+            signs = np.array([*product((1, -1), repeat=len(by_scene))])
+        else:
+            signs = np.random.default_rng(0).choice((1, -1), (2**FLIPS, len(by_scene)))
+        return float(np.mean(np.abs(signs @ by_scene) >= abs(by_scene.sum()) - 1e-12))
+
+    @cached_property
+    def ranks(self) -> dict[str, int]:
+        """The rank of each ranked row: 1 where it is not told from the first, else its place."""
+        return {row: place if row in self.told else 1 for place, row in enumerate(self.ranked, 1)}
 
     @cached_property
     def resolution(self) -> float | None:
-        """The difference of shares that so many scenes just tell apart, in the median of rows; None if they tell none.
+        """The difference of shares that so many scenes show in four cases of five, in the median of rows."""
+        first, *others = self.ranked or [""]
+        one = self._solved(first)
+        found = [_over_scenes(one[0] - self._solved(row)[0], one[1]) for row in others]
+        known = [each.high - each.low for each in found if each.known]
+        return POWERFUL * float(np.median(known)) / 2 if known else None
 
-        It is half the width of the interval of a row's difference from the first one.
-        """
-        first, *others = self.ranks or [""]
-        found = [self.difference(first, row) for row in others]
-        return float(np.median([(one.high - one.low) / 2 for one in found])) if found and found[0].known else None
 
-
-def _mean(scenes: Iterable[np.ndarray]) -> Interval:
-    """The mean over all targets, with the bootstrap interval over scenes; nan without a target."""
-    groups = [*scenes]
-    if not groups:
+def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
+    """The mean over sets of what is reached of all, [scenes, sets], with the bootstrap interval over scenes."""
+    if not every.size:
         return Interval(nan, nan, nan)
-    return statistics.bootstrap(groups, lambda drawn: np.mean(drawn, axis=-1), seed=0)
+
+    def mean(drawn: Any) -> Any:  # of numbers of scenes [..., n]
+        places = np.asarray(drawn, dtype=int)
+        of = reached[places].sum(axis=-2), every[places].sum(axis=-2)
+        known = of[1] > 0
+        shares = np.divide(of[0], of[1], out=np.zeros_like(of[0]), where=known)
+        return shares.sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+
+    statistic: Callable[[Any], Any] = mean
+    return statistics.bootstrap([np.array([place]) for place in range(len(every))], statistic, seed=0)

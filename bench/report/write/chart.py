@@ -95,10 +95,7 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
 
 @style.styled
 def draw_lead(panels: Sequence[Panel], height: float) -> Figure:
-    """Draws the first panel large, with the names of its lines beside it, and the others small below, of equal axes.
-
-    The lines of a panel should end at the same position.
-    """
+    """Draws the first panel large, with the names of its lines beside it, and the others small below, of equal axes."""
     figure = Figure(figsize=(style.WIDTH, height), layout="constrained")
     grid = figure.add_gridspec(2, max(len(panels) - 1, 1), height_ratios=(1.7, 1))
     lead = figure.add_subplot(grid[0, :])
@@ -124,16 +121,18 @@ def draw_lead(panels: Sequence[Panel], height: float) -> Figure:
 def _name_ends(axis: Axes, lines: list[Series]) -> None:
     """Writes the name of each line to the right of the axes, as near to its end as the other names leave room."""
     ends = sorted((each for each in lines if each["x"]), key=lambda each: each["y"][-1])
-    axis.set_xlim(right=max((each["x"][-1] for each in ends), default=None))
+    right = max((each["x"][-1] for each in ends), default=None)
+    axis.set_xlim(right=right)
     low, high = axis.get_ylim()
     gap, places = 1 / max(len(ends), NAMES), list[float]()
     for place in ((each["y"][-1] - low) / (high - low) for each in ends):
         places.append(max(place, places[-1] + gap) if places else place)
     over = max(places[-1] - 1 + gap / 2, 0.0) if places else 0.0
     for each, place in zip(ends, places, strict=True):
+        axis.plot([each["x"][-1], right], [each["y"][-1]] * 2, color=each["colour"], lw=0.6, ls=":")
         axis.annotate(
             each["name"],
-            (each["x"][-1], each["y"][-1]),
+            (right, each["y"][-1]),
             (1.04, place - over),
             **{"textcoords": "axes fraction", "va": "center", "color": each["colour"]},
             arrowprops={"arrowstyle": "-", "color": each["colour"], "lw": 0.6, "relpos": (0, 0.5)}
