@@ -4,6 +4,7 @@
 
   const {element, fill, section, details, list, later, choice, emphasised} = bench.dom;
   const SUITE = "suite";
+  const STANDING = {named: "Renderer", link: (row) => bench.address.to(["renderer", row])};
   const link = ({name}) => bench.address.to(["table", name]);
   const all = () => bench.store.have("list", "papers") || [];
   const find = (name) => all().find((each) => each.name === name);
@@ -30,7 +31,7 @@
     return [
       panels.length > 1 && choice("Set of problems", titles, "0", show),
       drawn,
-      bench.written(data.header, data.rows, {named: "Renderer", link: (row) => bench.address.to(["renderer", row])}),
+      bench.written(data.header, data.rows, STANDING),
       element("p.caption", null, data.caption, " ", element("a", {href: link({name: SUITE})}, "All charts, notes and files")),
     ];
   }
@@ -73,7 +74,7 @@
     const image = () => element("img.figure", {src: data.picture, alt: data.caption || known.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
-    const table = data.rows.length > 0 && bench.written(data.header, data.rows, {best: data.best});
+    const table = data.rows.length > 0 && bench.written(data.header, data.rows, known.name === SUITE ? STANDING : data);
     return [
       data.atlas && bench.atlas(data.atlas),
       data.chart && bench.chart(data.chart, {label: known.title}),

@@ -35,12 +35,12 @@
   /* How often it fails; the first failure, with its picture where its run is among these results. */
   function failure({failed, reached, runs}, {problems}) {
     const tried = reached.filter((each) => each !== null).length;
-    if (!failed.length) return element("p", null, `It fails at none of ${plural(tried, "problem")}.`);
+    if (!failed.length) return element("p", null, `It fails in none of ${plural(tried, "run")}.`);
     const [place, status, reason] = failed[0];
     const run = bench.runs.place(runs[place]);
     return element("div", null,
-      element("p", null, `It fails at ${failed.length} of ${plural(tried, "problem")}. The first:`),
-      element("p", null, bench.badge(status), ` ${named(problems[place])}: ${reason}.`),
+      element("p", null, `It fails in ${failed.length} of ${plural(tried, "run")}. The first:`),
+      element("p", null, bench.badge(status), ` ${named(problems[place])}: ${reason.replace(/\.?$/, ".")}`),
       run !== undefined && later(bench.runs.detail(run), ({pictures}) => {
         const found = pictures.find(([name]) => name === "failure.png") || pictures[0];
         return found && bench.picture(found);
@@ -51,20 +51,24 @@
   function missed(own, {problems, rows, targets}) {
     const most = problems.map((_, place) => Math.max(...rows.map(({reached}) => reached[place] ?? 0)));
     const failed = new Map(own.failed.map(([place, said]) => [place, said]));
-    const status = (place) => bench.badge(failed.get(place) || (own.reached[place] === null ? "not_run" : "ok"));
-    const gap = (place) => most[place] - (own.reached[place] ?? 0);
-    const places = problems.map((_, place) => place).filter((place) => (own.reached[place] ?? 0) < targets);
-    places.sort((a, b) => gap(b) - gap(a));
+    const gap = (place) => most[place] - own.reached[place];
+    const tried = problems.map((_, place) => place).filter((place) => own.reached[place] !== null);
+    const places = tried.filter((place) => own.reached[place] < targets).sort((a, b) => gap(b) - gap(a));
+    const unmade = problems.length - tried.length;
     const count = (key, label, get) =>
-      ({key, label, kind: "number", unit: `of ${targets} targets`, get, cell: (place) => String(get(place) ?? MISSING)});
+      ({key, label, kind: "number", unit: `of ${targets} targets`, get, cell: (place) => String(get(place))});
     const columns = [
       {key: "problem", label: "Problem", head: true, get: (place) => named(problems[place]), cell: (place) => named(problems[place])},
       count("reached", "Reached", (place) => own.reached[place]),
       count("most", "By the best", (place) => most[place]),
-      {label: "Run", cell: (place) => [status(place), " ", run(own.runs[place])]},
+      {label: "Run", cell: (place) => [bench.badge(failed.get(place) || "ok"), " ", run(own.runs[place])]},
     ];
-    if (!places.length) return element("p", null, "It reaches every target.");
-    return bench.table(columns, places, {caption: "What it does not reach"});
+    return [
+      unmade > 0 && element("p", null, `${plural(unmade, "run")} that other rows have are missing.`),
+      places.length
+        ? bench.table(columns, places, {caption: "What it does not reach"})
+        : element("p", null, `It reaches every target in ${plural(tried.length, "run")}.`),
+    ];
   }
 
   function run(folder) {
