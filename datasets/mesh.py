@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
@@ -177,7 +178,8 @@ def fit_in_sphere(mesh: Mesh, radius: float) -> tuple[Float[np.ndarray, "3"], fl
 def extract(field: Field, *, grid: int, reach: float, device: torch.device | str = "cpu") -> Mesh | None:
     """The zero set by marching cubes, wound outward; None where the samples have one sign.
 
-    A distance or a bound is evaluated only near its surface, see `_near_values`; a level set everywhere.
+    A distance or a bound is evaluated only near its surface, see `_near_values`; a level set everywhere. A sample that
+    is NaN is unknown: the surface is left open where it passes there, and a note says how many these are.
 
     Args:
         grid: samples per axis.
@@ -194,11 +196,21 @@ def extract(field: Field, *, grid: int, reach: float, device: torch.device | str
         values = evaluate(_places(np.arange(grid**3), axis)).reshape(grid, grid, grid)
     else:
         values = _near_values(evaluate, axis)
-    if not (values.min() < 0 < values.max()):
+    unknown = np.isnan(values)
+    if not (np.fmin.reduce(values, axis=None) < 0 < np.fmax.reduce(values, axis=None)):
         return None
     spacing = 2 * reach / (grid - 1)
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
-    return Mesh(vertices - reach, faces)
+    options = {"spacing": (spacing,) * 3, "gradient_direction": "descent"}
+    if not unknown.any():
+        vertices, faces, _, _ = marching_cubes(values, 0.0, **options)
+        return Mesh(vertices - reach, faces)
+    known = ~maximum_filter(unknown, size=2)  # of the cell before a sample
+    try:
+        vertices, faces, _, _ = marching_cubes(np.where(unknown, 1, values), 0.0, mask=known, **options)
+    except RuntimeError:  # no cell that is known has the surface
+        return None
+    count = np.count_nonzero(unknown)
+    return Mesh(vertices - reach, faces, (f"warning: the field is NaN at {count} samples: a surface is open there",))
 
 
 class _Samples:
@@ -215,7 +227,6 @@ class _Samples:
         self.axis = np.append(axis, np.full(self.side - len(axis), axis[-1], axis.dtype))
         self.values = np.zeros((self.side,) * 3, dtype=np.float32)
         self.known = np.zeros_like(self.values, dtype=bool)
-        self.numbers = True  # whether no value is NaN
 
     def refine(self, slope: float) -> None:
         """Asks where signs are open if the field is at most so steep, and gives the others a value of their sign."""
@@ -225,7 +236,10 @@ class _Samples:
             if stride < STRIDES[0]:
                 above, below = (_between(bound, fall) for bound in (above, below))
             self._ask(~(above > KEPT * fall) & ~(below > KEPT * fall), stride)
-            values, known = self.values[_every(stride)], self.known[_every(stride)]
+            values = self.values[_every(stride)]
+            known = self.known[_every(stride)] & ~np.isnan(values)
+            if not known.any():
+                return self.values.fill(np.nan)
             above, below = np.where(known, values, above), np.where(known, -values, below)
         outside, inside = (_between(bound, slope * self.spacing) > 0 for bound in (above, below))
         self._ask(~outside & ~inside, 1)
@@ -261,10 +275,8 @@ class _Samples:
         """Evaluates samples of a lattice that are not known, given by a mask or by their flat indices."""
         values, known = self.values[_every(stride)], self.known[_every(stride)]
         places = np.flatnonzero(where & ~known) if where.dtype == bool else where
-        if len(places) and self.numbers:
-            found = self.evaluate(_places(places, self.axis[::stride]))
-            values.flat[places], known.flat[places] = found, True
-            self.numbers = not np.isnan(found).any()
+        if len(places):
+            values.flat[places], known.flat[places] = self.evaluate(_places(places, self.axis[::stride])), True
 
     def _next_to(self, mask: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """A flat mask with all samples that share a cell with one of its own; at the cube's faces with some more."""
@@ -285,7 +297,7 @@ def _near_values(
     as steep as between any two neighbours among the asked samples. A field that is far steeper is asked everywhere.
     """
     samples, slope, steepest = _Samples(evaluate, axis), 0.0, SLOPE / STEEPER
-    while samples.numbers and STEEPER * steepest > slope:
+    while STEEPER * steepest > slope:
         slope = max(SLOPE, STEEPER * steepest)
         samples.refine(slope)
         steepest = samples.steepest()

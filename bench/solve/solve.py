@@ -188,6 +188,7 @@ def note_result(run: RunContext, after: Evaluation) -> None:
     record.status, record.reason = after.failure or (RunStatus.OK, "")
     record.notes = [*record.notes, *after.notes]
     if after.mesh is not None:
+        record.notes += after.mesh.repairs
         after.mesh.save(run.folder / "mesh.ply")
 
 

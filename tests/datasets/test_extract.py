@@ -1,5 +1,7 @@
 """From fields with a known zero set to meshes."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -83,11 +85,39 @@ def test_only_the_neighbourhood_of_the_surface_is_asked_and_nothing_of_it_is_los
     assert counted.counts.value < grid**3 / 3 or name not in ("thin", "solid") or grid < 64
 
 
+def unknown_where(shape: Shape, place: Callable[[torch.Tensor], torch.Tensor], kind: Kind) -> Shape:
+    return Shape(lambda p: torch.where(place(p), torch.nan, shape(p)), kind)
+
+
 @each("kind", [Kind.DISTANCE, Kind.LEVEL])
-def test_a_field_that_has_no_number_somewhere_has_no_surface_and_is_not_asked_further(kind):
-    counted = Meter(Shape(lambda p: torch.where(p[..., 0] > 0.4, torch.nan, PLATE(p)), kind))
+@each("name", ["thin", "nested", "noisy"])
+def test_samples_that_are_nan_away_from_the_surface_change_nothing_but_a_note(name, kind):
+    shape = FIELDS[name]
+    plain = extract(Shape(shape, kind), grid=64, reach=0.95)
+    mesh = extract(unknown_where(shape, lambda p: (p > 0.75).all(-1), kind), grid=64, reach=0.95)
+    assert np.array_equal(mesh.vertices, plain.vertices) and np.array_equal(mesh.faces, plain.faces)
+    (note,) = mesh.repairs
+    assert plain.repairs == () and note.startswith("warning: the field is NaN at ")
+    assert kind is Kind.DISTANCE or " 343 samples" in note  # 7 along each axis
+
+
+@each("kind", [Kind.DISTANCE, Kind.LEVEL])
+def test_a_surface_is_open_where_its_field_is_nan_and_as_it_was_elsewhere(kind):
+    mesh = extract(unknown_where(sphere(0.8), lambda p: p[..., 0] > 0.4, kind), grid=64, reach=1.0)
+    assert not mesh.watertight and mesh.holes == 1
+    assert 0.35 < mesh.vertices[:, 0].max() <= 0.4
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.8, abs=1e-3)
+
+
+def test_a_surface_of_which_no_cell_is_known_is_none():
+    hidden = unknown_where(sphere(0.5), lambda p: (p.norm(dim=-1) - 0.5).abs() < 0.2, Kind.LEVEL)
+    assert extract(hidden, grid=32, reach=1.0) is None
+
+
+def test_a_field_without_any_number_is_not_asked_further():
+    counted = Meter(Shape(lambda p: torch.full_like(p[..., 0], torch.nan), Kind.DISTANCE))
     assert extract(counted, grid=64, reach=1.0) is None
-    assert kind is Kind.LEVEL or counted.counts.value < 64**3 / 50
+    assert counted.counts.value < 64**3 / 50
 
 
 def test_a_dip_that_is_twice_as_steep_as_a_distance_is_found_wherever_it_is():

@@ -11,6 +11,7 @@ from bench.config import load
 from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, evaluate, render_view
 from bench.evaluate.state import State
 from bench.setup.inputs import RunInputs
+from bench.solve.solve import note_result
 from datasets.scene import sample_surface
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
@@ -66,6 +67,15 @@ def test_a_field_without_a_surface_scores_worst(inputs, value):
     assert judgement.mesh is None
     assert judgement.metrics["chamfer_l2"] == judgement.metrics["depth_mae"] == np.inf
     assert judgement.metrics["fscore"] == judgement.metrics["mask_iou"] == 0.0
+
+
+def test_a_field_that_is_nan_in_a_corner_is_judged_and_noted(inputs, tmp_path):
+    corner = Shape(lambda p: torch.where((p > 0.8).all(-1), torch.nan, sphere(RADIUS)(p)))
+    judged = evaluate(State(corner, inputs))
+    assert judged.metrics == pytest.approx(evaluate(State(sphere(RADIUS), inputs)).metrics)
+    run = run_of(tmp_path, inputs.renderer, ball_prior(), camera_of(24))
+    note_result(run, judged)
+    assert run.record.notes[-1].startswith("warning: the field is NaN at ")
 
 
 def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inputs):
