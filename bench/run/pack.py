@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
 from math import ceil, inf
 from pathlib import Path
+from shutil import which
 from statistics import median
 from typing import Any
 
@@ -201,6 +202,8 @@ class Packed(Launcher):
         from hydra_plugins.hydra_submitit_launcher.config import BaseQueueConf
         from submitit import AutoExecutor
 
+        if self.settings["cluster"] == "slurm" and which("srun") is None:
+            raise ValueError("no Slurm is here: type this on a machine of the cluster, or hydra.launcher.cluster=local")
         rest, shared = dict(self.passed_on), BaseQueueConf.__dataclass_fields__
         folder, retries = rest.pop("submitit_folder"), rest.pop("max_num_timeout")
         executor = AutoExecutor(folder, self.settings["cluster"], slurm_max_num_timeout=retries)
