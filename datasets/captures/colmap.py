@@ -1,5 +1,6 @@
 """COLMAP's sparse reconstructions."""
 
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,11 @@ def colmap(folder: Path, images: str | None = None) -> Layout | None:
         raise BadInput(f"dataset.images={images} is no folder: give that of COLMAP's images, from {folder} or /")
     tried = [(base, *located([*cameras], base)) for base in bases if base.is_dir()]
     base, found, how = max(tried, key=lambda one: len(one[1]))
-    there = {file.relative_to(base).as_posix(): file for file in found.values()}
+    short = {name: Path(relpath(file, base)).as_posix() for name, file in sorted(found.items())}
+    there = {short[name]: file for name, file in found.items()}
     masks, masked = masks_of(folder, there)
     frames = [
-        Frame(file, *cameras[name][:2], masks.get(file.relative_to(base).as_posix()), *cameras[name][2:])
-        for name, file in sorted(found.items())
+        Frame(found[name], *cameras[name][:2], masks.get(path), *cameras[name][2:]) for name, path in short.items()
     ]
     notes = [*_chosen(folder, place, {one: len(model.images) for one, model in models.items()})]
     notes += [*([how] if how else []), *masked, *without_image([name for name in cameras if name not in found])]

@@ -23,6 +23,8 @@ PLAIN = {  # COLMAP's models, and the numbers behind focal lengths and principal
 FISHEYE = {
     "SIMPLE_RADIAL_FISHEYE": ("k1",),
     "RADIAL_FISHEYE": ("k1", "k2"),
+    "SIMPLE_FISHEYE": (),
+    "FISHEYE": (),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import pairwise, takewhile
+from itertools import pairwise, product, takewhile
+from os.path import normpath
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -59,7 +60,7 @@ def by_order(names: Sequence[str], count: int, where: str) -> list[dict[int, str
     if not ordered:
         return [{}]
     found = _numbered(ordered, count)
-    if not found:
+    if not 0 < len(found) <= 2:
         raise BadInput(f"{told}: the names do not tell which images are missing; add them, or remove their cameras")
     return found
 
@@ -96,11 +97,14 @@ def _numbered(names: Sequence[str], count: int) -> list[dict[int, str]]:
     width, values = min(map(len, digits)), [int(number) for number in digits]
     if any(number != str(int(number)).zfill(width) for number in digits):
         return []
-    whole = [min(values)] if max(values) - min(values) + 1 == count else [0, 1]
-    starts = [start for start in whole if start <= min(values) and max(values) < start + count]
+    least, most = min(values), max(values)
+    starts = [start for start in {0, 1, least} if start <= least and most < start + count]
+    if starts == [least] and least > 1 and most - least + 1 < count:  # nothing says that the first is there
+        return []
+    zeros = any(number.startswith("0") for number in digits if len(number) > 1)
     found = []
-    for start in starts:
-        every = sorted(f"{before}{str(start + i).zfill(width)}{after}{suffix}" for i in range(count))
+    for start, zeroed in product(starts, {width} if zeros else {width, 1}):  # 10 and 11 may follow 09, or 9
+        every = sorted(f"{before}{str(start + i).zfill(zeroed)}{after}{suffix}" for i in range(count))
         places = {every.index(name): name for name in names}
         found += [places] if places not in found else []
     return found
@@ -214,7 +218,7 @@ def located(names: Iterable[str], base: Path) -> tuple[dict[str, Path], str]:
     found: dict[str, Path] = {}
     left = 0
     for skip in range(max(map(len, parts.values()), default=0)):
-        tails = {name: base.joinpath(*some[skip:]) for name, some in parts.items() if len(some) > skip}
+        tails = {name: Path(normpath(base.joinpath(*some[skip:]))) for name, some in parts.items() if len(some) > skip}
         there = {name: file for name, tail in tails.items() if (file := _existing(tail, listed))}
         if len(there) > len(found):
             found, left = there, skip

@@ -16,7 +16,7 @@ SAMPLES = 48  # per axis, while the hull is looked for
 ROUNDS = 4  # in which the part of the world that is sampled shrinks to the hull
 FILLED = 0.9  # of the unit sphere's radius that the hull takes
 PARALLEL, NARROW = 1e-4, 3e-3  # squares of radians between optical axes: below, no point is where they meet; hardly one
-RESIZED, ALIKE = 1.2, 0.05  # an image's size that differs more from its camera's is told; the same in both directions
+RESIZED, ALIKE = 1.3, 0.15  # an image's size that differs more from its camera's is told; the same in both directions
 BESIDE = 0.5  # share of the photographs in whose range of depths a point must not lie, to be looked for elsewhere
 
 
@@ -71,7 +71,7 @@ def size_doubt(cameras: Sequence[Camera]) -> str:
     if abs(across / down - 1) > ALIKE or max(across, 1 / across) < RESIZED or across <= 0:
         return ""
     return (
-        f"the principal point lies where it would be in images {across:.3g} times as wide and high: scale the "
+        f"the principal point lies where it would be in images about {across:.2g} times as wide and high: scale the "
         "intrinsics as the images were, or give the images of the cameras' size"
     )
 

@@ -183,7 +183,10 @@ def _depths(path: Path, unit: float, size: tuple[int, int]) -> Float[Tensor, "he
         import cv2
     except ImportError as error:
         raise BadInput(f"{path} is read by OpenCV: {install('stereo')}, or remove the folder of depths") from error
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        stored = None
     if stored is None:
         raise BadInput(f"{path} cannot be read as depths: copy it again, or remove the folder of depths")
     depths = stored.reshape(*stored.shape[:2], -1)[..., 0].astype(np.float64)

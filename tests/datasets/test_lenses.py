@@ -1,0 +1,80 @@
+"""Lenses bend rays as OpenCV and COLMAP have them, or are refused by name."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.captures.lenses import FISHEYE, PLAIN, colmap_lens, nerf_lens
+from renderers.checks import BadInput
+
+PLACES = np.stack(np.meshgrid(np.linspace(-0.7, 0.7, 9), np.linspace(-0.6, 0.6, 7)), axis=-1).reshape(-1, 2)
+RAYS = np.concatenate([PLACES, np.ones_like(PLACES[:, :1])], axis=1)
+SMALL = st.floats(-0.05, 0.05, allow_subnormal=False)
+NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
+FEW = settings(max_examples=20)
+
+
+def bent(lens) -> np.ndarray:
+    return np.stack(lens.bend(*PLACES.T), axis=-1)
+
+
+@FEW
+@given(st.lists(SMALL, min_size=8, max_size=8), st.sampled_from([4, 5, 8]))
+def test_numbers_of_a_file_are_those_of_opencv(numbers, count):
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
+    known = dict(zip(NAMES[:count], numbers[:count], strict=True))
+    expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), np.eye(3), np.array(numbers[:count]))[0][:, 0]
+    np.testing.assert_allclose(bent(nerf_lens(known, "file")), expected, atol=1e-9)
+
+
+@FEW
+@given(
+    st.lists(SMALL, min_size=4, max_size=4), st.sampled_from([{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
+)
+def test_a_fisheye_is_that_of_opencv(numbers, flag):
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
+    known = dict(zip(("k1", "k2", "k3", "k4"), numbers, strict=True)) | flag
+    expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(numbers))[0][:, 0]
+    np.testing.assert_allclose(bent(nerf_lens(known, "file")), expected, atol=1e-9)
+
+
+@FEW
+@given(st.data())
+def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra: pip install -e '.[colmap]'")
+    name = data.draw(st.sampled_from([one for one in pycolmap.CameraModelId.__members__ if one != "INVALID"]))
+    camera = pycolmap.Camera.create_from_model_id(1, getattr(pycolmap.CameraModelId, name), 50.0, 40, 30)
+    if name not in PLAIN | FISHEYE:
+        with pytest.raises(BadInput, match=f"of the model {name}, which is not understood"):
+            colmap_lens(name, list(camera.params), "sparse/0")
+        return
+    extra = len((PLAIN | FISHEYE)[name])
+    plain = list(camera.params[: len(camera.params) - extra])
+    camera.params = plain + data.draw(st.lists(SMALL, min_size=extra, max_size=extra))
+    focal, middle = camera.calibration_matrix()[[0, 1], [0, 1]], camera.calibration_matrix()[:2, 2]
+    expected = (camera.img_from_cam(RAYS) - middle) / focal
+    np.testing.assert_allclose(bent(colmap_lens(name, list(camera.params), "sparse/0")), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not understood"),
+        ({"camera_model": "ORTHOPHOTO"}, "camera_model ORTHOPHOTO"),
+        ({"camera_model": "FISHEYE624", "k1": 0.1}, "camera_model FISHEYE624"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye does not fit"),
+        ({"k1": 0.1, "k4": 0.01}, "k4 means one thing in a fisheye"),
+        ({"is_fisheye": True, "k1": 0.1, "p1": 0.01}, "a fisheye has k1 to k4"),
+        ({"s1": 0.1}, "the lens has s1"),
+        ({"ftheta_p0": 0.1}, "the lens has ftheta_p0"),
+        ({"equirectangular": True}, "equirectangular is not understood"),
+    ],
+)
+def test_other_lenses_are_refused_by_name(known, words):
+    with pytest.raises(BadInput, match=words):
+        nerf_lens(known, "transforms.json")
+
+
+def test_numbers_that_are_zero_are_no_lens():
+    assert not nerf_lens({"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False}, "file").bends

@@ -1,0 +1,116 @@
+"""Names of images, cameras and masks of each kind, made anew: the pairs are those of the rule, or none are given."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from datasets.captures.pairing import by_order, located, masks_of, paired
+from renderers.checks import BadInput
+
+PREFIXES = st.sampled_from(["", "r_", "IMG_2023_", "cam1_a_", "view 3 (4) "])
+WIDTHS = st.sampled_from([1, 3, 6])
+
+
+def write(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
+@given(PREFIXES, WIDTHS, st.integers(0, 5), st.integers(3, 30), st.randoms())
+def test_cameras_are_those_of_the_names_in_string_order(prefix, width, start, count, random):
+    names = sorted(f"{prefix}{str(start + i).zfill(width)}.png" for i in range(count))
+    shuffled = random.sample(names, count)
+    assert by_order(shuffled, count, "file") == [dict(enumerate(names))]
+
+
+@given(PREFIXES, WIDTHS, st.integers(0, 1), st.integers(4, 30), st.data())
+def test_missing_images_never_shift_the_others(prefix, width, start, count, data):
+    names = sorted(f"{prefix}{str(start + i).zfill(width)}.png" for i in range(count))
+    missing = data.draw(st.sets(st.integers(0, count - 1), min_size=1, max_size=count - 3))
+    left = {i: name for i, name in enumerate(names) if i not in missing}
+    try:
+        answers = by_order([*left.values()], count, "file")
+    except BadInput:
+        return
+    assert left in answers and len(answers) <= 2
+
+
+def test_where_the_ends_are_there_a_missing_image_is_known():
+    left = ["IMG_10.png", "IMG_12.png", "IMG_8.png", "IMG_9.png"]  # of 8 to 12
+    assert by_order(left, 5, "file") == [{0: "IMG_10.png", 2: "IMG_12.png", 3: "IMG_8.png", 4: "IMG_9.png"}]
+
+
+@pytest.mark.parametrize("names", [["a.png", "c.png", "d.png"], ["5.png", "6.png", "8.png"], ["1.png", "02.png"]])
+def test_names_that_do_not_tell_what_is_missing_are_refused(names):
+    with pytest.raises(BadInput, match=r"has 6 cameras, and there are \d images .* do not tell which"):
+        by_order(names, 6, "file")
+
+
+MASKS = {
+    "NAME": lambda stem, suffix: f"{stem}{suffix}",
+    "NAME.ext.png": lambda stem, suffix: f"{stem}{suffix}.png",
+    "NAME with another suffix": lambda stem, suffix: f"{stem}.gif",
+    "a common prefix or suffix": lambda stem, suffix: f"mask_{stem}_m.png",
+}
+
+
+@given(
+    st.sets(st.from_regex(r"[a-c]{1,2}_?[0-9]{1,3}(_of_12)?", fullmatch=True), min_size=3, max_size=12),
+    st.sampled_from([".png", ".jpg", ".JPEG"]),
+    st.sampled_from([*MASKS]),
+    st.randoms(),
+)
+def test_masks_are_those_of_their_images(stems, suffix, rule, random):
+    """Even where last numbers are the same, or cores of names are equal numbers."""
+    pairs = {stem + suffix: MASKS[rule](stem, suffix) for stem in stems}
+    found, told = paired([*pairs], random.sample([*pairs.values()], len(pairs)))
+    assert (found == pairs and told == rule) or (found != pairs and len(found) < len(pairs))
+
+
+def test_numbers_are_the_same_with_other_zeros_and_another_camera_is_not():
+    assert paired(["0.png", "9.png", "10.png"], ["010.png", "009.png", "000.png"])[0]["9.png"] == "009.png"
+    assert paired(["cam1_0.png", "cam1_1.png"], ["cam2_0.png", "cam2_1.png"]) == ({}, "")
+
+
+def test_masks_that_are_not_one_to_one_are_refused_with_both_lists(tmp_path):
+    images = {name: tmp_path / name for name in ("a_0.png", "a_1.png", "a_2.png", "b_0.png")}
+    write(tmp_path / "mask", "m_0.png", "m_1.png", "m_2.png", "._m_0.png")
+    with pytest.raises(BadInput, match=re.escape("4 images (a_0.png, a_1.png ... b_0.png) and 3 masks (m_0.png, ")):
+        masks_of(tmp_path, images)
+    write(tmp_path / "mask", "n_0.png")
+    with pytest.raises(BadInput, match="has no mask"):
+        masks_of(tmp_path, images)
+    masks, notes = masks_of(tmp_path, images, sorted_too=True)
+    assert masks["b_0.png"].name == "n_0.png" and notes == ("4 images; 4 masks by the order of their names",)
+
+
+FOUND = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+
+
+@FOUND
+@given(
+    st.sampled_from(["", "./", "images/", "C:\\scans\\me\\images\\", "/home/me/images/", "..\\images\\"]),
+    st.booleans(),
+    st.sampled_from([".png", ".PNG", ".jpg", ""]),
+)
+def test_images_are_found_by_paths_of_other_machines(tmp_path, before, windows, suffix):
+    names = ["cam 1/0.1", "cam 1/1", "cam2/0.1"]
+    base = tmp_path / "images" if "images" not in before or "." in before else tmp_path
+    write(tmp_path, *(f"images/{name}.png" for name in names), "images/._1.png")
+    asked = {before + name + suffix: name for name in names}
+    asked = {path.replace("/", "\\") if windows else path: name for path, name in asked.items()}
+    found, note = located([*asked], base)
+    assert {path: file.relative_to(tmp_path / "images").as_posix() for path, file in found.items()} == {
+        path: f"{name}.png" for path, name in asked.items()
+    } or (suffix == "" and len(found) < 3)
+    assert ("without" in note) == (before[:1] in ("C", "/")) or suffix == ""
+
+
+def test_two_paths_to_one_file_are_refused(tmp_path):
+    write(tmp_path, "0.png")
+    with pytest.raises(BadInput, match=r"a/0.png and b/0.png have cameras, and are one file"):
+        located(["a/0.png", "b/0.png"], tmp_path)
