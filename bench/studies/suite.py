@@ -106,10 +106,12 @@ def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
     lines = [
         chart.curve(row, standing.preset(row), costs, shares, step=True)
         for row, (costs, shares) in found.items()
-        if costs
+        if costs and costs[-1] > 0  # of a row whose runs ended before they cost anything there is no line
     ]
     name = f"{of_set or 'all sets'}, {format.plural(standing.scenes(of_set), 'scene')}"
-    return chart.panel_data(name, "field values over DIST's run", "share reached", lines)
+    panel = chart.panel_data(name, "field values over DIST's run", "share reached", lines)
+    panel["x"]["log"] = True  # also where something is reached at the start, for nothing
+    return panel
 
 
 def _sample(standing: Standing) -> str:

@@ -13,6 +13,7 @@ from bench import merge
 from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
+from bench.studies.suite import _panel
 from bench.suite import main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
@@ -156,6 +157,13 @@ def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another
     write_attempts(attempts_of(read_records(tmp_path)[0], tmp_path), tmp_path)
     ((found,), problems) = read_attempts(tmp_path)
     assert problems == [] and found.row == "Mine, steps=9" and [error for *_, error in found.curve] == [0.8, inf, 0.2]
+
+
+def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic():
+    standing = field([("Dist", 0.01, 100.0)])
+    late = [attempt("Late", scene, {0: 1.0}, status="timeout") for scene in SCENES]
+    panel = _panel(Standing([*standing.everything, *late]), None)
+    assert [line["name"] for line in panel["series"]] == ["Dist"] and panel["x"]["log"]
 
 
 def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
