@@ -1,6 +1,7 @@
 """Finds, reads and checks the user's mesh files, and makes them closed solids by `repair`."""
 
 import difflib
+import re
 import struct
 import warnings
 from collections.abc import Callable
@@ -29,8 +30,12 @@ MISTAKEN = {  # how other files begin: what they are, and the remedy
     b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull'"),
     b"\x1f\x8b": ("a file compressed by gzip", "unpack it"),
     b"PK\x03\x04": ("a .zip archive", "unpack it"),
-    b"<": ("a web page or XML", "download the file itself"),
+    b"<!doctype html": ("a web page", "download the file itself"),
+    b"<html": ("a web page", "download the file itself"),
 }
+PACKED = re.compile(
+    rb'"extensionsRequired"\s*:\s*\[[^\]]*"(KHR_draco_mesh_compression|EXT_meshopt_compression)"'
+)  # a .glb
 GREY = 0.7  # of parts without colours, beside parts that have some
 
 
@@ -103,7 +108,7 @@ def _read(path: Path) -> Mesh:
     if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
     for start, (what, remedy) in MISTAKEN.items():
-        if content.lstrip().startswith(start):
+        if content[:64].lstrip().lower().startswith(start.lower()):
             raise ValueError(f"must hold a mesh, found {what}; {remedy}")
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # a broken file makes numpy warn; its numbers are checked below
@@ -130,25 +135,36 @@ def _parts(path: Path, content: bytes) -> list[Any]:
         polygons = READERS[suffix](content)
         triangles, owner = polygons.triangles()
         if not len(triangles):
-            raise ValueError(
-                f"must have faces, found none: it holds {len(polygons.vertices)} vertices, as points or lines; "
-                "export it as a surface"
-            )
+            count = len(polygons.vertices)
+            what = f"it holds {count} vertices, as points or lines" if count else f"nothing in it is as in {suffix}"
+            raise ValueError(f"must have faces, found none: {what}; export it as a surface")
         shades = None if polygons.face_colours is None else polygons.face_colours[owner]
         painted = {"vertex_colors": polygons.vertex_colours, "face_colors": shades}
         return [trimesh.Trimesh(polygons.vertices, triangles, process=False, **painted)]
+    _check_binary(suffix, content)
     try:
         scene = trimesh.load_scene(path, process=False)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     except READ_ERRORS as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        raise ValueError(
-            f"must be a whole {suffix} file, but reading failed ({why}); export or copy it again"
-        ) from None
+        raise ValueError(f"must be readable as {suffix}, but reading failed ({why}); export or copy it again") from None
     if not parts:
-        where = "the file is truncated, or holds points or lines"
+        where = "the file is truncated, or holds points, lines or fans"
         raise ValueError(f"must have faces, found none: {where}; copy it again, or export it as a surface of triangles")
     return parts
+
+
+def _check_binary(suffix: str, content: bytes) -> None:
+    """Refuses an .stl of another length than it claims, and a .glb with packed numbers: trimesh names no cause."""
+    if suffix == ".stl" and len(content) > 83 and b"facet" not in content[:2000].lower():
+        count = int.from_bytes(content[80:84], "little")
+        if len(content) != 84 + 50 * count:
+            raise ValueError(
+                f"must be a whole .stl file, {84 + 50 * count} bytes for the {count} faces that it claims, found "
+                f"{len(content)}; export or copy it again"
+            )
+    if suffix == ".glb" and (packed := PACKED.search(content)):
+        raise ValueError(f"must be a .glb that is not packed, found {packed[1].decode()}; export it uncompressed")
 
 
 def _painted(
