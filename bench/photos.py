@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
 from datasets.captures.hull import Fit
-from datasets.own_photographs import AXES, DOUBTFUL, GOOD, Capture, Reading, read_capture
+from datasets.captures.sphere import doubt_of
+from datasets.own_photographs import AXES, DOUBTFUL, GOOD, LOOK, Capture, Reading, read_capture
 from renderers.camera import sphere_span
 
 MOST = 8  # photographs in the picture
@@ -27,7 +28,7 @@ def told(fit: Fit, capture: Capture) -> list[str]:
     if worst:
         named = ", ".join(f"{capture.shots[place].name} {overlaps[place]:.0%}" for place in worst)
         found.append(f"note: least in {named}: look at their masks and cameras")
-    if middle < DOUBTFUL:
+    if middle < DOUBTFUL and not doubt_of(capture.shots):
         found.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
     return found
 
@@ -80,7 +81,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     print(capture.summary)
     for note in capture.notes:
-        print(f"note: {note}")
+        if LOOK not in note:  # which is told below
+            print(f"note: {note}")
     if capture.fit:
         print("\n".join(told(capture.fit, capture)))
     print(into)

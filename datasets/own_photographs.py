@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from datasets.captures.formats import find_layout
-from datasets.captures.frames import OPENGL, Frame, Layout, motion
+from datasets.captures.frames import OPENGL, Frame, Layout, motion, nearest_motion
 from datasets.captures.hull import Fit, fit_of
-from datasets.captures.sphere import Sphere, hull_sphere, looked_at, size_doubt
+from datasets.captures.sphere import Sphere, doubt_of, hull_sphere, looked_at
 from datasets.captures.take import take, turning_notes
 from datasets.mesh import Mesh
 from datasets.scene import Split
@@ -192,7 +192,11 @@ def _capture(layout: Layout, reading: Reading) -> Capture:
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
     every = reading.held_out
     given = [place for place in range(len(shots)) if every is None or place % every]
-    sphere = _sphere(layout, middle, [shots[place] for place in given], [frames[place].span for place in given])
+    turns = turning_notes(frames)
+    try:
+        sphere = _sphere(layout, middle, [shots[place] for place in given], [frames[place].span for place in given])
+    except BadInput as error:
+        raise BadInput("; ".join([str(error), *turns])) from None
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
     longest = reading.longest
     whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
@@ -206,14 +210,14 @@ def _capture(layout: Layout, reading: Reading) -> Capture:
         source if masked else "",
         sphere.found,
         layout.world @ to_world,
-        (*layout.notes, *turning_notes(frames), *whole),
+        (*layout.notes, *turns, *whole),
         fit_of(within, HULL_SAMPLES) if masked else None,
     )
 
 
 def _centred(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[list[Frame], Float[np.ndarray, "3"]]:
     """Frames with the origin among the cameras, since digits would be lost in a far world; and where that was."""
-    turned = [replace(frame, world_to_camera=axes @ frame.world_to_camera) for frame in frames]
+    turned = [replace(frame, world_to_camera=axes @ nearest_motion(frame.world_to_camera)) for frame in frames]
     middle = -np.mean([frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in turned], axis=0)
     moved = motion(np.eye(3), middle)
     return [replace(frame, world_to_camera=frame.world_to_camera @ moved) for frame in turned], middle
@@ -248,8 +252,8 @@ def _checked(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[s
     """A capture with notes on what is doubtful, and what is so doubtful that it is refused."""
     fit = capture.fit
     overlap, shown = (float(np.median(one)) for one in ((fit.overlaps, fit.shown) if fit else ([1.0], [1.0])))
-    sizes = None in [frame.size for frame in frames] and (fit is None or overlap < DOUBTFUL)
-    if sizes and (doubt := size_doubt([shot.camera for shot in capture.shots])):
+    open_to_doubt = overlap < DOUBTFUL if fit else None in [frame.size for frame in frames]
+    if open_to_doubt and (doubt := doubt_of(capture.shots)):
         return capture, [doubt]
     told = {
         f"the visual hull of the masks overlaps with them by {overlap:.0%} (median): cameras may be those of other "

@@ -126,7 +126,7 @@ class PhotographTask(ABC):
         held_out: of so many photographs one is held out.
         masks: whether those that are given have their masks. The unit sphere may have been found by masks anyway, those
             of photographs that are held out not among them.
-        depths: that are given; photographs of one's own have none.
+        depths: that are given; photographs of one's own have none but in DVR's layout.
     """
 
     images: Photography

@@ -18,7 +18,8 @@ from renderers.checks import BadInput
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
 HALF = 0.5  # pixels: where the first pixel's centre is at whole numbers, the principal point moves by this
-RIGID = 1e-3  # most by which a rotation's columns may differ from unit and orthogonal ones
+RIGID = 5e-3  # most by which a rotation's axes may differ from unit and orthogonal ones
+ROUNDED = 1e-5  # those that differ more are replaced by the nearest rotation: the file has few digits
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,15 @@ def motion(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3
     moved = np.eye(4)
     moved[:3, :3], moved[:3, 3] = rotation, translation
     return moved
+
+
+def nearest_motion(moved: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """world_to_camera with a rotation that is exact, about the same centre; itself where it is nearly exact."""
+    rotation = moved[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() < ROUNDED:
+        return moved
+    left, _, right = np.linalg.svd(rotation)
+    return motion(left @ right, left @ right @ np.linalg.solve(rotation, moved[:3, 3]))
 
 
 def inverse(camera_to_world: Float[np.ndarray, "4 4"], where: str) -> Float[np.ndarray, "4 4"]:

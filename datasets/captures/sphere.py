@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from datasets.captures.hull import carve
 from datasets.shot import Shot
@@ -17,6 +18,10 @@ ROUNDS = 4  # in which the part of the world that is sampled shrinks to the hull
 FILLED = 0.9  # of the unit sphere's radius that the hull takes
 PARALLEL, NARROW = 1e-4, 3e-3  # squares of radians between optical axes: below, no point is where they meet; hardly one
 RESIZED, ALIKE = 1.3, 0.15  # an image's size that differs more from its camera's is told; the same in both directions
+UNKNOWN = (
+    "Try flipped axes (stated ones, where they are flipped), check the order of the images and that masks are white on "
+    "the object"
+)
 BESIDE = 0.5  # share of the photographs in whose range of depths a point must not lie, to be looked for elsewhere
 
 
@@ -43,7 +48,7 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
         if len(inside) == 0:
             raise BadInput(
                 "the visual hull of the masks is empty: no point is inside of all masks, so that cameras do not fit "
-                f"the masks{_cause(shots)}"
+                f"the masks. {doubt_of(shots).capitalize() or UNKNOWN}"
             )
         spacing = 2 * half / (SAMPLES - 1)
         low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing
@@ -52,17 +57,19 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
     return Sphere(centre, radius / FILLED, "about the visual hull of the masks")
 
 
-def _cause(shots: Sequence[Shot]) -> str:
-    """What may be wrong with cameras that do not fit their masks."""
-    if doubt := size_doubt([shot.camera for shot in shots]):
-        return f": {doubt}"
-    return (
-        ". Try flipped axes (stated ones, where they are flipped), check the order of the images and that masks are "
-        "white on the object"
-    )
+def doubt_of(shots: Sequence[Shot]) -> str:
+    """What may be wrong with photographs that do not fit: the size of their images, or inverted masks; "" else."""
+    sides = [side for shot in shots if shot.mask is not None for side in _border(shot.mask)]
+    if sides and np.mean([bool(side.float().mean() > 0.5) for side in sides]) > 0.5:
+        return "the masks are white along the border, as inverted ones: make the object white, and the rest black"
+    return _size_doubt([shot.camera for shot in shots])
 
 
-def size_doubt(cameras: Sequence[Camera]) -> str:
+def _border(mask: Bool[Tensor, "height width"]) -> tuple[Tensor, ...]:
+    return mask[0], mask[-1], mask[:, 0], mask[:, -1]
+
+
+def _size_doubt(cameras: Sequence[Camera]) -> str:
     """What is said of cameras whose principal point lies as if their images had another size; "" of others."""
     shares = np.array(
         [[2 * one.intrinsics[0, 2] / one.width, 2 * one.intrinsics[1, 2] / one.height] for one in cameras]

@@ -72,7 +72,11 @@ def _turns(frame: Frame) -> bool | None:
     None where it has no such tag.
     """
     with _found(frame.image) as image:
-        tag, (width, height) = _tag(image), image.size
+        width, height = image.size
+        try:
+            tag = _tag(image)
+        except OSError as error:
+            raise _broken(frame.image, error) from None
     if tag == UPRIGHT:
         return None
     turned = (height, width) if tag >= SIDEWAYS else (width, height)
@@ -130,7 +134,11 @@ def _found(path: Path) -> Image.Image:
     try:
         return Image.open(str(path))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+        raise _broken(path, error) from None
+
+
+def _broken(path: Path, error: Exception) -> BadInput:
+    return BadInput(f"{path} cannot be read as an image ({error}): copy or export it again")
 
 
 def _opened(path: Path, *, upright: bool = False) -> Image.Image:
@@ -139,7 +147,7 @@ def _opened(path: Path, *, upright: bool = False) -> Image.Image:
         try:
             stored.load()
         except (OSError, ValueError) as error:
-            raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+            raise _broken(path, error) from None
         image = ImageOps.exif_transpose(stored) if upright else stored.copy()
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
         values = np.asarray(image, np.float64)

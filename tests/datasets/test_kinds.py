@@ -149,6 +149,48 @@ def test_neus2_has_other_axes(tmp_path, axes, flag):
     assert off(read_capture(tmp_path, PLAIN)) < 0.01
 
 
+@FEW
+@given(st.integers(3, 6))
+def test_few_digits_are_the_nearest_rotation(tmp_path, digits):
+    nerf(tmp_path)
+
+    def change(stored) -> None:
+        for frame in stored["frames"]:
+            frame["transform_matrix"] = np.round(frame["transform_matrix"], digits).tolist()
+
+    changed(tmp_path, change)
+    assert off(read_capture(tmp_path, PLAIN)) < 0.1
+
+
+BROKEN = {
+    "frames": (lambda stored: stored.pop("frames"), "transforms.json has no frames"),
+    "matrix": (lambda stored: stored["frames"][3].pop("transform_matrix"), "r_3 has no transform_matrix"),
+    "path": (lambda stored: stored["frames"][3].pop("file_path"), "a frame has no file_path"),
+    "zeros": (
+        lambda stored: stored["frames"][3].update(transform_matrix=np.zeros((4, 4)).tolist()),
+        "r_3: .* inverted",
+    ),
+    "twice": (lambda stored: stored["frames"].append(stored["frames"][0]), "has ./train/r_0 twice"),
+    "mirror": (
+        lambda stored: stored["frames"][3].update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()),
+        "r_3.png must have a rotation, but .* mirrors",
+    ),
+    "scaled": (
+        lambda stored: stored["frames"][3].update(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
+        "r_3.png must have a rotation, but its axes have lengths 0.5",
+    ),
+}
+
+
+@each("broken", [*BROKEN])
+def test_what_is_missing_or_broken_is_named(tmp_path, broken):
+    change, words = BROKEN[broken]
+    nerf(tmp_path)
+    changed(tmp_path, change)
+    with pytest.raises(BadInput, match=words):
+        read_capture(tmp_path, PLAIN)
+
+
 # Orientation
 
 
@@ -205,6 +247,18 @@ def test_a_mask_is_all_that_is_not_background(tmp_path, colours, alpha):
     image(cameras()[0])[0].save(tmp_path / "image.png")
     found = read_image(tmp_path / "image.png", tmp_path / "mask.png", 48)[1]
     assert found is not None and ((found[..., 0] > 0.5) == inside).all()
+
+
+def test_inverted_masks_and_broken_files_are_told(tmp_path):
+    idr(tmp_path)
+    for file in (tmp_path / "mask").iterdir():
+        Image.fromarray(255 - np.asarray(Image.open(file))).save(file)
+    with pytest.raises(BadInput, match="the masks are white along the border, as inverted ones"):
+        read_capture(tmp_path, READ)
+    file = tmp_path / "image" / "000003.png"
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(BadInput, match=r"000003.png cannot be read as an image"):
+        read_capture(tmp_path, READ)
 
 
 # Worlds
