@@ -12,6 +12,7 @@ from renderers.checks import BadInput
 
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4", "k5", "k6"), ("p1", "p2")
 BROWN = ("k1", "k2", "p1", "p2")
+NERFSTUDIO = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of its distortion_params
 PLAIN = {  # COLMAP's models, and the numbers behind focal lengths and principal point
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -119,7 +120,8 @@ def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
     fisheye = model in FISHEYE or bool(known.get("is_fisheye"))
     if fisheye and model in PLAIN:
         raise BadInput(f"{where}: is_fisheye does not fit camera_model {model}: leave one of them out")
-    bent = {name: float(known.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
+    stated = dict(zip(NERFSTUDIO, known.get("distortion_params") or (), strict=False))
+    bent = {name: float(known.get(name) or stated.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
     if fisheye and any(bent[name] for name in ("k5", "k6", "p1", "p2")):
         raise BadInput(f"{where}: a fisheye has k1 to k4, and this one k5, k6, p1 or p2 too: export it again")
     if not fisheye and bent["k4"] and model != "FULL_OPENCV" and not {"k5", "k6"} & set(known):

@@ -95,7 +95,7 @@ def looked_at(shots: Sequence[Shot], spans: Sequence[tuple[float, float] | None]
     motions = np.stack([shot.camera.camera_to_world.double().numpy() for shot in shots])
     centre, spread = _nearest(motions[:, :3, 3], motions[:, :3, 2])
     depths = ((centre - motions[:, :3, 3]) * motions[:, :3, 2]).sum(axis=1)
-    known = np.array([span for span in spans if span is not None])
+    known = np.array([span for span in spans if span is not None and 0 < span[0] < span[1]])
     if len(known) == len(shots):
         near, far = known.T
         beside = np.mean((depths < near) | (depths > far)) > BESIDE

@@ -21,6 +21,7 @@ from renderers.checks import BadInput
 BACKGROUND = 1.0  # behind an image with an alpha channel: white, as NeRF has it
 LABELS, HALF = 32, 127  # a mask whose largest value, or number of them, is small has labels; 0 is the background
 COLOURED = 40  # of 255: channels of a mask that differ more are a colour, as colours that differ more are two
+AT_BORDER = 0.1  # share of the border from which on a coloured mask has a black background, whatever touches the rest
 UPRIGHT, SIDEWAYS = 1, 5  # orientations of EXIF: the one that turns nothing; the first that swaps width and height
 SAME_SHAPE = 0.01  # most by which width over height of an image may differ from those of its camera, as a share
 
@@ -168,15 +169,17 @@ def _foreground(image: Image.Image) -> Image.Image:
     values = np.asarray(image.convert("L"))
     if 0 < values.max() <= HALF and (values.max() < LABELS or len(np.unique(values)) < LABELS):
         values = (255 * (values > 0)).astype(np.uint8)
+    elif LABELS <= values.min() < values.max():  # a grey background
+        values = ((values - values.min()) * (255 / (values.max() - values.min()))).astype(np.uint8)
     return Image.fromarray(values)
 
 
 def _unlike_border(colours: Int[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
-    """The pixels of other colours than the background: black where there is any, else the border's commonest."""
-    dark = colours.max(axis=-1) <= COLOURED
+    """The pixels of other colours than the background: black where the border has it, else the border's commonest."""
     border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
     values, counts = np.unique(border, axis=0, return_counts=True)
-    background = np.zeros(3) if dark.any() else values[counts.argmax()]
+    dark = (border.max(axis=-1) <= COLOURED).mean() > AT_BORDER
+    background = np.zeros(3) if dark else values[counts.argmax()]
     return np.abs(colours - background).max(axis=-1) > COLOURED
 
 

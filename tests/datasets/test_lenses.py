@@ -76,5 +76,11 @@ def test_other_lenses_are_refused_by_name(known, words):
         nerf_lens(known, "transforms.json")
 
 
+def test_a_list_of_numbers_is_in_the_order_of_nerfstudio():
+    assert nerf_lens({"distortion_params": [1, 2, 3, 0, 5, 6]}, "file") == nerf_lens(
+        {"k1": 1, "k2": 2, "k3": 3, "p1": 5, "p2": 6}, "file"
+    )
+
+
 def test_numbers_that_are_zero_are_no_lens():
     assert not nerf_lens({"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False}, "file").bends
