@@ -173,6 +173,11 @@ REPAIRED = {  # a mesh, its volume then, and the notes, without a warning
         1,
         ("12 doubled faces dropped",),
     ),
+    "two faces twice": (
+        Mesh(box().vertices, np.concatenate([box().faces, box().faces[:2]])),
+        1,
+        ("2 doubled faces dropped",),
+    ),
     "a part twice": (
         joined(box(), box(at=(2, 0, 0)), box()),
         2,
