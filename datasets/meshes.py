@@ -136,7 +136,11 @@ def _parts(path: Path, content: bytes) -> list[Any]:
         triangles, owner = polygons.triangles()
         if not len(triangles):
             count = len(polygons.vertices)
-            what = f"it holds {count} vertices, as points or lines" if count else f"nothing in it is as in {suffix}"
+            what = (
+                f"it holds {count} vertices, as points or lines"
+                if count
+                else f"it has no vertex either, as {suffix} writes them"
+            )
             raise ValueError(f"must have faces, found none: {what}; export it as a surface")
         shades = None if polygons.face_colours is None else polygons.face_colours[owner]
         painted = {"vertex_colors": polygons.vertex_colours, "face_colors": shades}

@@ -3,6 +3,7 @@
 import re
 import struct
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,18 @@ def read_ply(content: bytes) -> Polygons:
     Raises:
         ValueError: where its header is not understood, or what follows is less or more than the header describes.
     """
-    elements, body = _header(content.removeprefix(b"\xef\xbb\xbf"))
+    elements, kind, rest = _header(content.removeprefix(b"\xef\xbb\xbf"))
+    if kind != "ascii":
+        _fill_all(elements, Body(rest, ORDERS[kind], text=False))
+        return _polygons(elements)
+    try:
+        _fill_all(elements, _numbers(rest.split()))
+    except ValueError:  # with more in a line, perhaps, than the header describes
+        _fill_all(elements, _numbers(_described(rest, elements)))
+    return _polygons(elements)
+
+
+def _fill_all(elements: dict[str, Element], body: Body) -> None:
     at = 0
     for element in elements.values():
         try:
@@ -94,14 +106,14 @@ def read_ply(content: bytes) -> Polygons:
                 f"must be a whole .ply file, but it is truncated or damaged: it ends within the {element.count} rows "
                 f"of '{element.name}' that its header claims; export or copy it again"
             ) from None
-    if more := len(body.content[at:].strip(b"\0\r\n\t ")):
-        raise ValueError(
-            f"must end where its header says, found {more} bytes more; copy it again, as a binary file, or export it"
-        )
-    return _polygons(elements)
+    more = (len(body.content) - at) // 8 if body.text else len(body.content[at:].strip(b"\0\r\n\t "))
+    if more:
+        what = "numbers more" if body.text else "bytes more; copy it again, as a binary file"
+        raise ValueError(f"must end where its header says, found {more} {what}; export or copy it again")
 
 
-def _header(content: bytes) -> tuple[dict[str, Element], Body]:
+def _header(content: bytes) -> tuple[dict[str, Element], str, bytes]:
+    """The elements, not yet filled, the format, and what follows the header."""
     match = HEADER.match(content)
     if match is None:
         begins = content.startswith(b"ply")
@@ -124,15 +136,28 @@ def _header(content: bytes) -> tuple[dict[str, Element], Body]:
                 raise ValueError(f"must have a header that is understood, found '{line[:60]}'; export it again")
     if not kind:
         raise ValueError("must name its format in the header, as 'format ascii 1.0'; export it again")
-    rest = content[match.end() :]
-    return elements, Body(_doubles(rest) if kind == "ascii" else rest, ORDERS[kind], kind == "ascii")
+    return elements, kind, content[match.end() :]
 
 
-def _doubles(text: bytes) -> bytes:
+def _numbers(words: list[bytes]) -> Body:
     try:
-        return np.array(text.split(), dtype="<f8").tobytes()
+        return Body(np.array(words, dtype="<f8").tobytes(), "<", text=True)
     except ValueError as error:
         raise ValueError(f"must hold numbers after its header ({error}); export it again") from None
+
+
+def _described(text: bytes, elements: dict[str, Element]) -> list[bytes]:
+    """The words of a text, without those at the end of a line of which the header says nothing."""
+    lines = (line.split() for line in text.splitlines() if line.strip())
+    words = []
+    for element in elements.values():
+        for line in islice(lines, element.count):
+            at = 0
+            for _, length in element.codes.values():
+                size = int(line[at]) if length and at < len(line) and line[at].isdigit() else 0
+                at += 1 + size
+            words += line[:at]
+    return words + [word for line in lines for word in line]
 
 
 def _fill(element: Element, body: Body, at: int) -> int:

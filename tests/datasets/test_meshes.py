@@ -124,7 +124,10 @@ BROKEN = {
     "packed.obj": (b"\x1f\x8b\x08\x00", "found a file compressed by gzip; unpack it"),
     "longer.stl": (trimesh.creation.box().export(file_type="stl") + b"\0", "684 bytes for the 12 faces .* found 685"),
     "packed.glb": (b'glTF{"extensionsRequired": ["KHR_draco_mesh_compression"]}', "found KHR_draco_mesh_compression"),
-    "other.obj": (trimesh.creation.box().export(file_type="off").encode(), "nothing in it is as in .obj"),
+    "other.obj": (
+        trimesh.creation.box().export(file_type="off").encode(),
+        "it has no vertex either, as .obj writes them",
+    ),
     "page.stl": (b"\n<!DOCTYPE html>\n", "found a web page"),
 }
 

@@ -196,6 +196,10 @@ TETRAHEDRA = {
     "two counts": (read_off, "off\n4 4\n" + ROWS),
     "no header": (read_off, "4 4 6\n" + ROWS),
     "one line": (read_off, " ".join(f"OFF 4 4 6 {ROWS}".split())),
+    "a text with more in a line than its header says": (
+        read_ply,
+        HEAD + "element face 4\nproperty list uchar int vertex_indices\nend_header\n" + ROWS.replace("\n", " 9 8 x\n"),
+    ),
     "a strip": (read_ply, STRIPS + "\n6 0 2 1 3 0 2\n"),
     "strips that begin anew": (read_ply, STRIPS + "\n13 0 2 1 -1 1 2 3 3 -1 1 3 0 2\n"),
 }
@@ -223,7 +227,7 @@ REFUSED = {
     "words": (read_off, "OFF\n4 4 6\n" + ROWS.replace("3 0 2 1", "3 0 two 1"), "'two'"),
     "no list": (read_ply, f"{HEAD}element face 1\nproperty int a\nend_header\n" + "0 " * 13, "found a;"),
     "rows cut short": (read_ply, STRIPS, "ends within the 1 rows of 'tristrips'"),
-    "a longer body": (read_ply, STRIPS + "\n3 0 1 2 7\n", "must end where its header says"),
+    "a longer body": (read_ply, STRIPS + "\n3 0 1 2\n7 7\n", "header says, found 2 numbers more"),
     "no end of the header": (read_ply, HEAD, "its header has no line 'end_header'"),
     "an unknown type": (read_ply, HEAD.replace("float x", "real x") + "end_header\n", "found 'property real x'"),
 }
