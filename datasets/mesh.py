@@ -238,8 +238,9 @@ class _Samples:
             self._ask(~(above > KEPT * fall) & ~(below > KEPT * fall), stride)
             values = self.values[_every(stride)]
             known = self.known[_every(stride)] & ~np.isnan(values)
-            if not known.any():
-                return self.values.fill(np.nan)
+            if not known.any():  # NaN everywhere: nothing to search for
+                self.values[...] = np.nan
+                return
             above, below = np.where(known, values, above), np.where(known, -values, below)
         outside, inside = (_between(bound, slope * self.spacing) > 0 for bound in (above, below))
         self._ask(~outside & ~inside, 1)
@@ -310,7 +311,7 @@ def _between(bound: Float[np.ndarray, "n n n"], fall: float) -> Float[np.ndarray
     finer = np.empty((2 * len(bound) - 1,) * 3, dtype=bound.dtype)
     for odd in product((0, 1), repeat=3):
         around = bound
-        for axis in np.flatnonzero(odd):
+        for axis in np.flatnonzero(odd).tolist():
             around = np.maximum(*_neighbours(around, axis))
         finer[tuple(slice(start, None, 2) for start in odd)] = around - fall * sqrt(sum(odd))
     return finer
