@@ -152,7 +152,7 @@ def read_capture(folder: Path, reading: Reading) -> Capture:
     Raises:
         BadInput: where something is missing, or cameras and masks do not fit.
     """
-    layout = find_layout(folder, reading.images)
+    layout = find_layout(folder, reading.images, masks=reading.masks)
     if len(layout.frames) < FEWEST:
         raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
     if layout.rival:
@@ -186,7 +186,6 @@ def _by_masks(layout: Layout, reading: Reading) -> Capture:
 def _capture(layout: Layout, reading: Reading) -> Capture:
     """The photographs of a layout, with their fit."""
     frames, middle = _centred(layout.frames, AXES[reading.axes])
-    frames = frames if reading.masks else [replace(frame, mask=None) for frame in frames]
     shots = [take(frame, reading.longest) for frame in frames]
     masked = reading.masks and _all_masked(shots)
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]

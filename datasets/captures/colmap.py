@@ -18,10 +18,11 @@ IMAGES = ("images", "images_2", "images_4", "images_8", "input", "image", ".")
 MOST = 0.9  # of the points lie in the sphere: others may be far away
 
 
-def colmap(folder: Path, images: str | None = None) -> Layout | None:
+def colmap(folder: Path, masked: bool, images: str | None = None) -> Layout | None:
     """The model with the most images, read by pycolmap; its points lie about the object, or about all that is seen.
 
     Args:
+        masked: whether masks are looked for.
         images: the folder of images; None for the usual ones.
     """
     places = _models(folder)
@@ -41,7 +42,7 @@ def colmap(folder: Path, images: str | None = None) -> Layout | None:
     base, found, how = max(tried, key=lambda one: len(one[1]))
     short = {name: Path(relpath(file, base)).as_posix() for name, file in sorted(found.items())}
     there = {short[name]: file for name, file in found.items()}
-    masks, masked = masks_of(folder, there)
+    masks, masked = masks_of(folder, there if masked else {})
     frames = [
         Frame(found[name], *cameras[name][:2], masks.get(path), *cameras[name][2:]) for name, path in short.items()
     ]

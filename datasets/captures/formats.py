@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -19,11 +20,12 @@ KNOWN = (
 )
 
 
-def find_layout(folder: Path, images: str | None = None) -> Layout:
+def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) -> Layout:
     """The photographs of a folder, in the first known format that it has.
 
     Args:
         images: where COLMAP's images are, in the folder or elsewhere; None for the usual places.
+        masks: whether masks are looked for.
 
     Raises:
         BadInput: where it has none, where an image has no camera, or where a file cannot be read.
@@ -31,17 +33,17 @@ def find_layout(folder: Path, images: str | None = None) -> Layout:
     if not folder.is_dir():
         what = f"{folder} is a file" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(f"{what}: name the folder that has the photographs and their cameras")
-    readers: dict[str, Callable[[Path], Layout | None]] = {
+    readers: dict[str, Callable[[Path, bool], Layout | None]] = {
         "DVR": dvr,
         "IDR/NeuS": idr,
         "NeRF": transforms,
         "Middlebury": middlebury,
         "LLFF": llff,
-        "COLMAP": lambda folder: colmap(folder, images),
+        "COLMAP": lambda folder, masks: colmap(folder, masks, images),
         "BlendedMVS": blended_mvs,
         "Choy": choy,
     }
-    found = [layout for name, read in readers.items() if (layout := _read(name, read, folder))]
+    found = [layout for name, read in readers.items() if (layout := _read(name, partial(read, folder, masks), folder))]
     if not found:
         inner = next((one for one in sorted(folder.glob("*/")) if any(one.glob("cameras*.npz"))), None)
         other = f"; name one of its folders, such as {inner}" if inner else ""
@@ -54,14 +56,14 @@ def find_layout(folder: Path, images: str | None = None) -> Layout:
     return replace(usable[0], notes=notes)
 
 
-def _read(name: str, read: Callable[[Path], Layout | None], folder: Path) -> Layout | None:
+def _read(name: str, read: Callable[[], Layout | None], folder: Path) -> Layout | None:
     """What a format's reader finds; where a file of it is broken, an error that names the format.
 
     Raises:
         BadInput: where something is missing, or cannot be read.
     """
     try:
-        return read(folder)
+        return read()
     except BadInput:
         raise
     except (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, BadZipFile, RuntimeError) as error:

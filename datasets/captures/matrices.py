@@ -15,17 +15,17 @@ SIMILAR = 1e-4  # most by which scale_mat may differ from a similarity, and from
 CUBE = 0.75**0.5  # radius of the sphere about DVR's cube from -1/2 to 1/2
 
 
-def idr(folder: Path) -> Layout | None:
+def idr(folder: Path, masked: bool) -> Layout | None:
     """IDR and NeuS: projections world_mat_i, and scale_mat_i from the unit sphere; i counts the sorted names."""
-    return _layout(folder, "IDR/NeuS", ("cameras_sphere.npz", "cameras.npz"), 1.0)
+    return _layout(folder, masked, "IDR/NeuS", ("cameras_sphere.npz", "cameras.npz"), 1.0)
 
 
-def dvr(folder: Path) -> Layout | None:
+def dvr(folder: Path, masked: bool) -> Layout | None:
     """DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths."""
-    return _layout(folder, "DVR", ("cameras.npz",), CUBE)
+    return _layout(folder, masked, "DVR", ("cameras.npz",), CUBE)
 
 
-def _layout(folder: Path, name: str, files: tuple[str, ...], radius: float) -> Layout | None:
+def _layout(folder: Path, masked: bool, name: str, files: tuple[str, ...], radius: float) -> Layout | None:
     """What a folder has in either format; `radius` is that of the sphere about the object, before scale_mat."""
     file = next((file for one in files if (file := folder / one).is_file()), None)
     if file is None:
@@ -42,7 +42,7 @@ def _layout(folder: Path, name: str, files: tuple[str, ...], radius: float) -> L
     images = first_images(folder, "image", "images")
     answers = by_order([*images], count, file.name)
     scale, notes = _scale(known, count, str(file))
-    masks, how = masks_of(folder, images, sorted_too=True)
+    masks, how = masks_of(folder, images if masked else {}, sorted_too=True)
     make = _dvr_frames(file, known, scale, images) if name == "DVR" else _idr_frames(file, known, scale)
 
     def frame(i: int, name: str) -> Frame:

@@ -17,7 +17,7 @@ from renderers.checks import BadInput
 FILES = ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")
 
 
-def transforms(folder: Path) -> Layout | None:
+def transforms(folder: Path, masked: bool) -> Layout | None:
     """camera_to_world in OpenGL's axes (in OpenCV's where `from_na` is true); fields of view, or intrinsics; a lens."""
     files = [file for name in FILES if (file := folder / name).is_file()]
     if not files:
@@ -35,7 +35,7 @@ def transforms(folder: Path) -> Layout | None:
         twice = next(path for path in paths if paths.count(path) > 1)
         raise BadInput(f"{files[0]} has {twice} twice: name each image once")
     found, how = located([*known], folder)
-    masks = _masks(folder, known, found)
+    masks = _masks(folder, known, found) if masked else {}
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
     missing = [path for path in known if path not in found]
     notes = (*([how] if how else []), *without_image(missing))

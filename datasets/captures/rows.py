@@ -11,7 +11,7 @@ from datasets.captures.pairing import by_order, first_images, images_in, located
 from renderers.checks import BadInput
 
 
-def middlebury(folder: Path) -> Layout | None:
+def middlebury(folder: Path, masked: bool) -> Layout | None:
     """Middlebury: a line for each image: its name, K, R and t, row by row."""
     files = [file for file in sorted(folder.glob("*_par.txt")) if not file.name.startswith(".")]
     if not files:
@@ -29,14 +29,14 @@ def middlebury(folder: Path) -> Layout | None:
     there = {file.name: file for file in found.values()}
     if lost := [name for name in images_in(folder) if name not in there]:
         raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
-    masks, masked = masks_of(folder, there)
+    masks, masked = masks_of(folder, there if masked else {})
     frames = tuple(Frame(file, *cameras[name], masks.get(file.name)) for name, file in found.items())
     missing = [name for name in cameras if name not in found]
     notes = (*([how] if how else []), *masked, *without_image(missing))
     return Layout("Middlebury", frames, None, notes, missing=missing[0] if missing else "")
 
 
-def llff(folder: Path) -> Layout | None:
+def llff(folder: Path, masked: bool) -> Layout | None:
     """LLFF: a row an image, by sorted names: camera_to_world with axes down, right, backward; size; focal; depths."""
     file = folder / "poses_bounds.npy"
     if not file.is_file():
@@ -45,7 +45,7 @@ def llff(folder: Path) -> Layout | None:
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
     answers = by_order([*images], len(rows), file.name)
-    masks, how = masks_of(folder, images)
+    masks, how = masks_of(folder, images if masked else {})
 
     def frame(i: int, name: str) -> Frame:
         down, right, back, centre, (height, width, focal) = rows[i, :15].reshape(3, 5).T
@@ -59,7 +59,7 @@ def llff(folder: Path) -> Layout | None:
     return Layout("LLFF", frames, None, (*notes, *how), rival=rival, missing="images/*")
 
 
-def blended_mvs(folder: Path) -> Layout | None:
+def blended_mvs(folder: Path, masked: bool) -> Layout | None:
     """BlendedMVS and MVSNet: a file for each image: world_to_camera, K, and the range of depths."""
     files = {file.name[: -len("_cam.txt")]: file for file in sorted(folder.glob("cams/[!.]*_cam.txt"))}
     if not files:
@@ -69,7 +69,7 @@ def blended_mvs(folder: Path) -> Layout | None:
     pairs, _ = paired([*files], [*images])
     if lost := [name for name in images if name not in pairs.values()]:
         raise BadInput(f"{images[lost[0]]} has no camera: there is no cams/{Path(lost[0]).stem}_cam.txt")
-    masks, how = masks_of(folder, images)
+    masks, how = masks_of(folder, images if masked else {})
     frames = [_mvs_frame(files[name], images[image], masks.get(image)) for name, image in pairs.items()]
     missing = [name for name in files if name not in pairs]
     notes = (*how, *without_image(missing))
@@ -89,7 +89,7 @@ def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
 FOCAL, SENSOR, FARTHEST = 35.0, 32.0, 1.75  # of Choy's camera in Blender: millimetres; the unit of its distances
 
 
-def choy(folder: Path) -> Layout | None:
+def choy(folder: Path, masked: bool) -> Layout | None:
     """Choy's renderings: a line for each image: azimuth, elevation, roll, distance, field of view."""
     files = [file for name in (".", "rendering") if (file := folder / name / "rendering_metadata.txt").is_file()]
     if not files:

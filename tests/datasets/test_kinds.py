@@ -98,6 +98,14 @@ def test_where_names_do_not_tell_what_is_missing_masks_do(tmp_path, lost):
         read_capture(tmp_path, PLAIN)
 
 
+def test_without_masks_nothing_is_said_of_them(tmp_path):
+    idr(tmp_path)
+    (tmp_path / "mask" / "004.png").rename(tmp_path / "mask" / "other.png")
+    with pytest.raises(BadInput, match="has no mask"):
+        read_capture(tmp_path, READ)
+    assert read_capture(tmp_path, PLAIN).masks == ""
+
+
 def test_files_of_a_mac_are_no_images(tmp_path):
     idr(tmp_path)
     for file in [*tmp_path.rglob("*.png")]:
