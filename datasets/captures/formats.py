@@ -51,6 +51,8 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
     usable = [layout for layout in found if layout.frames]
     if not usable:
         raise BadInput(_no_images(folder, found))
+    if images is not None and usable[0].format != "COLMAP":
+        raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {usable[0].format}: leave it out")
     others = ", ".join(layout.format for layout in found if layout is not usable[0])
     notes = (*usable[0].notes, f"other cameras in the folder are not used: {others}") if others else usable[0].notes
     return replace(usable[0], notes=notes)

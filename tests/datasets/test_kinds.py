@@ -104,6 +104,9 @@ def test_without_masks_nothing_is_said_of_them(tmp_path):
     with pytest.raises(BadInput, match="has no mask"):
         read_capture(tmp_path, READ)
     assert read_capture(tmp_path, PLAIN).masks == ""
+    shutil.rmtree(tmp_path / "mask")
+    with pytest.raises(BadInput, match=r"dataset\.images=image is for COLMAP, and .* has IDR/NeuS: leave it out"):
+        read_capture(tmp_path, Reading(48, images="image"))
 
 
 def test_files_of_a_mac_are_no_images(tmp_path):

@@ -127,6 +127,11 @@ def test_photographs_on_disk_are_learnt(tmp_path, masks, margin):
     assert ("mask_iou" in record.metrics) == (masks != "none")
     assert not {"chamfer_l1", "seen_chamfer_l1"} & set(record.metrics)
     colours = assert_coloured_mesh(tmp_path)
+    there, back = (trimesh.load_mesh(tmp_path / f"mesh{name}.ply", process=False) for name in ("", "_world"))
+    to_world = np.loadtxt(tmp_path / "to_world.txt")
+    np.testing.assert_allclose(back.vertices, there.vertices @ to_world[:3, :3].T + to_world[:3, 3], rtol=1e-12)
+    assert (back.visual.vertex_colors == there.visual.vertex_colors).all()
+    assert any(", ".join(str(float(value)) for value in to_world[:3, 3]) in note for note in record.notes)
     assert masks == "none" or colours[:, 0].mean() > colours[:, 2].mean() + 15  # the ball is orange
     assert all((tmp_path / name).is_file() == (masks == "none") for name in PICTURES)
     assert any(note.endswith("3 of them are held out") for note in record.notes)
