@@ -23,6 +23,7 @@ from bench.config import CONF, build, check_names, register
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.run import library
+from bench.run.pack import register_slurm
 from tests import composing, documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
 from tests.run.driving import command as typed
@@ -81,6 +82,7 @@ def first_cell(arguments: list[str]) -> tuple[list[str], list[str]]:
 def composed(arguments: list[str]) -> DictConfig:
     """The configuration of a command's first cell."""
     register()
+    register_slurm()
     folders, overrides = first_cell(arguments)
     extra = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
     spaces = any("method=space/" in override for override in overrides)
