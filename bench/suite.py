@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from math import log
 from pathlib import Path
 
-from bench.records.format import number
+from bench.records.format import number, plural
 from bench.records.read import RESULTS, read_records
 from bench.records.record import read_record
 from bench.report.suite.attempts import (
@@ -114,6 +114,10 @@ def show(results_dir: Path) -> int:
     standing = Standing.of_all([*read_attempts(paper.SHIPPED)[0], *kept])
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
+    stand = sum(one in kept for one in standing.attempts)
+    print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
+    print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
+    print(f"rank {'renderer':<24} share of targets reached; in each set; field values")
     for row in standing.rows:
         parts = [
             f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)

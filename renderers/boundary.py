@@ -99,6 +99,10 @@ def _check_part(name: str, part: str, value: object, rays: Rays) -> None:
         whose = "a Status per ray" if part == "status" else "as the rays are"
         remedy = f"convert it with .to(torch.{_short(dtype)})"
         raise BrokenContract(f"{name}: {part} must be {_short(dtype)}, {whose}, not {_short(value.dtype)}: {remedy}")
+    if value.requires_grad and not torch.is_grad_enabled():
+        raise BrokenContract(
+            f"{name}: {part} has a graph although gradients are off: do without torch.enable_grad, or detach it"
+        )
     if value.device != rays.origins.device:
         remedy = "create tensors with device=rays.origins.device"
         raise BrokenContract(f"{name}: {part} must be on {rays.origins.device}, not on {value.device}: {remedy}")

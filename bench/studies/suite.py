@@ -61,7 +61,7 @@ def _line(standing: Standing, row: str) -> dict[str, Any]:
         **{name: standing.share(row, name).value for name in standing.sets},
         **{"at_dist": standing.share_at(row, 1.0), "wrong": standing.wrong(row), "ratio": standing.ratio(row)},
         "seconds": seconds if seconds and seconds.known else None,
-        "failed": ", ".join(filter(None, [failed, f"{lacking} missing" if lacking else ""])),
+        "failed": ", ".join(filter(None, [failed, f"{lacking} not run" if lacking else ""])),
     }
 
 
@@ -150,7 +150,7 @@ def _doubts(standing: Standing) -> list[str]:
     loaded = sum(not one.timed for one in standing.attempts)
     return [
         f"Not shown, since their set has other settings: runs of {', '.join(other)}." if other else "",
-        f"Not shown: {alone} runs at problems that not all rows have." if alone else "",
+        f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
         f"Runs of {versions} versions of the code." if versions > 1 else "",
         f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone." if machines > 1 else "",
         f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded." if loaded else "",

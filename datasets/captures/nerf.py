@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from datasets.captures.frames import OPENGL, Frame, Layout, image_size, inverse, need
 from datasets.captures.lenses import nerf_lens
-from datasets.captures.pairing import located, natural, without_image
+from datasets.captures.pairing import located, masks_of, natural, without_image
 from renderers.checks import BadInput
 
 FILES = ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")
@@ -35,21 +35,28 @@ def transforms(folder: Path, masked: bool) -> Layout | None:
         twice = next(path for path in paths if paths.count(path) > 1)
         raise BadInput(f"{files[0]} has {twice} twice: name each image once")
     found, how = located([*known], folder)
-    masks = _masks(folder, known, found) if masked else {}
+    masks, told = _masks(folder, known, found) if masked else ({}, ())
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
     missing = [path for path in known if path not in found]
-    notes = (*([how] if how else []), *without_image(missing))
+    notes = (*([how] if how else []), *told, *without_image(missing))
     frames = sorted(frames, key=lambda frame: natural(frame.image.name))
     return Layout("NeRF", tuple(frames), None, notes, missing=missing[0] if missing else "")
 
 
-def _masks(folder: Path, known: Mapping[str, Mapping[str, Any]], found: Mapping[str, Path]) -> dict[str, Path]:
-    """The masks that frames name, by their images' paths."""
+def _masks(
+    folder: Path, known: Mapping[str, Mapping[str, Any]], found: Mapping[str, Path]
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """The masks that frames name, by their images' paths; where none does, those of a folder `mask`, with a note."""
     named = {path: str(frame["mask_path"]) for path, frame in known.items() if path in found and frame.get("mask_path")}
+    if not named:
+        files = {file.name: file for file in found.values()}
+        own, notes = masks_of(folder, files) if len(files) == len(found) else ({}, ())
+        told = "the folder of masks is used, though transforms.json does not name it"
+        return {path: own[file.name] for path, file in found.items() if own}, (told, *notes) if own else ()
     masks, _ = located(named.values(), folder)
     if lost := [mask for mask in named.values() if mask not in masks]:
         raise BadInput(f"the mask {lost[0]} that transforms.json names is not in {folder}: add it, or use no masks")
-    return {path: masks[mask] for path, mask in named.items()}
+    return {path: masks[mask] for path, mask in named.items()}, ()
 
 
 def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) -> Frame:

@@ -77,7 +77,8 @@ def made(
     notes = without_image(unused) if len(answers) == 1 else (f"no image for {len(unused)} of the cameras",)
     if names != sorted(names, key=natural):
         one, other = next(pair for pair in pairwise(names) if natural(pair[0]) > natural(pair[1]))
-        notes = (f"{len(names)} images, paired with cameras by name order: {one} before {other}", *notes)
+        told = f"{len(names)} images, paired with cameras by name order: {one} before {other}"
+        notes = (f"{told}; if cameras follow the numbers, give these leading zeros", *notes)
     return found[0], found[1] if len(found) > 1 else (), notes
 
 

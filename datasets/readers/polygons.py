@@ -33,8 +33,8 @@ class Polygons:
         wrong = self.corners[(self.corners < 0) | (self.corners >= len(self.vertices))]
         if len(wrong):
             raise ValueError(
-                f"a face must use the file's {len(self.vertices)} vertices, but one uses number {wrong[0]}, "
-                "counted from 0; export or copy it again"
+                f"a face must use the file's {len(self.vertices)} vertices, but one uses number {wrong[0]} "
+                f"counted from 0, {wrong[0] + 1} from 1; export or copy it again"
             )
 
     def triangles(self) -> tuple[Int[np.ndarray, "t 3"], Int[np.ndarray, " t"]]:

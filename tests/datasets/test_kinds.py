@@ -109,6 +109,18 @@ def test_without_masks_nothing_is_said_of_them(tmp_path):
         read_capture(tmp_path, Reading(48, images="image"))
 
 
+def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
+    nerf(tmp_path)
+    half = np.zeros(SIZE, np.uint8)
+    half[:, : SIZE[1] // 2] = 255
+    (tmp_path / "masks").mkdir()
+    for file in sorted(tmp_path.glob("train/*.png")):
+        Image.fromarray(half).save(tmp_path / "masks" / file.name)
+    own = read_capture(tmp_path, READ)
+    assert any("does not name it" in note for note in own.notes)
+    assert {float(shot.mask.float().mean()) for shot in own.shots} == {0.5}
+
+
 def test_files_of_a_mac_are_no_images(tmp_path):
     idr(tmp_path)
     for file in [*tmp_path.rglob("*.png")]:

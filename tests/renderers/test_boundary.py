@@ -96,6 +96,13 @@ def test_a_broken_rendering_is_an_error_that_names_renderer_and_part(name):
         rendered(Mine(change), ball(), RAYS)
 
 
+def test_a_graph_where_none_is_wanted_is_an_error():
+    bound = Mine(lambda r: changed(r, residual=r.residual.clone().requires_grad_()))
+    rendered(bound, ball(), RAYS)
+    with torch.no_grad(), pytest.raises(BrokenContract, match="residual has a graph although gradients are off"):
+        rendered(bound, ball(), RAYS)
+
+
 def test_a_claimed_gradient_that_is_missing_is_an_error():
     towards_field = r"Mine\.capabilities\.field_gradient is True, but the distances of its hits carry no gradient "
     with pytest.raises(BrokenContract, match=towards_field + "towards the field's parameters: attach one .*=False"):

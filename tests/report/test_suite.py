@@ -249,7 +249,8 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
     assert show(tmp_path / "own") == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0].split()[:2] == ["1", "Dist"] and "Mine" in said[1] and Path(said[-1]).is_file()
+    assert said[0].startswith("1 run of ") and "which 1 stand" in said[0]
+    assert said[3].split()[:2] == ["1", "Dist"] and "Mine" in said[4] and Path(said[-1]).is_file()
     table = (tmp_path / "own" / "paper" / "suite.md").read_text()
     assert "| Dist |" in table and "| Mine |" in table and "reaches 100 %" in table
     assert [one.row for one in read_attempts(tmp_path / "own")[0]] == ["Mine"]
