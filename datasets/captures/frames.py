@@ -52,6 +52,11 @@ class Frame:
             raise BadInput(
                 f"the camera of {self.image} must have finite numbers and positive focal lengths: export it again"
             )
+        if np.abs(self.intrinsics[2] - (0, 0, 1)).max() > RIGID or abs(self.intrinsics[1, 0]) > RIGID:
+            raise BadInput(
+                f"the intrinsics of {self.image} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], not "
+                f"{self.intrinsics.tolist()}: they may be transposed"
+            )
         rotation = self.world_to_camera[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
             lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(rotation, axis=1))

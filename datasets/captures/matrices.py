@@ -32,7 +32,7 @@ def _layout(folder: Path, masked: bool, name: str, files: tuple[str, ...], radiu
         return None
     with np.load(file) as stored:
         known = {key: np.asarray(stored[key], dtype=np.float64) for key in stored if "_mat_" in key}
-    if ("camera_mat_0" in known) != (name == "DVR"):
+    if _is_dvr(known) != (name == "DVR"):
         return None
     count = sum(key.startswith("world_mat_") and key[10:].isdigit() for key in known)
     if count == 0:
@@ -52,6 +52,14 @@ def _layout(folder: Path, masked: bool, name: str, files: tuple[str, ...], radiu
     sphere = (np.zeros(3), radius) if any(key.startswith("scale_mat_") for key in known) else None
     notes = (*notes, *found, *how)
     return Layout(name, frames, sphere, notes, world=scale, rival=rival, missing="image/*")
+
+
+def _is_dvr(known: Matrices) -> bool:
+    """Whether intrinsics stand apart, in camera_mat_i: NeuS's scripts write them beside a world_mat_i that has them."""
+    if not {"camera_mat_0", "world_mat_0"} <= set(known):
+        return False
+    lengths = np.linalg.norm(known["world_mat_0"][:3, :3], axis=1)
+    return bool(lengths.max() <= 1.01 * lengths.min())
 
 
 def _idr_frames(

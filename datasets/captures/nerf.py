@@ -73,7 +73,10 @@ def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) ->
 def _intrinsics(known: Mapping[str, Any], width: int, height: int, where: str) -> Float[np.ndarray, "3 3"]:
     """Intrinsics from a matrix, from focal lengths, or from fields of view."""
     if (matrix := known.get("intrinsic_matrix")) is not None:
-        return np.asarray(matrix, dtype=np.float64)[:3, :3]
+        found = np.asarray(matrix, dtype=np.float64)
+        if found.shape not in ((3, 3), (3, 4), (4, 4)):
+            raise BadInput(f"{where}: intrinsic_matrix must be 3 x 3, not of shape {list(found.shape)}")
+        return found[:3, :3]
     across = _focal(known, "x", width, where)
     down = _focal(known, "y", height, where)
     if across is None and down is None:

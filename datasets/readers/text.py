@@ -84,6 +84,8 @@ def decoded(content: bytes) -> str:
 
 def _in_rows(lines: list[list[str]], vertex_count: int, face_count: int) -> list[list[str]]:
     """The words of each vertex and face of an .off file that breaks its lines elsewhere; none if it is not whole."""
+    if min(vertex_count, face_count) < 0 or 3 * vertex_count + face_count > sum(map(len, lines)):
+        return []
     rest = islice((word for line in lines for word in line), 3, None)
     rows = [[*islice(rest, 3)] for _ in range(vertex_count)]
     rows += [[count, *islice(rest, int(count))] for count in rest if count.isdigit()]

@@ -217,7 +217,7 @@ REFUSED = {
     "comma": (read_obj, "v 0,5 0 0\n", r"'v x y z', found 'v 0,5 0 0'"),
     "zero": (read_obj, V + "f 0 1 2\n", "found 'f 0 1 2'"),
     "too far back": (read_obj, V + "f -5 1 2\n", "from -4 to -1, found 'f -5 1 2'"),
-    "beyond": (read_obj, V + "f 1 2 5\n", "4 vertices, but one uses number 4, counted from 0"),
+    "beyond": (read_obj, V + "f 1 2 5\n", "4 vertices, but one uses number 4 counted from 0, 5 from 1"),
     "free form": (read_obj, V + F + "surf 0 1 0 1 1 2 3 4\n", "has a free-form surface"),
     "four dimensions": (read_off, "4OFF\n4 4 6\n" + ROWS, "must be text and begin with OFF.*found '4OFF'"),
     "binary": (read_off, "OFF BINARY\n\0\0", "must be text .*found 'OFF BINARY'"),
