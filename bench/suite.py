@@ -141,7 +141,8 @@ def verify(results_dir: Path, count: int) -> int:
     kept, problems = read_attempts(results_dir if place(results_dir).is_dir() else paper.SHIPPED)
     found = [one for one in kept if one.ok]
     if not found:
-        raise ValueError(f"{place(results_dir)} has no results that ended ok: type python -m bench.suite")
+        unread = f" ({'; '.join(problems)})" if problems else ""
+        raise ValueError(f"{place(results_dir)} has no results that ended ok{unread}: type python -m bench.suite")
     agree = [_agrees(one) for one in random.sample(found, min(count, len(found)))]
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
