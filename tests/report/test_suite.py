@@ -311,10 +311,10 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
     assert [cost for cost, _ in spent["Slow"]] == [cost for cost, _ in spent["Exact"]]
     assert all(slow > 5 + exact / 2 for (_, slow), (_, exact) in zip(spent["Slow"], spent["Exact"], strict=True))
     assert main(["verify=1", f"results_dir={results}"]) == 0
-    kept = [
-        replace(one, final=one.final / 2, curve=[[*spent, float(f"{error / 2:.5g}")] for *spent, error in one.curve])
-        for one in read_attempts(results)[0]
+    halves = [
+        (one, [[*spent, float(f"{error / 2:.5g}")] for *spent, error in one.curve]) for one in read_attempts(results)[0]
     ]
+    kept = [replace(one, final=curve[-1][2], curve=curve) for one, curve in halves]
     for path in place(results).iterdir():
         path.unlink()
     write_attempts(kept, results)
