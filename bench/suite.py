@@ -116,7 +116,8 @@ def show(results_dir: Path) -> int:
         print(f"not read: {problem}", file=sys.stderr)
     stand = sum(one in kept for one in standing.attempts)
     print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
-    print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
+    if any(map(standing.lacking, standing.rows)):
+        print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
     print(f"rank {'renderer':<24} share of targets reached; in each set; field values")
     for row in standing.rows:
         parts = [

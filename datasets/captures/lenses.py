@@ -120,7 +120,13 @@ def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
     fisheye = model in FISHEYE or bool(known.get("is_fisheye"))
     if fisheye and model in PLAIN:
         raise BadInput(f"{where}: is_fisheye does not fit camera_model {model}: leave one of them out")
-    stated = dict(zip(NERFSTUDIO, known.get("distortion_params") or (), strict=False))
+    listed = known.get("distortion_params") or ()
+    if len(listed) not in (0, len(NERFSTUDIO)) and not (fisheye and len(listed) == 4):
+        raise BadInput(
+            f"{where}: distortion_params must be {', '.join(NERFSTUDIO)}, or k1 to k4 of a fisheye, not "
+            f"{len(listed)} numbers: give them by name"
+        )
+    stated = dict(zip(NERFSTUDIO, listed, strict=False))
     bent = {name: float(known.get(name) or stated.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
     if fisheye and any(bent[name] for name in ("k5", "k6", "p1", "p2")):
         raise BadInput(f"{where}: a fisheye has k1 to k4, and this one k5, k6, p1 or p2 too: export it again")

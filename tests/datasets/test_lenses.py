@@ -82,5 +82,12 @@ def test_a_list_of_numbers_is_in_the_order_of_nerfstudio():
     )
 
 
+@pytest.mark.parametrize("known", [{"distortion_params": [0.1, 0, 0, 0, 0.01]}, {"distortion_params": [0.1, 0, 0, 0]}])
+def test_a_list_of_another_length_is_refused(known):
+    with pytest.raises(BadInput, match=r"distortion_params must be .* not \d numbers: give them by name"):
+        nerf_lens(known, "file")
+    assert nerf_lens({"distortion_params": [0.1, 0, 0, 0], "is_fisheye": True}, "file").fisheye
+
+
 def test_numbers_that_are_zero_are_no_lens():
     assert not nerf_lens({"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False}, "file").bends
