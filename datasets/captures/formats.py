@@ -43,7 +43,16 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
         "BlendedMVS": blended_mvs,
         "Choy": choy,
     }
-    found = [layout for name, read in readers.items() if (layout := _read(name, partial(read, folder, masks), folder))]
+    found, unread = list[Layout](), list[str]()
+    for name, read in readers.items():
+        try:
+            layout = _read(name, partial(read, folder, masks), folder)
+        except BadInput:
+            if not any(one.frames for one in found):
+                raise
+            unread.append(name)  # beside cameras that are read
+        else:
+            found += [layout] if layout else []
     if not found:
         inner = next((one for one in sorted(folder.glob("*/")) if any(one.glob("cameras*.npz"))), None)
         other = f"; name one of its folders, such as {inner}" if inner else ""
@@ -53,7 +62,7 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
         raise BadInput(_no_images(folder, found))
     if images is not None and usable[0].format != "COLMAP":
         raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {usable[0].format}: leave it out")
-    others = ", ".join(layout.format for layout in found if layout is not usable[0])
+    others = ", ".join([*(layout.format for layout in found if layout is not usable[0]), *unread])
     notes = (*usable[0].notes, f"other cameras in the folder are not used: {others}") if others else usable[0].notes
     return replace(usable[0], notes=notes)
 
@@ -68,7 +77,17 @@ def _read(name: str, read: Callable[[], Layout | None], folder: Path) -> Layout 
         return read()
     except BadInput:
         raise
-    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, BadZipFile, RuntimeError) as error:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        EOFError,
+        MemoryError,
+        BadZipFile,
+        RuntimeError,
+    ) as error:
         what = " ".join(str(error).split())
         raise BadInput(f"the {name} cameras of {folder} cannot be read ({what}): export them again") from error
 

@@ -18,6 +18,7 @@ from renderers.checks import BadInput
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
 HALF = 0.5  # pixels: where the first pixel's centre is at whole numbers, the principal point moves by this
+UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # what Pillow says of a broken image
 RIGID = 5e-3  # most by which a rotation's axes may differ from unit and orthogonal ones
 ROUNDED = 1e-5  # those that differ more are replaced by the nearest rotation: the file has few digits
 
@@ -104,7 +105,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return image.size
-    except OSError as error:
+    except UNREADABLE as error:
         raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from datasets.captures.frames import Frame
+from datasets.captures.frames import UNREADABLE, Frame
 from datasets.captures.lenses import Lens
 from datasets.extras import install
 from datasets.shot import Shot
@@ -23,7 +23,6 @@ LABELS, HALF = 32, 127  # a mask whose largest value, or number of them, is smal
 COLOURED = 40  # of 255: channels of a mask that differ more are a colour, as colours that differ more are two
 AT_BORDER = 0.1  # share of the border from which on a coloured mask has a black background, whatever touches the rest
 UPRIGHT, SIDEWAYS = 1, 5  # orientations of EXIF: the one that turns nothing; the first that swaps width and height
-SAME_SHAPE = 0.01  # most by which width over height of an image may differ from those of its camera, as a share
 
 
 def take(frame: Frame, longest: int) -> Shot:
@@ -85,8 +84,9 @@ def _turns(frame: Frame) -> bool | None:
 
 
 def _alike(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
-    """Whether width and height have the shape of height and width."""
-    return abs(size[0] * wanted[0] / (size[1] * wanted[1]) - 1) <= SAME_SHAPE
+    """Whether width and height have the shape of height and width, but for what rounding to pixels changes."""
+    shape = wanted[1] / wanted[0]
+    return abs(size[0] - size[1] * shape) <= 1 + shape
 
 
 def _tag(image: Image.Image) -> int:
@@ -134,7 +134,7 @@ def _smaller(
 def _found(path: Path) -> Image.Image:
     try:
         return Image.open(str(path))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         raise _broken(path, error) from None
 
 
@@ -147,12 +147,13 @@ def _opened(path: Path, *, upright: bool = False) -> Image.Image:
     with _found(path) as stored:
         try:
             stored.load()
-        except (OSError, ValueError) as error:
+        except UNREADABLE as error:
             raise _broken(path, error) from None
         image = ImageOps.exif_transpose(stored) if upright else stored.copy()
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
         values = np.asarray(image, np.float64)
-        image = Image.fromarray((values * (255 / (65535 if values.max() > 255 else 255))).astype(np.uint8))
+        most = 65535 if values.max() > 255 else 1 if image.mode == "F" and values.max() <= 1 else 255
+        image = Image.fromarray((values * (255 / most)).astype(np.uint8))
     return image
 
 

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 
 from datasets.captures.frames import OPENGL
 from datasets.captures.rows import _from_angles
-from datasets.captures.take import read_image
+from datasets.captures.take import _alike, read_image
 from datasets.own_photographs import Capture, Reading, read_capture
 from renderers.checks import BadInput
 from tests.datasets.test_captures import CENTRE, FOCAL, MIDDLE, RADIUS, SIZE, cameras, colmap, idr, image, llff, nerf
@@ -369,6 +369,26 @@ def test_cameras_of_larger_images_and_of_other_ones_are_refused(tmp_path):
 
 
 # DVR, BlendedMVS, Choy
+
+
+def test_broken_cameras_beside_others_do_not_matter(tmp_path):
+    nerf(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
+    capture = read_capture(tmp_path, READ)
+    assert capture.format == "NeRF" and "other cameras in the folder are not used: LLFF" in capture.notes
+
+
+def test_an_image_of_floats_is_from_black_to_white(tmp_path):
+    Image.fromarray(np.full(SIZE, 0.5, np.float32)).save(tmp_path / "a.tiff")
+    assert np.abs(read_image(tmp_path / "a.tiff", None, 48)[0] - 0.5).max() < 0.01
+
+
+@each(
+    "size, same",
+    [((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False)],
+)
+def test_a_cropped_image_is_no_smaller_one(size, same):
+    assert _alike(size, (3000, 4000)) == same
 
 
 def test_intrinsics_beside_whole_cameras_are_neus_own(tmp_path):
