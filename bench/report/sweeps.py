@@ -232,6 +232,12 @@ def _answer(sweep: Sweep, found: list[dict[str, Any]], lead: str, headings: dict
     }
 
 
+def _failed(line: dict[str, Any]) -> str:
+    """How many runs failed, with the interval of their share where there is one; the caption has n once."""
+    count, whole = line["failed"], line["runs"]
+    return counted(count, whole, line["rate"]) if line["rate"].known else f"{count:g} of {whole}"
+
+
 def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> list[Column]:
     names, first = sweep.metrics, next(iter(headings.values()), Metric(""))
     ratio = Metric(f"{first.label.split(' (')[0]} over the first row's" if several else "")
@@ -242,7 +248,7 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
         *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
         *_estimate("ratio", ratio),
         Column("runs"),
-        Column("failed", "Failed", words=lambda line: _alone(counted(line["failed"], line["runs"], line["rate"]))),
+        Column("failed", "Failed", words=_failed),
         *_ends("failed", "rate"),
         text("reasons"),
         Column("loop_seconds", "Loop", show=format.seconds),
@@ -254,15 +260,13 @@ def _estimate(key: str, shown: Metric) -> list[Column]:
     """The columns of an estimate that a line may lack, and of the ends of its interval: in scene units for the CSV."""
 
     def words(line: dict[str, Any]) -> str:
-        return format.MISSING if line[key] is None else _alone(str(line[key].times(shown.factor)))
+        if line[key] is None:
+            return format.MISSING
+        found = line[key].times(shown.factor)
+        return str(found) if found.known else found.alone()  # the caption has n once
 
     heading, value = f"{shown.label}{ARROWS[shown.better]}", lambda line: getattr(line[key], "value", None)
     return [Column(key, heading, value, words=words, better=shown.better), *_ends(key, key)]
-
-
-def _alone(words: str) -> str:
-    """An estimate without the number of its shapes, which the caption has once."""
-    return words.partition(" (n = ")[0]
 
 
 def _ends(key: str, of: str) -> list[Column]:

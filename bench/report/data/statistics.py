@@ -61,7 +61,11 @@ class Interval:
 
     def __str__(self) -> str:
         """The estimate, and its interval or else the number of shapes."""
-        return f"{format.number(None if math.isnan(self.value) else self.value)} {self.ends()}"
+        return f"{self.alone()} {self.ends()}"
+
+    def alone(self) -> str:
+        """The estimate without its interval."""
+        return format.number(None if math.isnan(self.value) else self.value)
 
 
 def interquartile_mean(values: Values) -> float | np.ndarray:
@@ -139,10 +143,16 @@ def differ(ratios: Sequence[Interval]) -> list[bool]:
     Ratios of fewer shapes than `FEWEST_SHAPES` do not, and are not counted.
     """
     known = [place for place, found in enumerate(ratios) if found.known]
-    chances = sorted((_sign_test(ratios[place].points), place) for place in known)
-    sure = [chance <= (1 - LEVEL) / (len(known) - before) for before, (chance, _) in enumerate(chances)]
-    rejected = {place for (_, place), _ in zip(chances, takewhile(bool, sure), strict=False)}
-    return [place in rejected for place in range(len(ratios))]
+    differing = dict(zip(known, holm([_sign_test(ratios[place].points) for place in known]), strict=True))
+    return [differing.get(place, False) for place in range(len(ratios))]
+
+
+def holm(chances: Sequence[float]) -> list[bool]:
+    """Which of a family of probabilities are too small for chance, by Holm's step-down at 5 % in all."""
+    ordered = sorted((chance, place) for place, chance in enumerate(chances))
+    sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(ordered)]
+    rejected = {place for (_, place), _ in zip(ordered, takewhile(bool, sure), strict=False)}
+    return [place in rejected for place in range(len(chances))]
 
 
 def _sign_test(points: Sequence[float]) -> float:

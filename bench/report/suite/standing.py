@@ -7,7 +7,7 @@ set of problems weighs the same. Renderings, which have no course, stand apart: 
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -18,14 +18,14 @@ import numpy as np
 
 from bench.report.data import statistics
 from bench.report.data.records import grouped
-from bench.report.data.statistics import LEVEL, Interval
+from bench.report.data.statistics import Interval
 from bench.report.suite.attempts import APART, Attempt, joined, problems_of, suite
 from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
 LEAST_SIZE = "quick"  # a row that has its problems is judged
 COST, SECONDS = 0, 1  # places in what a target was reached at
-FLIPS = 12  # most scenes of which all signs are tried; of more, that many random ones
+FLIPS = 12  # most scenes of which all signs are tried; of more, as many random ones as there are of these
 POWERFUL = 1.43  # over half of a 95 % interval: a difference that is found in four cases of five
 
 
@@ -148,13 +148,10 @@ class Standing:
         """Of each judged attempt by its key, the cost and the seconds of each target; infinite where not reached."""
         return {one.key: self._reached(one) for one in self.judged}
 
-    def errors(self, one: Attempt) -> list[float]:
-        """The errors that are the targets of an attempt."""
-        reference, start = self.references[one.set, one.problem], self.starts[one.key[:3]]
-        return [reference * (start / reference) ** target for target in suite().targets]
-
     def _reached(self, one: Attempt) -> list[tuple[float, float]]:
-        return [one.reached(error) or (inf, inf) for error in self.errors(one)]
+        reference, start = self.references[one.set, one.problem], self.starts[one.key[:3]]
+        errors = [reference * (start / reference) ** target for target in suite().targets]
+        return [one.reached(error) or (inf, inf) for error in errors]
 
     @cached_property
     def _by_row(self) -> dict[str, list[Attempt]]:
@@ -258,9 +255,8 @@ class Standing:
     def told(self) -> set[str]:
         """The ranked rows whose shares are told from the first's: signs flipped over scenes, Holm at 5 % in all."""
         first, *others = self.ranked or [""]
-        chances = sorted((self._chance(first, row), row) for row in others)
-        sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(chances)]
-        return {row for place, (_, row) in enumerate(chances) if all(sure[: place + 1])}
+        found = statistics.holm([self._chance(first, row) for row in others])
+        return {row for row, is_told in zip(others, found, strict=True) if is_told}
 
     def _chance(self, first: str, second: str) -> float:
         """The probability of as large a difference of shares where each scene's has either sign (permutation test)."""
@@ -300,5 +296,4 @@ def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
         shares = np.divide(of[0], of[1], out=np.zeros_like(of[0]), where=known)
         return shares.sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
 
-    statistic: Callable[[Any], Any] = mean
-    return statistics.bootstrap([np.array([place]) for place in range(len(every))], statistic, seed=0)
+    return statistics.bootstrap([np.array([place]) for place in range(len(every))], mean, seed=0)
