@@ -10,6 +10,12 @@ from torch import Tensor
 from renderers.camera import Camera
 
 
+def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    common, either = found & true, found | true
+    return float(common.sum() / either.sum()) if either.any() else 1.0
+
+
 @dataclass(frozen=True)
 class Shot:
     """A photograph with its camera.

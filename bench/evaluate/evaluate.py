@@ -17,6 +17,7 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Surface, View, sample_surface
+from datasets.shot import mask_iou
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
@@ -117,12 +118,6 @@ def image_metrics(
         "depth_mae": float(error.mean()) if common.any() else np.inf,
         "mask_iou": mask_iou(predicted_mask, truth_mask),
     }
-
-
-def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
-    """See `IMAGE`."""
-    common, either = found & true, found | true
-    return float(common.sum() / either.sum()) if either.any() else 1.0
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from bench.evaluate.evaluate import (
     OWN,
     WORST_SURFACE,
     Evaluation,
-    mask_iou,
     render_image,
     surface_metrics,
     unrendered,
@@ -28,7 +27,7 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import View, sample_surface
-from datasets.shot import Shot
+from datasets.shot import Shot, mask_iou
 from renderers.camera import sphere_span
 
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import mask_iou
 from bench.single_view.images import as_input
 from datasets.captures.take import read_image
 from datasets.mesh import Mesh
 from datasets.scene import Truth, see
+from datasets.shot import mask_iou
 from renderers.camera import Camera
 from renderers.checks import BadInput
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from datasets.mesh import Mesh, extract
 from datasets.scene import Truth, see
-from datasets.shot import Shot
+from datasets.shot import Shot, mask_iou
 from renderers.field import Kind
 from renderers.fields.analytic import Shape
 
@@ -89,13 +89,7 @@ def fit_of(shots: Sequence[Shot], samples: int) -> Fit:
     """How well photographs with masks fit, by their visual hull in the unit sphere, `samples` per axis."""
     hull = hull_mesh(shots, samples)
     silhouettes = tuple(seen.numpy() for seen in hull_views(shots, hull))
-    overlaps = [_overlap(seen, np.asarray(shot.mask)) for seen, shot in zip(silhouettes, shots, strict=True)]
+    overlaps = [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in zip(silhouettes, shots, strict=True)]
     points = torch.zeros(0, 3) if hull is None else torch.from_numpy(hull.vertices).float()
     shown = [float(shot.camera.shows(points).float().mean()) if len(points) else 0.0 for shot in shots]
     return Fit(silhouettes, tuple(overlaps), tuple(shown))
-
-
-def _overlap(seen: Bool[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> float:
-    """Intersection over union; 1 where both are empty."""
-    union = int((seen | mask).sum())
-    return float((seen & mask).sum() / union) if union else 1.0
