@@ -19,6 +19,10 @@ KNOWN = (
     "(BlendedMVS), rendering_metadata.txt (Choy)"
 )
 
+FAULTS = (  # of a file of cameras that is broken
+    *(OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, MemoryError, BadZipFile, RuntimeError),
+)
+
 
 def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) -> Layout:
     """The photographs of a folder, in the first known format that it has.
@@ -77,17 +81,7 @@ def _read(name: str, read: Callable[[], Layout | None], folder: Path) -> Layout 
         return read()
     except BadInput:
         raise
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        EOFError,
-        MemoryError,
-        BadZipFile,
-        RuntimeError,
-    ) as error:
+    except FAULTS as error:
         what = " ".join(str(error).split())
         raise BadInput(f"the {name} cameras of {folder} cannot be read ({what}): export them again") from error
 

@@ -3,7 +3,8 @@
 Axes and pixels are those of `renderers.camera`: x right, y down, z forward, the first pixel's centre at (0.5, 0.5).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,13 +101,20 @@ def need(known: Mapping[str, Any], key: str, where: str) -> Any:
     return known[key]
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as it is stored; raises BadInput where it cannot be read."""
+@contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """An image whose pixels are not yet read; raises BadInput where it, or what is asked of it, cannot be read."""
     try:
         with Image.open(path) as image:
-            return image.size
+            yield image
     except UNREADABLE as error:
         raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image as it is stored; raises BadInput where it cannot be read."""
+    with opened(path) as image:
+        return image.size
 
 
 def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "4 4"]]:

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from datasets.captures.frames import UNREADABLE, Frame
+from datasets.captures.frames import Frame, opened
 from datasets.captures.lenses import Lens
 from datasets.extras import install
 from datasets.shot import Shot
@@ -71,12 +71,8 @@ def _turns(frame: Frame) -> bool | None:
 
     None where it has no such tag.
     """
-    with _found(frame.image) as image:
-        width, height = image.size
-        try:
-            tag = _tag(image)
-        except OSError as error:
-            raise _broken(frame.image, error) from None
+    with opened(frame.image) as image:
+        (width, height), tag = image.size, _tag(image)
     if tag == UPRIGHT:
         return None
     turned = (height, width) if tag >= SIDEWAYS else (width, height)
@@ -131,24 +127,10 @@ def _smaller(
     return colours, np.asarray(_foreground(shape).resize(size, Image.Resampling.BOX), np.float32)[..., None] / 255
 
 
-def _found(path: Path) -> Image.Image:
-    try:
-        return Image.open(str(path))
-    except UNREADABLE as error:
-        raise _broken(path, error) from None
-
-
-def _broken(path: Path, error: Exception) -> BadInput:
-    return BadInput(f"{path} cannot be read as an image ({error}): copy or export it again")
-
-
 def _opened(path: Path, *, upright: bool = False) -> Image.Image:
     """An image with 8 bits a channel; whether its tag of orientation is applied."""
-    with _found(path) as stored:
-        try:
-            stored.load()
-        except UNREADABLE as error:
-            raise _broken(path, error) from None
+    with opened(path) as stored:
+        stored.load()
         image = ImageOps.exif_transpose(stored) if upright else stored.copy()
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
         values = np.asarray(image, np.float64)
