@@ -114,7 +114,8 @@ def show(results_dir: Path) -> int:
     standing = Standing.of_all([*read_attempts(paper.SHIPPED)[0], *kept])
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
-    stand = sum(one in kept for one in standing.attempts)
+    own = {(*one.key, one.started) for one in kept}
+    stand = sum((*one.key, one.started) in own for one in standing.attempts)
     print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
     if any(map(standing.lacking, standing.rows)):
         print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
@@ -161,18 +162,18 @@ def _agrees(attempt: Attempt) -> bool:
     if not again:
         print(f"not run again: {name}: {' '.join(said.stderr.split())[-300:]}")
         return False
-    points, found = (
-        [number for cost, _, error in one.curve for number in (cost, error)] for one in (attempt, again[0])
-    )
-    pairs = zip(points, found, strict=False)
-    same = again[0].ok and len(points) == len(found)
-    same &= all(a == b or (min(a, b) > 0 and abs(log(a / b)) <= AGREE) for a, b in pairs)
-    told = ", ".join(
-        f"{number(a)} and {number(b)}" for a, b in [(attempt.final, again[0].final), (attempt.cost, again[0].cost)]
-    )
-    ended = "" if again[0].ok else f"; {again[0].status}: {again[0].reason}"
+    (found,) = again
+    first, second = ([number for cost, _, error in one.curve for number in (cost, error)] for one in (attempt, found))
+    same = found.ok and len(first) == len(second) and all(map(_close, first, second))
+    pairs = (attempt.final, found.final), (attempt.cost, found.cost)
+    told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
+    ended = "" if found.ok else f"; {found.status}: {found.reason}"
     print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}{ended}")
     return same
+
+
+def _close(first: float, second: float) -> bool:
+    return first == second or (min(first, second) > 0 and abs(log(first / second)) <= AGREE)
 
 
 if __name__ == "__main__":
