@@ -34,7 +34,10 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from bench.run.process import start_early
+    try:
+        from bench.run.process import start_early
 
-    start_early(sys.argv[1:])
-    sys.exit(main())
+        start_early(sys.argv[1:])
+        sys.exit(main())
+    except KeyboardInterrupt:  # before the command line was read
+        sys.exit("error: stopped by Ctrl-C; nothing was run")

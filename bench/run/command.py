@@ -87,8 +87,9 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
         if raised:
             raise raised[0]
     except KeyboardInterrupt as error:
-        before = "" if begun or Sweep.plan is not None else "; nothing was run"
-        return _tell(stopped_by(error) + before, INTERRUPTED)
+        text = stopped_by(error)
+        none = Sweep.plan is None and not text.startswith("killed")  # as a run says that has left a record
+        return _tell(f"{text}; nothing was run" if none else text, INTERRUPTED)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         leave_server()
         return _tell(_with_file(_explain(error)), USAGE)

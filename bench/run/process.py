@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
@@ -117,7 +117,7 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     Returns:
         None where the child finished and sent its final record; else how it ended.
     """
-    context = fork_server()
+    context = warm_up()
     channel, childs = context.Pipe()
     alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
     process = context.Process(target=_enter, args=(job, childs, alive))
@@ -151,11 +151,20 @@ def fork_server() -> ForkServerContext:
     return context
 
 
-def warm_up() -> None:
-    """Starts the server of processes, which loads what is slow while this process does something else."""
-    fork_server()
-    with signals_delayed():  # a request that breaks off would end the server
-        forkserver.ensure_running()
+def warm_up() -> ForkServerContext:
+    """Starts the server of processes, which loads what is slow while this process does something else.
+
+    The server and its children never get Ctrl-C: their parent does, and ends them.
+    """
+    context = fork_server()
+    resource_tracker.ensure_running()  # the server would start it, and it unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # which a new process inherits
+    try:
+        with signals_delayed():  # a request that breaks off would end the server
+            forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return context
 
 
 def start_early(arguments: Sequence[str]) -> None:
@@ -181,7 +190,7 @@ def leave_server() -> None:
 
 def in_child(work: Callable[[Any], Any], argument: Any) -> Any:
     """What `work` gives for an argument, in a process that branches off from the server; None where that one dies."""
-    context = fork_server()
+    context = warm_up()
     answers, answer = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(work, argument, answer))
     with answers:
@@ -199,12 +208,10 @@ def in_child(work: Callable[[Any], Any], argument: Any) -> Any:
 
 
 def _work(work: Callable[[Any], Any], argument: Any, answer: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     answer.send(work(argument))
 
 
 def _enter(job: Job, channel: Connection, parent: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     for module in preloaded():  # what the server has left out, before `Started`: off the run's clocks
         with suppress(ImportError):
             import_module(module)

@@ -1,10 +1,14 @@
 """A run that ends badly leaves a record that says how; it is stopped at its limit, and costs no other run."""
 
+import os
 import signal
+import subprocess
+import sys
 import time
 from multiprocessing import Pipe
 from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from bench.records.record import Record
@@ -115,3 +119,12 @@ def test_the_server_starts_before_the_command_line_is_read_where_that_asks_for_r
     process.start_early(arguments)
     process.leave_server()  # of a command that is refused
     assert (done, ended) == (([True], [(42, signal.SIGKILL)]) if early else ([], []))
+
+
+def test_ctrl_c_while_the_server_loads_what_runs_need_is_told_in_one_line(tmp_path):
+    command = [sys.executable, "-m", "bench", f"results_dir={tmp_path}", "scale=smoke"]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as running:
+        parent = psutil.Process(running.pid)
+        wait_for(lambda: any("forkserver" in " ".join(child.cmdline()) for child in parent.children()))
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of its processes get it
+        assert running.communicate()[1].splitlines() == ["error: stopped by Ctrl-C; nothing was run"]
