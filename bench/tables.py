@@ -38,6 +38,7 @@ LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the plac
 DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
 SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
 MANY = 20  # names, beyond which a message leaves variants out
+ALL = 100  # and beyond which it names none
 Node = dict[str, Any]
 
 
@@ -234,6 +235,8 @@ def nearest(word: str, known: list[str]) -> str:
     shown = roots if len(known) > MANY else known
     if not shown:
         return ""
+    if len(shown) > ALL:
+        return f": none of {len(shown)} is like it; python -m bench --cfg job shows them"
     return f": it has {', '.join(sorted(shown))}" + (", and variants of these" if len(shown) < len(known) else "")
 
 

@@ -359,7 +359,7 @@ def test_two_runs_are_compared(results, tab):
     page.locator("#picks a").click()
     page.get_by_role("heading", name="Settings that differ").wait_for()
     text = page.locator("main").inner_text()
-    assert "renderer._label_" in text and "index" in text
+    assert "renderer._label_" in text and "Not only the renderer differs: " in text and "index" in text
     row = page.get_by_role("row").filter(has=page.get_by_text("Chamfer × 1000", exact=True))
     assert row.locator("td").all_inner_texts() == ["1.00", "2.00", "2.00", "A"]
     plots = drawn(page)

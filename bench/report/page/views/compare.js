@@ -2,9 +2,10 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill, soft, section, later, code} = bench.dom;
+  const {element, fill, soft, section, details: fold, later, code} = bench.dom;
   const {number, count, seconds, size, label, MISSING} = bench.format;
   const SIDES = ["A", "B"];
+  const MOST = 6;  // keys that are named in a line
 
   function compare(home, names) {
     const {runs} = bench;
@@ -39,6 +40,7 @@
     const turning = [];
     const named = details.map(({curve}, n) => ({name: `${SIDES[n]}: ${bench.runs.text(places[n], "name")}`, curve}));
     return [
+      warning(details),
       section("Metrics after the run", metrics(details)),
       section("Settings that differ", settings(details)),
       section("Costs", costs(places, details)),
@@ -60,11 +62,23 @@
     return typeof a === "number" && typeof b === "number" && a > 0 && Number.isFinite(b / a) ? number(b / a) : MISSING;
   }});
 
-  /* The rows of which the two values are not the same text. */
-  function settings(details) {
+  /* The settings of each side, all keys, and those of which the two values are not the same text. */
+  function differing(details) {
     const sides = details.map((detail) => new Map(detail.settings));
     const all = [...new Set(sides.flatMap((side) => [...side.keys()]))];
-    const keys = all.filter((key) => sides[0].get(key) !== sides[1].get(key));
+    return {sides, all, keys: all.filter((key) => sides[0].get(key) !== sides[1].get(key))};
+  }
+
+  /* That more than the renderer differs, so that the metrics may differ for another reason. */
+  function warning(details) {
+    const keys = differing(details).keys.filter((key) => key !== "label" && !/^renderer\b/.test(key));
+    const shown = keys.slice(0, MOST).flatMap((key, n) => (n ? [", ", code(key)] : [code(key)]));
+    const more = keys.length > MOST ? ` and ${keys.length - MOST} more` : "";
+    return keys.length > 0 && element("p.note", null, "Not only the renderer differs: ", shown, `${more}. The metrics may differ for that reason.`);
+  }
+
+  function settings(details) {
+    const {sides, all, keys} = differing(details);
     if (!keys.length) return element("p", null, `None: all ${all.length} settings are equal.`);
     const value = (key, n) => (sides[n].has(key) ? sides[n].get(key) : soft(MISSING));
     return [table("Setting", keys, code, value), element("p.soft", null, `${all.length - keys.length} others are equal.`)];
@@ -84,8 +98,10 @@
     };
     const name = (key) => (shown.has(key) ? label(shown.get(key).label) : code(key));
     const cell = (key, n) => number(value(key, n), shown.has(key) ? shown.get(key).factor : 1);
-    const rows = [...new Set([...shown.keys(), ...found])];
-    return table("Metric", rows, name, cell, "number", ratio(value), {label: "Better", cell: better});
+    const made = (rows) => table("Metric", rows, name, cell, "number", ratio(value), {label: "Better", cell: better});
+    const rest = [...found].filter((key) => !shown.has(key));
+    const more = shown.size ? fold(`${rest.length} more, by their keys in the record`, made(rest)) : made(rest);
+    return [shown.size > 0 && made([...shown.keys()]), rest.length > 0 && more];
   }
 
   function costs(places, details) {
