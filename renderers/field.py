@@ -1,7 +1,7 @@
 """Fields: callables from points to values, negative inside; their properties; normals; the Meter; moved fields."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import lru_cache
@@ -130,15 +130,6 @@ def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
     return bounds
 
 
-# Moves rays in place by compiled code, see `CompiledDecoder.march`, and gives how many values that took.
-Marcher = Callable[[tuple[Tensor, Tensor], Sequence[Tensor], Sequence[float], int], int]
-
-
-def marcher_of(values: Values) -> Marcher | None:
-    """The march through it that a field offers as `marcher`; None where it offers none."""
-    return getattr(values, "marcher", None)
-
-
 @dataclass
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
@@ -241,20 +232,6 @@ class Meter(Wrapper):
     def bounds(self) -> Bounds | None:
         """The bounds that the field offers; each counts as the products of weights that it takes."""
         return noted_bounds(self.inner, self._count_value)
-
-    @property
-    def marcher(self) -> Marcher | None:
-        """The march that the field offers; its values are counted."""
-        offered = marcher_of(self.inner)
-        if offered is None:
-            return None
-
-        def march(rays: tuple[Tensor, Tensor], front: Sequence[Tensor], stepping: Sequence[float], steps: int) -> int:
-            asked = offered(rays, front, stepping, steps)
-            self._count_value(asked)
-            return asked
-
-        return march
 
     def _count_value(self, points: int) -> None:
         self.counts.add("value", points)

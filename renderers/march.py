@@ -7,7 +7,6 @@ the graph instead.
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from math import inf
 from typing import NamedTuple
 
 import torch
@@ -15,8 +14,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
-from renderers.field import Values, marcher_of
-from renderers.kernels.decoder import RAYS
+from renderers.field import Values
 from renderers.rendering import Status
 from renderers.waits import steps_between, values_where
 
@@ -277,9 +275,6 @@ def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: i
     if steps < 1:
         return
     moved, every = front.active, not stepping.active_only
-    if note is None and _marched_by_compiled_code(values, rays, front, stepping, steps):
-        front.finish(moved, stepping)
-        return
     table, index = Moving.of(front, stepping), (front.meets if every else moved).nonzero().squeeze(-1)
     moving, going, fresh = table.some(index), moved[index], front.fresh[index]
     origins, directions, between = rays.origins[index], rays.directions[index], steps_between(index.device)
@@ -305,25 +300,6 @@ def march(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: i
     table.table.index_copy_(1, index, moving.table)
     table.write(front)
     front.finish(moved, stepping)
-
-
-def _marched_by_compiled_code(values: Values, rays: Rays, front: Front, stepping: Stepping, steps: int) -> bool:
-    """The loop of `march`, ray by ray, where the field has compiled code for it; False where it is left to PyTorch."""
-    marcher = marcher_of(values)
-    plain = stepping.active_only and not stepping.step_back and front.sample_value.shape[1] == 1
-    if marcher is None or not plain or rays.origins.dtype != torch.float32:
-        return False
-    for name in ("distance", "value", "sample_distance", "sample_value"):
-        setattr(front, name, getattr(front, name).contiguous())
-    columns = (front.distance, front.value, front.sample_distance, front.sample_value)
-    columns = (*columns, front.entry - stepping.epsilon, front.leave.contiguous(), front.active, front.fresh)
-    ends = rays.origins.detach().contiguous(), rays.directions.detach().contiguous()
-    bounds = [inf if bound is None else bound for bound in (stepping.extra_step_cap, stepping.step_clamp)]
-    numbers = (stepping.epsilon, stepping.alpha, *bounds, stepping.least_step, stepping.slope)
-    for start in range(0, len(front.distance), RAYS):
-        part = slice(start, start + RAYS)
-        marcher((ends[0][part], ends[1][part]), [column[part] for column in columns], numbers, steps)
-    return True
 
 
 def march_coarse_to_fine(

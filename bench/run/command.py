@@ -167,7 +167,7 @@ def _identified(config: DictConfig) -> Identity:
     register_resolvers()  # again, since a launcher's worker has not read the command line
     hydra = HydraConfig.get()
     if (asked := os.environ.get(KERNELS)) not in (None, "", "torch", "compiled"):
-        raise ValueError(f"{KERNELS} must be torch or compiled, not {asked!r}: unset it for torch")
+        raise ValueError(f"{KERNELS} must be torch or compiled, not {asked!r}: unset it for compiled")
     if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
         config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
     return identify(config, hydra.runtime, hydra.overrides.task)

@@ -17,7 +17,7 @@ from torch.nn.functional import linear
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from renderers.checks import check_at_least
-from renderers.field import Coarse, Flops, Kind, Marcher, Values, points_in_sphere
+from renderers.field import Coarse, Flops, Kind, Values, points_in_sphere
 from renderers.fields.affine import segment_bounds
 from renderers.kernels.decoder import CompiledDecoder, compiled
 
@@ -149,11 +149,6 @@ class BoundDecoder:
     @cached_property
     def _tensors(self) -> tuple[Tensor, ...]:
         return tuple(tensor for layer in (*self.hidden, self.last) for tensor in layer)
-
-    @property
-    def marcher(self) -> Marcher | None:
-        """A march through the field by compiled code, for one code and weights that stay; None where there is none."""
-        return None if torch.get_num_threads() > 1 or self._compiled is None else self._compiled.march
 
     @cached_property
     def _compiled(self) -> CompiledDecoder | None:

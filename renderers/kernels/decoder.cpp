@@ -1,6 +1,5 @@
 // Values of a ReLU network at points, without a graph: the layers of a tile of points stay in the first caches.
 // Its plain twin is `BoundDecoder._forward` in renderers/fields/mlp.py.
-#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <memory>
@@ -91,54 +90,5 @@ extern "C" void decoder_values(const Decoder *net, float *points, int64_t count,
       from = to, to = swapped;
     }
     for (int r = 0; r < some; r++) values[first + r] = sum_last(net, from.at(r));
-  }
-}
-
-struct Stepping {
-  float epsilon, alpha, extra_step_cap, step_clamp, least_step, slope;  // see `march.Stepping`; infinite for no bound
-};
-
-struct Front {  // of rays; see `march.Front` and `march.Moving`
-  float *distance, *value, *sample_distance, *sample_value;
-  const float *earliest, *leave;
-  const bool *active, *fresh;
-};
-
-static float within(float number, float bound) { return std::fmin(std::fmax(number, -bound), bound); }
-
-// Moves a ray by the value at its end, and says whether it goes on; the plain twin is `march.Moving.after`.
-static bool advance(const Front *front, int64_t ray, const Stepping *by, float found, bool first) {
-  float value = std::isfinite(found) ? found : NAN, known = std::isfinite(found) ? found : 0, size = std::fabs(value);
-  float reach = within(known / by->slope, by->step_clamp), at = front->distance[ray];
-  float step = reach + within((by->alpha - 1) * reach, by->extra_step_cap);
-  if (by->least_step > 0 && known > 0 && front->value[ray] >= 0) step = std::fmax(step, by->least_step);
-  bool converged = size < by->epsilon, inside = first && front->fresh[ray] && value < 0 && !converged;
-  float moved = inside ? -INFINITY : at + (converged ? known : step);
-  if (size < std::fabs(front->sample_value[ray])) front->sample_value[ray] = value, front->sample_distance[ray] = at;
-  front->distance[ray] = moved, front->value[ray] = value;
-  return moved <= front->leave[ray] && moved >= front->earliest[ray] && size >= by->epsilon;
-}
-
-// Marches each active ray on its own; one that stops leaves its place in the tile to the next. Returns the values asked.
-extern "C" int64_t decoder_march(const Decoder *net, const float *origins, const float *directions, const Front *front,
-                                 const Stepping *by, int64_t count, int steps) {
-  int64_t next = 0, asked = 0, ray[TILE];
-  int done[TILE], rows = 0;
-  float points[3 * TILE], values[TILE];
-  for (;;) {
-    for (; rows < TILE && next < count; next++)
-      if (front->active[next]) ray[rows] = next, done[rows++] = 0;
-    if (!rows) return asked;
-    for (int i = 0; i < 3 * rows; i++) {
-      int64_t r = ray[i / 3], place = 3 * r + i % 3;
-      points[i] = origins[place] + front->distance[r] * directions[place];
-    }
-    decoder_values(net, points, rows, values);
-    asked += rows;
-    int kept = 0;
-    for (int i = 0; i < rows; i++)
-      if (advance(front, ray[i], by, values[i], !done[i]) && done[i] + 1 < steps)
-        ray[kept] = ray[i], done[kept++] = done[i] + 1;
-    rows = kept;
   }
 }

@@ -1,4 +1,4 @@
-"""A ReLU network's values, and marches through it, by compiled code, in place of rows of PyTorch's operations."""
+"""A ReLU network's values by compiled code, in place of rows of PyTorch's operations."""
 
 import ctypes
 from collections.abc import Sequence
@@ -11,7 +11,6 @@ from torch import Tensor
 from renderers.kernels.library import kernels
 
 Layer = tuple[Tensor, Tensor]  # weight [out, in] and bias [out]
-RAYS = 2048  # that are marched in one call, during which no signal is noticed and nothing is counted
 
 
 class _Decoder(ctypes.Structure):
@@ -46,19 +45,6 @@ class CompiledDecoder:
         found = points.new_empty(len(points))
         self.library.decoder_values(ctypes.addressof(self.network), points.data_ptr(), len(points), found.data_ptr())
         return found
-
-    def march(self, rays: tuple[Tensor, Tensor], front: Sequence[Tensor], stepping: Sequence[float], steps: int) -> int:
-        """Marches up to RAYS rays, in place; gives how many values that took.
-
-        Args:
-            rays: origins and directions, contiguous.
-            front, stepping: columns and numbers in the order of `Front` and `Stepping` in decoder.cpp, contiguous.
-        """
-        columns = (ctypes.c_void_p * len(front))(*(column.data_ptr() for column in front))
-        numbers = (ctypes.c_float * len(stepping))(*stepping)
-        ends, network = [part.data_ptr() for part in rays], ctypes.addressof(self.network)
-        settings = ctypes.addressof(columns), ctypes.addressof(numbers)
-        return self.library.decoder_march(network, *ends, *settings, len(front[0]), steps)
 
 
 def compiled(hidden: Sequence[Layer], last: Layer, skip: int) -> CompiledDecoder | None:

@@ -1,7 +1,7 @@
-"""Compiled code beside plain PyTorch, where `IMPLICIT_BENCH_KERNELS=compiled` asks for it: built once a machine.
+"""Compiled code beside plain PyTorch, which does the same up to rounding: built once a machine, where that is possible.
 
-Without it PyTorch does the same, up to rounding. It is not the default while it marches for some renderers alone: they
-would be compared with others by their engine.
+It gives values of fields alone, which all renderers ask for: none is compared with others by its engine.
+`IMPLICIT_BENCH_KERNELS=torch` leaves all to PyTorch.
 """
 
 import ctypes
@@ -38,14 +38,14 @@ class Kernels:
 
 @cache
 def kernels() -> Kernels:
-    """The compiled code for this processor, if asked for; the first call on a machine builds it, in about a second.
+    """The compiled code for this processor; the first call on a machine builds it, in about a second.
 
     Raises:
         ValueError: where `IMPLICIT_BENCH_KERNELS` is something else than torch or compiled.
     """
-    wanted = os.environ.get(VARIABLE) or TORCH
+    wanted = os.environ.get(VARIABLE) or COMPILED
     if wanted not in (TORCH, COMPILED):
-        raise ValueError(f"{VARIABLE} must be {TORCH} or {COMPILED}, not {wanted!r}: unset it for {TORCH}")
+        raise ValueError(f"{VARIABLE} must be {TORCH} or {COMPILED}, not {wanted!r}: unset it for {COMPILED}")
     if wanted == TORCH:
         return Kernels(None, TORCH)
     processor = _processor()
@@ -57,7 +57,6 @@ def kernels() -> Kernels:
         return Kernels(None, f"{TORCH}: {' '.join(str(error).split())[:200]}")
     place, count = ctypes.c_void_p, ctypes.c_int64
     library.decoder_values.argtypes, library.decoder_values.restype = [place, place, count, place], None
-    library.decoder_march.argtypes, library.decoder_march.restype = [*[place] * 5, count, ctypes.c_int], count
     return Kernels(library, COMPILED)
 
 

@@ -14,15 +14,12 @@ from bench.machine import environment
 from bench.machine.environment import using_threads
 from bench.shape_prior import initialise_to_sphere
 from datasets.views import ViewSampler
-from renderers.camera import Rays
-from renderers.field import Counts, Meter, marcher_of
+from renderers.field import Counts, Meter
 from renderers.fields import mlp
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.kernels import decoder as of_decoders
 from renderers.kernels import library
 from renderers.kernels.library import kernels
-from renderers.march import Front, Stepping, march
-from renderers.rendering import Status
 from tests.looped import each
 
 NETWORKS = {
@@ -34,14 +31,14 @@ NETWORKS = {
 }
 
 
-def asked_for() -> library.Kernels:
-    """What a process finds that asks for compiled code."""
+def by_default() -> library.Kernels:
+    """What a process finds that asks for nothing."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(library.VARIABLE, library.COMPILED)
+        patch.delenv(library.VARIABLE, raising=False)
         return kernels.__wrapped__()
 
 
-THERE = asked_for()
+THERE = by_default()
 with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.said}")
 
 
@@ -57,7 +54,7 @@ def make(name: str) -> Decoder:
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
     """What a new process would find."""
-    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: library.COMPILED, **environment}.items():
+    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: "", **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
 
@@ -88,7 +85,6 @@ def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatc
         make("skip").double().at(code.double())(points.double())
     with using_threads(2), torch.no_grad():
         make("skip").at(code)(points)
-        assert marcher_of(make("skip").at(code)) is None
         assert environment.describe(torch.device("cpu"))["kernels"] == "torch: compiled code is for one thread of a CPU"
     monkeypatch.undo()
     with using_threads(1), torch.no_grad():  # weights that may change meanwhile are not copied
@@ -102,32 +98,21 @@ def ball() -> BoundDecoder:
     return decoder.requires_grad_(False).at(torch.full((4,), 0.1))
 
 
-def rendered(name: str, **settings) -> tuple[Tensor, Tensor, Counts]:
+def rendered(name: str) -> tuple[Tensor, Tensor, Counts]:
     field = Meter(ball(), Counts())
     rays = ViewSampler(1.2, 70.0, (0.0, 360.0), (15.0, 35.0), 48).camera(30.0, 25.0).rays()
     with torch.no_grad():
-        rendering = load("renderer", name, **settings).render(field, rays)
+        rendering = load("renderer", name).render(field, rays)
     return rendering.status, rendering.distance, field.counts
 
 
 @with_compiler
-@each(
-    "name, settings",
-    [
-        *((name, {}) for name in ("dist", "newton", "idr", "neus", "relaxed_boundary")),
-        ("dist", {"steps": 6, "coarse_to_fine": False}),
-        ("dist", {"alpha": 1.0, "step_clamp": 0.1, "least_step": 0.01, "sphere_radius": 1.3}),
-        ("dist", {"slope_samples": 100, "extra_step_cap": None}),
-        ("dist", {"n_gradient_samples": 3}),
-        ("dist", {"step_back": True}),
-        ("dist", {"active_only": False}),
-    ],
-)
-def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, settings, monkeypatch):
+@each("name", ["dist", "newton", "idr", "neus", "relaxed_boundary"])
+def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
     with using_threads(1):
-        status, distance, counts = rendered(name, **settings)
+        status, distance, counts = rendered(name)
         monkeypatch.setattr(mlp, "compiled", lambda *_: None)
-        status_of_torch, distance_of_torch, counts_of_torch = rendered(name, **settings)
+        status_of_torch, distance_of_torch, counts_of_torch = rendered(name)
         monkeypatch.undo()
     alike = status == status_of_torch
     assert (~alike).sum() <= 2 and len(status.unique()) > 1
@@ -135,29 +120,8 @@ def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, settings, mon
     assert (distance - distance_of_torch)[alike].abs().quantile(0.99) < 1e-4
 
 
-@with_compiler
-def test_a_march_of_compiled_code_keeps_what_each_ray_knows():
-    """Also where the field is no number, where rays begin inside, and of rays that are not to move."""
-    field, generator = ball(), torch.Generator().manual_seed(2)
-    directions = torch.nn.functional.normalize(torch.randn(5000, 3, generator=generator), dim=-1)
-    rays = Rays(0.9 * torch.rand(5000, 3, generator=generator), directions)
-    fronts = []
-    with using_threads(1):
-        for there in (True, False):
-            front = Front.on_sphere(rays, radius=1.0, samples=1)
-            front.active[::7], front.distance[3] = False, torch.nan
-            assert marcher_of(field) is not None and marcher_of(field.__call__) is None
-            march(field if there else field.__call__, rays, front, Stepping(1e-3, alpha=1.3), 4)
-            fronts.append(vars(front))
-    for name, of_compiled in fronts[0].items():
-        torch.testing.assert_close(of_compiled, fronts[1][name], rtol=1e-4, atol=1e-4, equal_nan=True)
-    assert set(fronts[0]["status"].tolist()) == {int(status) for status in Status}
-
-
-def test_torch_is_the_default_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
-    for wanted in ("torch", ""):
-        found = fresh(monkeypatch, tmp_path, **{library.VARIABLE: wanted})
-        assert (found.library, found.said) == (None, "torch")
+def test_torch_alone_is_left_to_torch_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
+    assert fresh(monkeypatch, tmp_path, **{library.VARIABLE: "torch"}) == library.Kernels(None, "torch")
     with pytest.raises(ValueError, match=f"{library.VARIABLE} must be torch or compiled, not 'cuda'"):
         fresh(monkeypatch, tmp_path, **{library.VARIABLE: "cuda"})
     assert not list(tmp_path.iterdir())
@@ -181,7 +145,7 @@ def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(mo
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
     asked = "from renderers.kernels.library import kernels; print(kernels().said)"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.VARIABLE: library.COMPILED}
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.VARIABLE: ""}
     command = [sys.executable, "-c", asked]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
