@@ -1,42 +1,22 @@
 """Finds, reads and checks the user's mesh files, and makes them closed solids by `repair`."""
 
 import difflib
-import re
-import struct
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from datasets.mesh import Mesh
+from datasets.readers.glb import read_glb
 from datasets.readers.ply import read_ply
-from datasets.readers.text import read_obj, read_off
+from datasets.readers.text import mistaken, read_obj, read_off, read_stl
 from datasets.repair import repair
 from renderers.checks import BadInput
 
-SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
+READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off, ".glb": read_glb}
+SUFFIXES = tuple(READERS)
 FLAT = 1e-12  # of the squared diagonal: a mesh with less area is a line or a point
-READ_ERRORS = (  # what trimesh raises on broken files; it has no exception of its own
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError,
-    RuntimeError, TypeError, ValueError, struct.error,
-)  # fmt: skip
-READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply}  # other formats by trimesh
-MISTAKEN = {  # how other files begin: what they are, and the remedy
-    b"\x00\x05\x16\x07": ("a Mac's notes on a file, whose names begin with '._'", "take the file without '._'"),
-    b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull'"),
-    b"\x1f\x8b": ("a file compressed by gzip", "unpack it"),
-    b"PK\x03\x04": ("a .zip archive", "unpack it"),
-    b"<!doctype html": ("a web page", "download the file itself"),
-    b"<html": ("a web page", "download the file itself"),
-}
-PACKED = re.compile(
-    rb'"extensionsRequired"\s*:\s*\[[^\]]*"(KHR_draco_mesh_compression|EXT_meshopt_compression)"'
-)  # a .glb
-GREY = 0.7  # of parts without colours, beside parts that have some
 
 
 def find_meshes(path: str | Path) -> list[Path]:
@@ -104,88 +84,26 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def _read(path: Path) -> Mesh:
-    content = path.read_bytes()
+    content, suffix = path.read_bytes(), path.suffix.lower()
     if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
-    for start, (what, remedy) in MISTAKEN.items():
-        if content[:64].lstrip().lower().startswith(start.lower()):
-            raise ValueError(f"must hold a mesh, found {what}; {remedy}")
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # a broken file makes numpy warn; its numbers are checked below
-        parts = _parts(path, content)
-    vertices, faces = [np.asarray(part.vertices) for part in parts], [np.asarray(part.faces) for part in parts]
-    colours = [_vertex_colours(part) for part in parts]
-    offsets = np.cumsum([0] + [len(part) for part in vertices[:-1]])
-    joined = np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=True)])
-    mesh = Mesh(np.concatenate(vertices), joined, colours=_painted(vertices, colours))
+    if what := mistaken(path):
+        raise ValueError(what)
+    with np.errstate(all="ignore"):  # of numbers that Mesh refuses
+        polygons = READERS[suffix](content)
+        triangles, owner = polygons.triangles()
+    if not len(triangles):
+        count = len(polygons.vertices)
+        held = (
+            f"it holds {count} vertices, as points or lines"
+            if count
+            else f"it has no vertex either, as {suffix} writes them"
+        )
+        raise ValueError(f"must have faces, found none: {held}; export it as a surface")
+    mesh = Mesh(polygons.vertices, triangles, colours=polygons.shaded(triangles, owner))
     if mesh.area <= FLAT * mesh.diagonal**2:
         raise ValueError(
             f"must have an area, found {mesh.area:.3g} in a box {mesh.diagonal:.3g} across; "
             "look for a stray vertex, or export it again"
         )
     return mesh
-
-
-def _parts(path: Path, content: bytes) -> list[Any]:
-    """The parts of a file, as trimesh.Trimesh: one or more, all with faces."""
-    import trimesh
-
-    suffix = path.suffix.lower()
-    if suffix in READERS:
-        polygons = READERS[suffix](content)
-        triangles, owner = polygons.triangles()
-        if not len(triangles):
-            count = len(polygons.vertices)
-            what = (
-                f"it holds {count} vertices, as points or lines"
-                if count
-                else f"it has no vertex either, as {suffix} writes them"
-            )
-            raise ValueError(f"must have faces, found none: {what}; export it as a surface")
-        shades = None if polygons.face_colours is None else polygons.face_colours[owner]
-        painted = {"vertex_colors": polygons.vertex_colours, "face_colors": shades}
-        return [trimesh.Trimesh(polygons.vertices, triangles, process=False, **painted)]
-    _check_binary(suffix, content)
-    try:
-        scene = trimesh.load_scene(path, process=False)
-        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    except READ_ERRORS as error:
-        why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        raise ValueError(f"must be readable as {suffix}, but reading failed ({why}); export or copy it again") from None
-    if not parts:
-        where = "the file is truncated, or holds points, lines or fans"
-        raise ValueError(f"must have faces, found none: {where}; copy it again, or export it as a surface of triangles")
-    return parts
-
-
-def _check_binary(suffix: str, content: bytes) -> None:
-    """Refuses an .stl of another length than it claims, and a .glb with packed numbers: trimesh names no cause."""
-    if suffix == ".stl" and len(content) > 83 and b"facet" not in content[:2000].lower():
-        count = int.from_bytes(content[80:84], "little")
-        if len(content) != 84 + 50 * count:
-            raise ValueError(
-                f"must be a whole .stl file, {84 + 50 * count} bytes for the {count} faces that it claims, found "
-                f"{len(content)}; export or copy it again"
-            )
-    if suffix == ".glb" and (packed := PACKED.search(content)):
-        raise ValueError(f"must be a .glb that is not packed, found {packed[1].decode()}; export it uncompressed")
-
-
-def _painted(
-    vertices: list[Float[np.ndarray, "_ 3"]], colours: list[Float[np.ndarray, "_ 3"] | None]
-) -> Float[np.ndarray, "v 3"] | None:
-    """The colours of the parts' vertices; None where no part has some."""
-    if all(known is None for known in colours):
-        return None
-    shades = [np.full(part.shape, GREY) for part in vertices]
-    return np.concatenate([grey if known is None else known for grey, known in zip(shades, colours, strict=True)])
-
-
-def _vertex_colours(part: Any) -> Float[np.ndarray, "v 3"] | None:
-    """RGB of a trimesh.Trimesh from 0 to 1; None where its vertices and faces have none. Textures are not read."""
-    from trimesh.visual.color import to_rgba
-
-    colours = part.visual.vertex_colors if part.visual.kind in ("vertex", "face") else None
-    if part.visual.kind == "texture":  # then trimesh keeps the colours of the vertices in one of two places
-        colours = {**part.visual.vertex_attributes, **part.vertex_attributes}.get("color")
-    return None if colours is None else to_rgba(colours)[:, :3] / 255

@@ -15,6 +15,7 @@ from torch import Tensor
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import load_mesh
 from datasets.readers.ply import read_ply
+from datasets.readers.text import mistaken
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
 from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_share
@@ -45,6 +46,8 @@ class Scan:
             BadInput: where the file is cut short, or has no points.
         """
         try:
+            if what := mistaken(self.file):
+                raise ValueError(what)
             points = read_ply(self.file.read_bytes()).vertices
         except ValueError as error:
             raise BadInput(f"scan '{self.file}' {error}") from None

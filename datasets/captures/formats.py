@@ -11,6 +11,7 @@ from datasets.captures.frames import Layout
 from datasets.captures.matrices import dvr, idr
 from datasets.captures.nerf import transforms
 from datasets.captures.rows import blended_mvs, choy, llff, middlebury
+from datasets.readers.text import mistaken
 from renderers.checks import BadInput
 
 KNOWN = (
@@ -79,9 +80,13 @@ def _read(name: str, read: Callable[[], Layout | None], folder: Path) -> Layout 
     """
     try:
         return read()
-    except BadInput:
-        raise
     except FAULTS as error:
+        files = (file for file in sorted(folder.rglob("*")) if file.is_file())
+        pointer = next((f"{file} {what}" for file in files if "LFS" in (what := mistaken(file))), None)
+        if pointer is not None:
+            raise BadInput(pointer) from None
+        if isinstance(error, BadInput):
+            raise
         what = " ".join(str(error).split())
         raise BadInput(f"the {name} cameras of {folder} cannot be read ({what}): export them again") from error
 

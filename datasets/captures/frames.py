@@ -15,6 +15,7 @@ from PIL import Image
 from scipy.linalg import rq
 
 from datasets.captures.lenses import Lens
+from datasets.readers.text import mistaken
 from renderers.checks import BadInput
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
@@ -108,7 +109,10 @@ def opened(path: Path) -> Iterator[Image.Image]:
         with Image.open(path) as image:
             yield image
     except UNREADABLE as error:
-        raise BadInput(f"{path} cannot be read as an image ({error}): copy or export it again") from None
+        pointer = path.is_file() and mistaken(path)
+        raise BadInput(
+            f"{path} {pointer or f'cannot be read as an image ({error}): copy or export it again'}"
+        ) from None
 
 
 def image_size(path: Path) -> tuple[int, int]:

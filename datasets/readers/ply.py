@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from datasets.readers.polygons import Polygons, shades
+from datasets.readers.polygons import Polygons, cut_strips, shades
 
 CODES = {  # of numpy and of struct
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d",
@@ -208,7 +208,7 @@ def _polygons(elements: dict[str, Element]) -> Polygons:
         raise ValueError("must have an element 'vertex' with x, y and z; export it again")
     vertices = np.stack([np.asarray(vertex.columns[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     faces, strips = _indices(face), _indices(elements.get("tristrips", Element("tristrips", 0)))
-    cut = _cut(strips)
+    cut = cut_strips(strips.numbers, strips.counts)
     counts = np.concatenate([faces.counts, np.full(len(cut), 3)])
     shade = None if len(cut) else face.colours
     return Polygons(vertices, counts, np.concatenate([faces.numbers, cut.ravel()]), vertex.colours, shade)
@@ -223,15 +223,3 @@ def _indices(element: Element) -> Lists:
         found = ", ".join(element.codes) or "nothing"
         raise ValueError(f"must have lists vertex_indices in its '{element.name}', found {found}; export it again")
     return _lists([], [])
-
-
-def _cut(strips: Lists) -> Int[np.ndarray, "t 3"]:
-    """The triangles of strips, every second one turned; -1 begins a strip anew within a row."""
-    numbers = np.insert(strips.numbers, np.cumsum(strips.counts), -1)
-    place = np.arange(len(numbers))
-    begin = np.maximum.accumulate(np.where(numbers < 0, place + 1, 0))
-    three = np.stack([numbers, np.roll(numbers, -1), np.roll(numbers, -2)], axis=1)  # the last is -1
-    turned = (place - begin)[:, None] % 2 == 1
-    triangles = np.where(turned, three[:, [1, 0, 2]], three)
-    distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    return triangles[(three >= 0).all(axis=1) & distinct]

@@ -51,13 +51,24 @@ class Polygons:
             cut = loops[:, fan(count)]
             if count > 3:
                 places = self.vertices[loops]
-                for i in np.flatnonzero(~_is_fan(places)):
-                    cut[i] = loops[i][ears(_in_plane(places[i]))]
+                others = np.flatnonzero(~_is_fan(places))
+                cut[others] = loops[others[:, None, None], ears(_in_plane(places[others]))]
             triangles.append(cut.reshape(-1, 3))
             owners.append(np.repeat(alike, count - 2))
         owner = np.concatenate(owners)
         order = np.argsort(owner, kind="stable")
         return np.concatenate(triangles)[order], owner[order]
+
+    def shaded(
+        self, triangles: Int[np.ndarray, "t 3"], owner: Int[np.ndarray, " t"]
+    ) -> Float[np.ndarray, "v 3"] | None:
+        """RGB of each vertex, if it or its faces have some: then the mean of its triangles'."""
+        if self.vertex_colours is not None or self.face_colours is None:
+            return self.vertex_colours
+        counts = np.bincount(triangles.ravel(), minlength=len(self.vertices)).clip(1)
+        bands = np.repeat(self.face_colours[owner], 3, axis=0).T
+        sums = [np.bincount(triangles.ravel(), weights=band, minlength=len(self.vertices)) for band in bands]
+        return np.stack(sums, axis=1) / counts[:, None]
 
 
 def shades(colours: Float[np.ndarray, "n 3"], full: float | None = None) -> Float[np.ndarray, "n 3"]:
@@ -68,6 +79,18 @@ def shades(colours: Float[np.ndarray, "n 3"], full: float | None = None) -> Floa
 def fan(count: int) -> Int[np.ndarray, "t 3"]:
     """The triangles about the first corner of a polygon."""
     return np.array([(0, 1, 2), *((i - 1, i, 0) for i in range(3, count))])
+
+
+def cut_strips(corners: Int[np.ndarray, " m"], counts: Int[np.ndarray, " n"]) -> Int[np.ndarray, "t 3"]:
+    """The triangles of strips with so many corners each, every second one turned; -1 begins a strip anew."""
+    numbers = np.insert(corners, np.cumsum(counts), -1)
+    place = np.arange(len(numbers))
+    begin = np.maximum.accumulate(np.where(numbers < 0, place + 1, 0))
+    three = np.stack([numbers, np.roll(numbers, -1), np.roll(numbers, -2)], axis=1)  # the last is -1
+    turned = (place - begin)[:, None] % 2 == 1
+    triangles = np.where(turned, three[:, [1, 0, 2]], three)
+    distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return triangles[(three >= 0).all(axis=1) & distinct]
 
 
 def _crosses(places: Float[np.ndarray, "*p c 3"]) -> Float[np.ndarray, "*p t 3"]:
@@ -83,41 +106,47 @@ def _is_fan(places: Float[np.ndarray, "p c 3"]) -> np.ndarray:
     return ((crosses * normals).sum(axis=-1) > FLAT * (normals**2).sum(axis=-1)).all(axis=1)
 
 
-def _in_plane(places: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 2"]:
-    """A polygon seen along its normal (Newell's), from where it winds anticlockwise."""
-    normal = _crosses(places).sum(axis=0)
-    right = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    axes = np.stack([right, np.cross(normal, right)])
+def _in_plane(places: Float[np.ndarray, "p c 3"]) -> Float[np.ndarray, "p c 2"]:
+    """Polygons seen along their normals (Newell's), from where they wind anticlockwise."""
+    normals = _crosses(places).sum(axis=1)
+    right = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    axes = np.stack([right, np.cross(normals, right)], axis=2)
     lengths = np.linalg.norm(axes, axis=1, keepdims=True)
-    return (places - places[0]) @ np.divide(axes, lengths, out=np.zeros_like(axes), where=lengths > 0).T
+    return (places - places[:, :1]) @ np.divide(axes, lengths, out=np.zeros_like(axes), where=lengths > 0)
 
 
-def ears(points: Float[np.ndarray, "c 2"]) -> Int[np.ndarray, "t 3"]:
-    """The triangles of a simple polygon that winds anticlockwise: corners of which nothing is behind are cut off.
+def ears(points: Float[np.ndarray, "p c 2"]) -> Int[np.ndarray, "p t 3"]:
+    """The triangles of simple polygons that wind anticlockwise: corners of which nothing is behind are cut off.
 
     None is flat, also beside corners on a straight edge. mapbox_earcut leaves flat ones there.
     """
-    left, found = list(range(len(points))), []
-    while len(left) > 3:
-        place = _ear(points[left])
-        found.append((left[place - 1], left[place], left[(place + 1) % len(left)]))
-        del left[place]
-    return np.array([*found, left])
+    left, found = np.tile(np.arange(points.shape[1]), (len(points), 1)), []
+    while (count := left.shape[1]) > 3:
+        ear = _ears(np.take_along_axis(points, left[..., None], axis=1))[:, None]
+        found.append(np.take_along_axis(left, (ear + np.arange(-1, 2)) % count, axis=1))
+        left = left[np.arange(count) != ear].reshape(-1, count - 1)
+    return np.stack([*found, left], axis=1)
 
 
-def _ear(points: Float[np.ndarray, "c 2"]) -> int:
+def _ears(points: Float[np.ndarray, "p c 2"]) -> Int[np.ndarray, " p"]:
     """The corner with the shortest cut behind which no other corner lies; the widest of a polygon that has none."""
-    before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
+    before, after = np.roll(points, 1, axis=1), np.roll(points, -1, axis=1)
+    corners = np.stack([before, points, after], axis=2)
     turns = _turn(before, points, after)
-    least = FLAT * np.ptp(points, axis=0).max() ** 2
-    for i in np.argsort(((after - before) ** 2).sum(axis=1)):
-        if turns[i] <= least:
-            continue
-        corners = np.stack([before[i], points[i], after[i]])
-        inside = np.all([_turn(corners[j - 1], corners[j], points) >= -least for j in range(3)], axis=0)
-        if not (inside & (points[:, None] != corners).any(axis=2).all(axis=1)).any():
-            return int(i)
-    return int(np.argmax(turns))
+    least = FLAT * np.ptp(points, axis=1).max(axis=1, keepdims=True) ** 2
+    found, open_ = turns.argmax(axis=1), np.arange(len(points))
+    cuts = np.where(turns > least, ((after - before) ** 2).sum(axis=2), np.inf)
+    for ear in cuts.argsort(axis=1, kind="stable").T:
+        open_ = open_[np.isfinite(cuts[open_, ear[open_]])]
+        if not len(open_):
+            break
+        ear, others = ear[open_], points[open_]
+        three = corners[open_, ear][:, :, None]
+        inside = np.all([_turn(three[:, j - 1], three[:, j], others) >= -least[open_] for j in range(3)], axis=0)
+        free = ~(inside & (others[:, None] != three).any(axis=3).all(axis=1)).any(axis=1)
+        found[open_[free]] = ear[free]
+        open_ = open_[~free]
+    return found
 
 
 def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

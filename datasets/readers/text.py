@@ -1,14 +1,25 @@
-"""Reads the polygons of .obj and .off files."""
+"""Reads the polygons of .obj, .off and .stl files, and knows files of other kinds by how they begin."""
 
 import re
 from collections.abc import Sequence
 from itertools import islice
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from datasets.readers.polygons import Polygons, shades
 
 UNREAD = {"surf": "a free-form surface", "call": "another file that it includes"}  # of .obj: would be missing
+FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])  # of a binary .stl
+MISTAKEN = {  # how other files begin, in lower case: what they are, and the remedy
+    b"\x00\x05\x16\x07": "holds a Mac's notes on a file, whose names begin with '._'; take the file without '._'",
+    b"version https://git-lfs": "is a Git LFS pointer; fetch it with 'git lfs pull'",
+    b"\x1f\x8b": "is compressed by gzip; unpack it",
+    b"pk\x03\x04": "is a .zip archive; unpack it",
+    b"<!doctype html": "is a web page; download the file itself",
+    b"<html": "is a web page; download the file itself",
+}
 BROKEN_LINE = re.compile(r"^[ \t]*[vf][ \t](?:[^\\\n]|\\[ \t]*\n)*", re.MULTILINE)  # \ at the end: the next one goes on
 
 
@@ -75,6 +86,43 @@ def read_off(content: bytes) -> Polygons:
     return _polygons(vertices, [face[0] for face in whole], [corner for face in whole for corner in face[1:]], colours)
 
 
+def read_stl(content: bytes) -> Polygons:
+    """The polygons of an .stl file, binary or text with one solid or more. Normals and colours are not read.
+
+    Raises:
+        ValueError: where it is not whole, or has a word for a number.
+    """
+    if b"\0" in content[:84]:
+        count = int.from_bytes(content[80:84], "little")
+        if len(content) != 84 + 50 * count:
+            raise ValueError(
+                f"must be a whole .stl file, {84 + 50 * count} bytes for the {count} faces that it claims, found "
+                f"{len(content)}; export or copy it again"
+            )
+        vertices, counts = np.frombuffer(content, FACE, count, 84)["corners"].reshape(-1, 3), [3] * count
+    else:
+        text = decoded(content).lower()
+        if not re.match(r"\s*solid\b", text) or not re.search(r"\bendsolid\b[^\n]*\s*$", text):
+            first, last = (" ".join(end.split()) for end in (text[:20], text[-20:]))
+            raise ValueError(
+                f"must be a whole .stl file, from 'solid' to 'endsolid', found '{first}' to '{last}'; "
+                "export or copy it again"
+            )
+        corners = [re.findall(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", loop) for loop in text.split("endloop")]
+        try:
+            vertices, counts = [_three(words) for loop in corners for words in loop], [*map(len, corners)]
+        except ValueError as error:
+            raise ValueError(f"must have lines 'vertex x y z' ({error}); export it again") from None
+    return _polygons(vertices, counts, np.arange(len(vertices)), [])
+
+
+def mistaken(path: Path) -> str:
+    """What a file is and the remedy, where it begins as one of another kind does; else nothing."""
+    with path.open("rb") as file:
+        begins = file.read(64).lstrip().lower()
+    return next((what for start, what in MISTAKEN.items() if begins.startswith(start)), "")
+
+
 def decoded(content: bytes) -> str:
     """The text of a file with plain ends of lines, without comments and the mark that some editors write first."""
     wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -105,7 +153,7 @@ def _from_zero(number: int, vertex_count: int) -> int:
     return number - 1 if number > 0 else vertex_count + number
 
 
-def _polygons(vertices: list, counts: list, corners: list, colours: list) -> Polygons:
+def _polygons(vertices: Any, counts: list, corners: Any, colours: list) -> Polygons:
     return Polygons(
         np.array(vertices, dtype=np.float64).reshape(-1, 3),
         np.array(counts, dtype=np.int64),

@@ -497,3 +497,25 @@ def test_names_with_folders_blanks_and_paths_of_elsewhere(tmp_path, named):
     with pytest.raises(BadInput, match=r"none of their images, such as .*000.png; its files end with .png, .txt"):
         read_capture(tmp_path, READ)
     assert off(read_capture(tmp_path, Reading(48, masks=False, images="elsewhere"))) < 0.01
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+
+
+@each(
+    "format, name",
+    [
+        (idr, "image/000003.png"),
+        (idr, "cameras_sphere.npz"),
+        (llff, "poses_bounds.npy"),
+        (nerf, "transforms_train.json"),
+    ],
+)
+def test_a_pointer_of_git_lfs_is_told_as_such(tmp_path, format, name):
+    folder = tmp_path / name.replace("/", "_")
+    folder.mkdir()
+    format(folder)
+    (file,) = [folder / name] if (folder / name).exists() else folder.glob("*.json")
+    file.write_bytes(POINTER)
+    with pytest.raises(BadInput, match=r"is a Git LFS pointer; fetch it with 'git lfs pull'"):
+        read_capture(folder, READ)

@@ -115,20 +115,19 @@ BROKEN = {
     "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "must have an area, found 0"),
     "words.ply": (b"this is\nno mesh\n", "does not begin with a line 'ply'"),
     "words.stl": (b"this is\nno mesh\n", "."),
-    "words.glb": (b"this is\nno mesh\n", "reading failed"),
-    "mac.ply": (b"\x00\x05\x16\x07\x00\x02", "found a Mac's notes on a file"),
+    "words.glb": (b"this is\nno mesh\n", "must begin with 'glTF', version 2"),
+    "mac.ply": (b"\x00\x05\x16\x07\x00\x02", "holds a Mac's notes on a file"),
     "pointer.glb": (
         b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
-        "found a pointer of Git LFS; run 'git",
+        "is a Git LFS pointer; fetch it with 'git lfs pull'",
     ),
-    "packed.obj": (b"\x1f\x8b\x08\x00", "found a file compressed by gzip; unpack it"),
+    "packed.obj": (b"\x1f\x8b\x08\x00", "is compressed by gzip; unpack it"),
     "longer.stl": (trimesh.creation.box().export(file_type="stl") + b"\0", "684 bytes for the 12 faces .* found 685"),
-    "packed.glb": (b'glTF{"extensionsRequired": ["KHR_draco_mesh_compression"]}', "found KHR_draco_mesh_compression"),
     "other.obj": (
         trimesh.creation.box().export(file_type="off").encode(),
         "it has no vertex either, as .obj writes them",
     ),
-    "page.stl": (b"\n<!DOCTYPE html>\n", "found a web page"),
+    "page.stl": (b"\n<!DOCTYPE html>\n", "is a web page"),
 }
 
 
@@ -159,10 +158,9 @@ def test_a_file_without_its_end_is_refused_wherever_it_was_cut(tmp_path, name):
     path, whole = tmp_path / f"ball.{name}", WHOLE[name]
     path.write_bytes(whole)
     assert load_mesh(path).repairs == ()
-    least = 60 if name in ("stl", "ascii.stl") else 5  # a face of an .stl: no more is missing of it than that
-    for length in (*(int(share * len(whole)) for share in (0.02, 0.3, 0.5, 0.8, 0.99)), len(whole) - least):
+    for length in (*(int(share * len(whole)) for share in (0.02, 0.3, 0.5, 0.8, 0.99)), len(whole) - 5):
         path.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"must (be a whole|be readable|have faces).*; .*copy it again"):
+        with pytest.raises(ValueError, match=r"must be a whole.*; .*copy it again"):
             load_mesh(path)
 
 
